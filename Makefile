@@ -1,0 +1,47 @@
+# The only list of commands. Nothing is assumed but Python >= 3.11 and make.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+UV := $(shell command -v uv 2>/dev/null || echo .uv/bin/uv)
+STAMP := $(VENV)/.installed
+
+.PHONY: setup demo test check bench tables pins clean
+
+setup: $(STAMP)
+
+demo: setup
+	$(BIN)/retrim demo
+
+test: setup
+	$(BIN)/pytest
+
+check: setup
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+bench: setup
+	$(BIN)/retrim bench
+
+tables: setup
+	$(BIN)/retrim reproduce hover --out docs/results
+
+# uv, in a private folder where there is none.
+.uv/bin/uv:
+	$(PYTHON) -m venv .uv
+	.uv/bin/python -m pip install --quiet uv==0.13.8
+
+$(STAMP): pyproject.toml constraints.txt | $(UV)
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "retrim needs Python 3.11 or newer; set PYTHON=...")'
+	$(UV) venv --quiet --clear --python $(PYTHON) $(VENV)
+	$(UV) pip install --quiet --python $(VENV) --constraints constraints.txt --group dev --editable .
+	@touch $@
+
+# After a change of dependencies in pyproject.toml: names, versions and markers only.
+pins: | $(UV)
+	$(UV) pip compile --quiet --upgrade --universal --all-extras --group dev --python-version 3.11 \
+		--no-header --no-annotate pyproject.toml --output-file constraints.txt
+
+clean:
+	rm -rf $(VENV) .uv runs .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

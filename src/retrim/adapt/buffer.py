@@ -1,0 +1,39 @@
+"""The last seconds of flight."""
+
+from collections import deque
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..learn.residual import Window
+from ..physics.state import Command, State
+
+
+class RollingBuffer:
+    """Keeps the last ``size`` ticks (paper, Sec. IV-A.3: 100 for hover). ``window`` is a copy, never a view."""
+
+    def __init__(self, size: int) -> None:
+        if size < 2:
+            raise ValueError(f"RollingBuffer: size = {size} must be at least 2, for one difference of velocity")
+        self._rows: deque[tuple[State, Command]] = deque(maxlen=size)
+        self._size = size
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def push(self, x: State, u: Command) -> None:
+        """Append the state at a tick and the command issued at it."""
+        self._rows.append((x, u))
+
+    def window(self) -> Window:
+        """A snapshot of fixed shape; while it fills, the oldest tick is repeated in front and marked invalid.
+
+        Raises ``ValueError`` if nothing was pushed yet.
+        """
+        if not self._rows:
+            raise ValueError("RollingBuffer: no tick was pushed yet")
+        missing = self._size - len(self._rows)
+        rows = [self._rows[0]] * missing + list(self._rows)
+        x, u = jax.tree.map(lambda *leaves: jnp.asarray(np.stack([np.asarray(leaf) for leaf in leaves])), *rows)
+        return Window(x, u, jnp.arange(self._size) >= missing)

@@ -1,0 +1,3 @@
+"""Plants: one file each."""
+
+from .sim import SimPlant as SimPlant

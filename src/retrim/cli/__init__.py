@@ -1,0 +1,3 @@
+"""The command ``retrim``: one file per command."""
+
+from .main import main as main

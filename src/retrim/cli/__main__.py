@@ -1,0 +1,5 @@
+"""``python -m retrim.cli``."""
+
+from .main import main
+
+main()

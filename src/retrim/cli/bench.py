@@ -1,0 +1,77 @@
+"""``retrim bench``: how long each piece of work takes on this machine, and how much memory."""
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+
+from .bench_works import WORKS
+from .session import Stopwatch, console, run_folder, write_results
+
+
+def bench(works: tuple[str, ...] = tuple(WORKS), out: Path | None = None) -> int:
+    """Time the work of the paper's runtime study and of this project, each in a process of its own.
+
+    Compiling is measured apart, from an empty cache unless the work says otherwise. run_s is the median of the runs.
+
+    Args:
+        works: Which; all by default.
+        out: Folder for results.json; a new one under runs/ by default.
+    """
+    unknown = [name for name in works if name not in WORKS]
+    if unknown:
+        console.print(f"[bold red]retrim:[/] no work {', '.join(unknown)}; there are {', '.join(WORKS)}")
+        return 2
+    watch, rows, interrupted = Stopwatch(), list[dict[str, Any]](), False
+    shown = Table(title="retrim bench", caption="peak memory of the process, jax included")
+    for heading in ("work", "compile, s", "run, s", "peak, MB", "goal", "remarks"):
+        shown.add_column(heading, overflow="fold")
+    with tempfile.TemporaryDirectory() as cache:
+        for name in works:
+            try:
+                with console.status(f"{name}: {WORKS[name].title} ..."):
+                    row = _measured(name, Path(cache))
+            except KeyboardInterrupt:
+                interrupted = True
+                break
+            rows.append(row)
+            shown.add_row(
+                row["work"],
+                _seconds(row["compile_s"]),
+                _seconds(row["run_s"]),
+                f"{row['peak_mb']:.0f}",
+                row["goal"],
+                row["remarks"],
+            )
+            console.print(f"{row['work']}: compile {_seconds(row['compile_s'])} s, run {_seconds(row['run_s'])} s")
+    console.print(shown)
+    folder = run_folder(out, "bench")
+    path = write_results(folder, seeds=[0], watch=watch, rows=rows, interrupted=interrupted)
+    console.print(f"[bold]{path}[/]", soft_wrap=True)
+    return 130 if interrupted else 0
+
+
+def _measured(name: str, cache: Path) -> dict[str, Any]:
+    """The row of one work, done by a fresh interpreter; ``cache`` starts empty, for the works that ask for one."""
+    environment = {**os.environ, "RETRIM_COMPILE_CACHE": "0", "TF_CPP_MIN_LOG_LEVEL": "3"}
+    environment.pop("JAX_COMPILATION_CACHE_DIR", None)
+    if WORKS[name].cached:
+        environment |= {
+            "JAX_COMPILATION_CACHE_DIR": str(cache),
+            "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+        }
+    ran = subprocess.run(
+        [sys.executable, "-m", "retrim.cli.bench_works", name], env=environment, capture_output=True, text=True
+    )
+    if ran.returncode:
+        raise OSError(f"bench {name} failed: {ran.stderr.strip().splitlines()[-1:]}")
+    return {"name": name, **json.loads(ran.stdout.splitlines()[-1])}
+
+
+def _seconds(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3g}" if value < 10 else f"{value:.1f}"

@@ -1,0 +1,199 @@
+"""What ``retrim bench`` times. ``python -m retrim.cli.bench_works NAME`` does one piece of work and prints JSON."""
+
+import json
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+from jax import lax, random
+from jaxtyping import Array, Key
+
+from .. import presets
+from ..adapt.adapter import Adapter, AdaptState
+from ..adapt.buffer import RollingBuffer
+from ..adapt.gate import Verdict
+from ..adapt.plant import ControllerPilot, fly
+from ..adapt.plants.sim import SimPlant
+from ..control.controller import PolicyController
+from ..learn.bptt import PolicyState
+from ..learn.pretrain import training_chunk
+from ..learn.residual import Window
+from ..physics.state import Command
+from ..presets import Preset
+from .training import nominal_error
+
+
+@dataclass(frozen=True)
+class Work:
+    """One row of the bench."""
+
+    title: str
+    goal: str
+    do: Callable[[], dict[str, Any]]
+    """Returns compile_s, run_s and remarks."""
+    cached: bool = False
+    """Uses the bench's own persistent compile cache, empty at first."""
+
+
+def _timed(compile_s: float, run: Callable[[], Any], runs: int) -> dict[str, Any]:
+    seconds = []
+    for _ in range(runs):
+        began = time.perf_counter()
+        jax.block_until_ready(run())
+        seconds.append(time.perf_counter() - began)
+    spread = f"{min(seconds):.3g} to {max(seconds):.3g} s in {runs} runs" if runs > 1 else "1 run"
+    return {"compile_s": compile_s, "run_s": statistics.median(seconds), "remarks": spread}
+
+
+def _compiled(jitted: Any, *arguments: Any) -> tuple[Any, float]:
+    began = time.perf_counter()
+    program = jitted.lower(*arguments).compile()
+    return program, time.perf_counter() - began
+
+
+def _pretrain(preset: Preset, runs: int) -> dict[str, Any]:
+    p, key = preset.pretrain, random.key(0)
+    optimiser = presets.optimiser(preset)
+    chunk = training_chunk(
+        presets.nominal(preset), presets.task(preset), optimiser=optimiser, envs=p.envs, epochs=10, delay=preset.delay
+    )
+    policy = presets.policy(preset, key)
+    state = PolicyState(policy, optimiser.init(policy.layers))
+    program, compile_s = _compiled(chunk, state, key)
+
+    def run(seed: int = 0) -> PolicyState:
+        trained = state
+        for k in random.split(random.key(seed), p.epochs // 10):
+            trained, _ = program(trained, k)
+        return trained
+
+    row = _timed(compile_s, run, runs)
+    errors = (
+        [nominal_error(preset, run(seed).policy) for seed in range(1, 4)]
+        if runs > 1
+        else [nominal_error(preset, run().policy)]
+    )
+    row["remarks"] += "; hover error " + ", ".join(f"{1000 * e:.1f}" for e in errors) + " mm"
+    return row
+
+
+def _learner() -> tuple[Adapter, AdaptState, Window]:
+    """Adapter, its state with a residual that is not zero, and a full window of flight under the large disturbance."""
+    preset = presets.load("paper")
+    policy = presets.policy(preset, random.key(0))
+    adapter = presets.adapter(preset)
+    plant = SimPlant(presets.plant_model("small"), presets.disturbance("large"))
+    log_buffer = RollingBuffer(preset.adapt.window)
+    sample = plant.reset(presets.flight_starts(preset, 1)[0])
+    for _ in range(preset.adapt.window):
+        log_buffer.push(sample.x, Command.hover())
+        sample = plant.exchange(Command.hover())
+    window = log_buffer.window()
+    state = adapter.init(policy, presets.residual(preset, random.key(1)))
+    return adapter, state, window
+
+
+def _burst() -> dict[str, Any]:
+    adapter, state, window = _learner()
+    fitted, _ = adapter.refine(state.residual, window)
+    arguments = adapter, state.policy, fitted.residual, window, random.key(0)
+    program, compile_s = _compiled(Adapter.improve, *arguments)
+    return _timed(compile_s, lambda: program(*arguments), 9)
+
+
+def _residual() -> dict[str, Any]:
+    adapter, state, window = _learner()
+    program, compile_s = _compiled(Adapter.refine, adapter, state.residual, window)
+    return _timed(compile_s, lambda: program(adapter, state.residual, window), 9)
+
+
+def _programs() -> dict[str, Any]:
+    """Trace and compile, or load, everything a flight needs: policy, plant, residual fit, policy update."""
+    from .flights import Campaign
+    from .session import Stopwatch
+
+    watch = Stopwatch()
+    preset = presets.load("fast")
+    campaign = Campaign(preset, presets.policy(preset, random.key(0)), vehicle="small", seconds=3.0, starts=1, seed=0)
+    campaign.warm_up()
+    return {"compile_s": watch.compile_s, "run_s": watch.total_s - watch.compile_s, "remarks": "preset fast"}
+
+
+def _tick() -> dict[str, Any]:
+    """One flight without adaptation: plant, observation, policy, checks."""
+    preset = presets.load("fast")
+    controller = PolicyController(presets.task(preset).observation, presets.policy(preset, random.key(0)))
+    plant = SimPlant(presets.plant_model("small"), presets.disturbance("none"))
+    x0 = presets.flight_starts(preset, 1)[0]
+    began = time.perf_counter()
+    fly(plant, ControllerPilot(controller), x0, ticks=2)
+    compile_s = time.perf_counter() - began
+    row = _timed(compile_s, lambda: fly(plant, ControllerPilot(controller), x0, ticks=1500).p, 5)
+    row["remarks"] = f"{1000 * row['run_s'] / 1500:.2f} ms a tick; " + row["remarks"]
+    return row
+
+
+def _fleet(how: str) -> dict[str, Any]:
+    """Eight bursts of eight vehicles."""
+    adapter, state, window = _learner()
+    fitted, _ = adapter.refine(state.residual, window)
+    keys = random.split(random.key(0), 8)
+
+    def one(key: Key[Array, ""]) -> tuple[PolicyState, Verdict]:
+        return adapter.improve(state.policy, fitted.residual, window, key)
+
+    if how == "threads":
+        jax.block_until_ready(one(keys[0]))
+        with ThreadPoolExecutor(2) as pool:
+            return _timed(0.0, lambda: list(pool.map(lambda k: jax.block_until_ready(one(k)), keys)), 3)
+    fleet = jax.jit(lambda keys: lax.map(one, keys) if how == "map" else jax.vmap(one)(keys))
+    program, compile_s = _compiled(fleet, keys)
+    return _timed(compile_s, lambda: program(keys), 3)
+
+
+def _demo() -> dict[str, Any]:
+    with tempfile.TemporaryDirectory() as folder:
+        began = time.perf_counter()
+        subprocess.run(
+            [sys.executable, "-m", "retrim.cli", "demo", "--out", folder], check=True, stdout=subprocess.DEVNULL
+        )
+        total = time.perf_counter() - began
+        with open(f"{folder}/results.json") as file:
+            compile_s = json.load(file)["compile_s"]
+    return {"compile_s": compile_s, "run_s": total - compile_s, "remarks": "48 flights of 30 s, 24 of them adapting"}
+
+
+WORKS: dict[str, Work] = {
+    "pretrain-paper": Work("pretrain 300 x 100 x 150", "40 s", lambda: _pretrain(presets.load("paper"), 1)),
+    "pretrain-fast": Work("pretrain 150 x 16 x 150, to 5 mm", "6 s", lambda: _pretrain(presets.load("fast"), 3)),
+    "burst": Work("policy update 30 x 10 x 150, with residual", "0.8 s", _burst),
+    "residual": Work("residual, 3 nets x 100 iterations x 100 samples", "0.1 s", _residual),
+    "programs-cold": Work("all programs of a flight, empty cache", "60 s", _programs, cached=True),
+    "programs-warm": Work("all programs of a flight, from the cache", "5 s", _programs, cached=True),
+    "flight": Work("30 s of flight, not adapting", "-", _tick),
+    "fleet-map": Work("8 policy updates, lax.map", "-", lambda: _fleet("map")),
+    "fleet-vmap": Work("8 policy updates, vmap", "-", lambda: _fleet("vmap")),
+    "fleet-threads": Work("8 policy updates, 2 threads", "-", lambda: _fleet("threads")),
+    "demo": Work("retrim demo", "180 s, 2000 MB", _demo),
+}
+
+
+def main() -> None:
+    """Do the work named on the command line and print its row."""
+    work = WORKS[sys.argv[1]]
+    found = work.do()
+    peak = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    unit = 1024.0 if sys.platform != "darwin" else 1024.0**2
+    print(json.dumps({"work": work.title, "goal": work.goal, "peak_mb": peak / unit, **found}))
+
+
+if __name__ == "__main__":
+    main()

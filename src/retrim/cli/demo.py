@@ -1,0 +1,69 @@
+"""``retrim demo``: the whole loop in two minutes."""
+
+import sys
+import webbrowser
+from pathlib import Path
+from typing import Literal
+
+from .. import presets
+from ..checkpoint import save_policy
+from .fly import write_events
+from .hover_table import fly_table, hover_table
+from .pictures import picture
+from .session import Stopwatch, console, run_folder, write_results
+from .training import nominal_error, train
+
+
+def demo(
+    preset: Literal["fast", "released", "paper"] = "fast",
+    seconds: float = 30.0,
+    starts: int = 8,
+    seed: int = 0,
+    out: Path | None = None,
+) -> int:
+    """Pretrain a hover policy, push it with disturbances that it never saw, and re-train it while it flies.
+
+    Args:
+        preset: fast trains in seconds and has the plant's delay in its model; paper and released take about a minute.
+        seconds: Length of a flight.
+        starts: Flights per disturbance and method, each from another start.
+        seed: Seed of everything.
+        out: Folder for the policy, results.json and the pictures; a new one under runs/ by default.
+    """
+    watch = Stopwatch()
+    if seconds < 3.0 or starts < 1:
+        raise presets.PresetError(f"--seconds {seconds:g} --starts {starts}: at least 3 s and 1 start are needed")
+    folder = run_folder(out, "demo")
+    settings = presets.load(preset)
+    console.print(
+        f"preset [bold]{preset}[/], small quadrotor (0.19 kg), simulated plant: rotor level at 1 kHz, 20 ms delay"
+    )
+    policy, losses, interrupted = train(settings, seed)
+    if interrupted:
+        console.print("interrupted while pretraining")
+        return 130
+    save_policy(folder / "policy.safetensors", policy, settings)
+    console.print(f"hover error in its own model: {1000 * nominal_error(settings, policy):.1f} mm")
+    flights, interrupted = fly_table(settings, policy, seconds=seconds, starts=starts, seed=seed)
+    table = hover_table(flights, settings)
+    write_results(
+        folder,
+        seeds=[seed],
+        watch=watch,
+        rows=table.rows,
+        interrupted=interrupted,
+        preset=presets.values(settings),
+        losses=losses,
+    )
+    write_events(flights, folder)
+    console.print(table.shown)
+    console.print(f"compiling {watch.compile_s:.0f} s, all else {watch.total_s - watch.compile_s:.0f} s")
+    flown = dict.fromkeys(f.plan.disturbance for f in flights)
+    pictures = [path for name in flown for path in picture(flights, settings, name, settings.vehicle, folder)]
+    for path in pictures:
+        if path.suffix == ".png":
+            console.print(f"[bold]{path}[/]", soft_wrap=True)
+    best = folder / "hover_large.png"
+    if best in pictures and sys.stdout.isatty():
+        webbrowser.open(best.resolve().as_uri())
+    return 130 if interrupted else 0

@@ -1,0 +1,54 @@
+"""``retrim doctor``: is this installation fit to fly?"""
+
+import platform
+from importlib.metadata import version
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from rich.table import Table
+
+from .session import commit, console, machine
+
+EXCLUDED = "0.10.2"
+
+
+def doctor() -> int:
+    """Print versions, device and cache, and look for the known faults of dependencies; exit code 1 if one is there."""
+    wrong = sum(wrong_rows(n, jnp.float32) for n in (1_000, 16_385, 32_769))
+    if wrong:
+        verdict = f"[bold red]wrong[/]: {wrong} rows of a batched product; another version of jax is needed"
+    else:
+        verdict = "[green]right[/]"
+    shown = Table(show_header=False)
+    for name, value in (
+        ("retrim", f"{version('retrim')}, commit {commit()}"),
+        ("python", platform.python_version()),
+        *((name, version(name)) for name in ("jax", "jaxlib", "equinox", "optax", "numpy")),
+        ("machine", machine()),
+        ("compile cache", str(jax.config.values["jax_compilation_cache_dir"])),
+        ("batched products (jax-ml/jax#39103)", verdict),
+    ):
+        shown.add_row(name, value)
+    console.print(shown)
+    return 1 if wrong else 0
+
+
+def wrong_rows(n: int, dtype: jnp.dtype) -> int:
+    """Rows that ``jit`` gets wrong of: rotate n vectors (0 ... n-1, 0, 0) by the identity, square, sum.
+
+    jax 0.10.2 returns another row's result once the batch is large enough (jax-ml/jax#39103). Row i must be i^2,
+    exactly in float64 and to rounding in float32.
+    """
+    rows = np.zeros((n, 3))
+    rows[:, 0] = np.arange(n)
+    identity = jnp.eye(3, dtype=dtype)
+
+    def one(y: Float[Array, "3"]) -> Float[Array, ""]:
+        return jnp.sum((identity @ y) ** 2)
+
+    found = np.asarray(jax.jit(jax.vmap(one))(jnp.asarray(rows, dtype=dtype)), dtype=np.float64)
+    expected = np.arange(n, dtype=np.float64) ** 2
+    tolerance = 0.0 if dtype == jnp.float64 else 1e-6
+    return int(np.sum(np.abs(found - expected) > tolerance * expected))

@@ -1,0 +1,85 @@
+"""``retrim fly``."""
+
+from pathlib import Path
+from typing import Literal
+
+from rich.table import Table
+
+from .. import presets
+from ..adapt.sink import JsonlSink
+from ..checkpoint import load_policy
+from .flights import Campaign, Flight, Plan, cell, rows
+from .pictures import picture
+from .session import Stopwatch, console, run_folder, write_results
+
+
+def fly(
+    policy: Path,
+    disturbance: Literal["none", "small", "large", "reversing"] = "large",
+    adapt: Literal["none", "full"] = "full",
+    vehicle: Literal["small", "large"] | None = None,
+    config: Path | None = None,
+    charge: Literal["fixed", "measured"] = "fixed",
+    seconds: float = 30.0,
+    starts: int = 1,
+    seed: int = 0,
+    out: Path | None = None,
+) -> int:
+    """Fly a policy on the simulated plant, as it is and, with --adapt full, adapting as it flies.
+
+    Args:
+        policy: A policy.safetensors, or the folder that holds one.
+        disturbance: What pushes the vehicle.
+        adapt: full: also fly it while residual and policy are re-trained; none: only as it is.
+        vehicle: Quadrotor to fly; that which the policy was trained for by default.
+        config: TOML file that overlays the policy's own preset, for example with a table [adapt].
+        charge: fixed: learning costs the preset's flight time, so that a run repeats bit for bit; measured: what the
+            clock says.
+        seconds: Length of a flight.
+        starts: Number of flights, each from another start.
+        seed: Seed of the starts and of the learners.
+        out: Folder for results.json, events.jsonl and the picture; a new one under runs/ by default.
+    """
+    watch = Stopwatch()
+    weights, preset = load_policy(policy)
+    if config is not None:
+        preset = presets.overlaid(preset, config)
+    if seconds < 3.0 or starts < 1:
+        raise presets.PresetError(f"--seconds {seconds:g} --starts {starts}: at least 3 s and 1 start are needed")
+    flown_on = vehicle or preset.vehicle
+    folder = run_folder(out, "fly")
+    campaign = Campaign(
+        preset, weights, vehicle=flown_on, seconds=seconds, starts=starts, seed=seed, measured=charge == "measured"
+    )
+    methods: tuple[Literal["base", "full"], ...] = ("base", "full") if adapt == "full" else ("base",)
+    campaign.warm_up()
+    plans = [Plan(disturbance, method, i) for method in methods for i in range(starts)]
+    flights, interrupted = campaign.fly(plans)
+    if not flights:
+        console.print("interrupted before the first flight was over; nothing was saved")
+        return 130
+    write_events(flights, folder)
+    table = rows(flights, task=preset.task, plant="simple", vehicle=flown_on)
+    write_results(folder, seeds=[seed], watch=watch, rows=table, interrupted=interrupted, preset=presets.values(preset))
+    shown = Table(
+        title=f"steady-state hover error \\[m], last 2 s of {seconds:g} s, {starts} start{'s' * (starts > 1)}"
+    )
+    for heading in ("disturbance", "method", "error"):
+        shown.add_column(heading)
+    for row in table:
+        shown.add_row(row["disturbance"], row["method"], cell(row))
+    console.print(shown)
+    for path in picture(flights, preset, disturbance, flown_on, folder):
+        console.print(f"[bold]{path}[/]", soft_wrap=True)
+    return 130 if interrupted else 0
+
+
+def write_events(flights: list[Flight], folder: Path) -> None:
+    """``events.jsonl``: what adaptation did, flight by flight."""
+    sink = JsonlSink(folder / "events.jsonl")
+    for flight in flights:
+        for event in flight.events:
+            sink.event(
+                event.kind, disturbance=flight.plan.disturbance, start=flight.plan.start, t=event.t, note=event.note
+            )
+    sink.close()

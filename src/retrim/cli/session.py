@@ -1,0 +1,132 @@
+"""What every command shares: the folder of a run, what machine it ran on, and results for machines."""
+
+import json
+import os
+import platform
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from datetime import datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import jax
+from rich.console import Console
+
+SCHEMA = "retrim.results/1"
+console = Console(highlight=False)
+
+
+class Stopwatch:
+    """Separates compiling (tracing, lowering, XLA, reading the compile cache) from running, from its creation on."""
+
+    def __init__(self) -> None:
+        self._began = time.perf_counter()
+        self._compiling = 0.0
+        jax.monitoring.register_event_duration_secs_listener(self._listen)
+
+    def _listen(self, event: str, duration_secs: float, **_: str | int) -> None:
+        if event in (
+            "/jax/core/compile/jaxpr_trace_duration",
+            "/jax/core/compile/jaxpr_to_mlir_module_duration",
+            "/jax/core/compile/backend_compile_duration",
+        ):
+            self._compiling += duration_secs
+
+    @property
+    def compile_s(self) -> float:
+        """Seconds spent compiling so far, added up over threads."""
+        return self._compiling
+
+    @property
+    def total_s(self) -> float:
+        """Seconds since the start."""
+        return time.perf_counter() - self._began
+
+
+def enable_compile_cache() -> Path | None:
+    """Keep compiled programs in the user's cache folder, unless JAX was told otherwise; returns the folder.
+
+    One folder per version of jax. ``RETRIM_COMPILE_CACHE=0`` switches it off.
+    """
+    if jax.config.values["jax_compilation_cache_dir"] or os.environ.get("RETRIM_COMPILE_CACHE") == "0":
+        return None
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    folder = home / "retrim" / f"jax-{jax.__version__}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        console.print(f"[yellow]no compile cache: {error}[/]")
+        return None
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+    return folder
+
+
+def run_folder(out: Path | None, command: str) -> Path:
+    """``out``, or a fresh folder under ``runs/`` named after the command and the time; made at once."""
+    folder = out or Path("runs") / f"{command}-{datetime.now():%Y%m%d-%H%M%S}"
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def commit() -> str:
+    """Commit of the checkout that this package lies in, with ``-dirty`` for local changes; or ``unknown``."""
+    here = Path(__file__).parent
+
+    def git(*words: str) -> str:
+        return subprocess.run(
+            ["git", "-C", str(here), *words], capture_output=True, text=True, check=True
+        ).stdout.strip()
+
+    try:
+        if Path(git("rev-parse", "--show-toplevel")) / "src" / "retrim" != here.parent:
+            return "unknown"
+        return git("rev-parse", "--short=12", "HEAD") + ("-dirty" if git("status", "--porcelain") else "")
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+
+
+def machine() -> str:
+    """In words: what computes."""
+    name = platform.machine()
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        name = next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        pass
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    accelerators = sorted({d.device_kind for d in jax.devices() if d.platform != "cpu"})
+    return ", ".join([f"{cores} CPU cores ({name})", *accelerators])
+
+
+def write_results(
+    folder: Path,
+    *,
+    seeds: Sequence[int],
+    watch: Stopwatch,
+    rows: Sequence[dict[str, Any]],
+    interrupted: bool = False,
+    **more: Any,
+) -> Path:
+    """``results.json`` in ``folder``."""
+    results = {
+        "schema": SCHEMA,
+        "command": " ".join(["retrim", *sys.argv[1:]]),
+        "commit": commit(),
+        "versions": {name: version(name) for name in ("retrim", "jax", "jaxlib", "equinox", "optax", "numpy")}
+        | {"python": platform.python_version()},
+        "device": machine(),
+        "seeds": list(seeds),
+        "compile_s": round(watch.compile_s, 3),
+        "run_s": round(watch.total_s - watch.compile_s, 3),
+        "interrupted": interrupted,
+        "rows": list(rows),
+        **more,
+    }
+    path = folder / "results.json"
+    path.write_text(json.dumps(results, indent=2) + "\n")
+    return path

@@ -1,0 +1,56 @@
+"""Pretraining with a progress bar."""
+
+import jax
+import jax.numpy as jnp
+from jax import random
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from .. import presets
+from ..control.policy import Policy
+from ..learn.pretrain import pretrain
+from ..learn.rollout import rollout
+from ..presets import Preset
+from .session import console
+
+CHUNK = 10
+
+
+def train(preset: Preset, seed: int) -> tuple[Policy, list[float], bool]:
+    """A pretrained policy, each epoch's loss, and whether Ctrl-C cut it short (then it is the last state reached)."""
+    k_init, k_train = random.split(random.key(seed))
+    policy, losses, interrupted = presets.policy(preset, k_init), list[float](), False
+    p = preset.pretrain
+    columns = TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[loss]}"), TimeRemainingColumn()
+    chunk = CHUNK if p.epochs % CHUNK == 0 else 1
+    with Progress(*columns, console=console) as progress:
+        bar = progress.add_task(
+            f"pretraining, {p.epochs} x {p.envs} x {p.horizon}", total=p.epochs, loss="compiling ..."
+        )
+        try:
+            for state, chunk_losses in pretrain(
+                policy,
+                presets.nominal(preset),
+                presets.task(preset),
+                k_train,
+                optimiser=presets.optimiser(preset),
+                epochs=p.epochs,
+                envs=p.envs,
+                delay=preset.delay,
+                chunk=chunk,
+            ):
+                losses += [float(loss) for loss in chunk_losses]
+                policy = state.policy
+                progress.update(bar, completed=len(losses), loss=f"loss {losses[-1]:.3f}")
+        except KeyboardInterrupt:
+            interrupted = True
+    return policy, losses, interrupted
+
+
+def nominal_error(preset: Preset, policy: Policy, *, n: int = 64, seed: int = 1) -> float:
+    """Mean error in the policy's own model over the last half second of 6 s, from ``n`` starts of its training [m]."""
+    task = presets.task(preset)
+    long = type(task)(task.goal, task.observation, task.box, task.heading, task.dt, horizon=round(6.0 / task.dt))
+    x0 = jax.vmap(long.reset)(random.split(random.key(seed), n))
+    one = lambda x: rollout(presets.nominal(preset), long, policy, x, delay=preset.delay)  # noqa: E731
+    flown = jax.jit(jax.vmap(one))(x0)
+    return float(jnp.mean(jnp.linalg.norm(flown.x.p - task.goal, axis=-1)[:, -25:]))

@@ -1,0 +1,5 @@
+"""Who decides: policies and other controllers."""
+
+from .controller import AbstractController as AbstractController
+from .controller import PolicyController as PolicyController
+from .policy import Policy as Policy

@@ -1,0 +1,72 @@
+"""The policy network: observation -> command, centred at hover and bounded."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax, random
+from jaxtyping import Array, Float, Key
+
+from ..physics.state import Command
+from ..physics.vehicle import Vehicle
+
+Taps = tuple[Float[Array, " _"], ...]
+"""One vector per layer, added to the pre-activation; see :mod:`retrim.learn.taps`."""
+Inputs = tuple[Float[Array, " _"], ...]
+"""What each layer was given."""
+
+
+class Policy(eqx.Module):
+    """A ReLU network with a smooth, bounded output. ``layers`` are trained; the commands never are.
+
+    u = u_min + (u_max - u_min) sigmoid(y + y_0), where y is the network's output and y_0 makes y = 0 the hover
+    command. A hard limit would have no gradient once it is reached; this one always has some.
+    """
+
+    layers: tuple[eqx.nn.Linear, ...]
+    u_hover: Command
+    u_min: Command
+    u_max: Command
+
+    @classmethod
+    def of(
+        cls, observation_size: int, vehicle: Vehicle, *, key: Key[Array, ""], hidden: tuple[int, ...] = (512, 512)
+    ) -> "Policy":
+        """A fresh network: kernels N(0, 0.01 / mean of fan-in and fan-out), biases zero; it hovers blindly at first."""
+        sizes = (observation_size, *hidden, 4)
+        layers = []
+        for fan_in, fan_out, k in zip(sizes[:-1], sizes[1:], random.split(key, len(sizes) - 1), strict=True):
+            std = (0.01 * 2.0 / (fan_in + fan_out)) ** 0.5
+            blank = eqx.nn.Linear(fan_in, fan_out, key=k)
+            layers.append(
+                eqx.tree_at(
+                    lambda l: (l.weight, l.bias),
+                    blank,
+                    (std * random.normal(k, (fan_out, fan_in)), jnp.zeros(fan_out)),
+                )
+            )
+        return cls(tuple(layers), Command.hover(), vehicle.command_min, vehicle.command_max)
+
+    def __call__(self, observation: Float[Array, " o"]) -> Command:
+        """The command for one observation."""
+        h = observation
+        for layer in self.layers[:-1]:
+            h = jax.nn.relu(layer(h))
+        return self.bounded(self.layers[-1](h))
+
+    def tapped(self, observation: Float[Array, " o"], taps: Taps) -> tuple[Command, Inputs]:
+        """The same command, with ``taps[l]`` added to the output of layer l and no gradient to any weight.
+
+        Also returns each layer's input: with the taps' cotangents they give every weight gradient.
+        """
+        h, inputs = observation, []
+        for i, (layer, tap) in enumerate(zip(self.layers, taps, strict=True)):
+            inputs.append(h)
+            y = lax.stop_gradient(layer)(h) + tap
+            h = jax.nn.relu(y) if i < len(self.layers) - 1 else y
+        return self.bounded(h), tuple(inputs)
+
+    def bounded(self, y: Float[Array, "4"]) -> Command:
+        """From the network's output to a command within the limits; zero is hover."""
+        low, high, hover = (lax.stop_gradient(u.vector()) for u in (self.u_min, self.u_max, self.u_hover))
+        y_0 = jnp.log((hover - low) / (high - hover))
+        return Command.of(low + (high - low) * jax.nn.sigmoid(y + y_0))

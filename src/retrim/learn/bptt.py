@@ -1,0 +1,80 @@
+"""Policy optimisation by back-propagation through time (paper, Sec. III-C, Eq. (2) and (3))."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from jax import lax
+from jaxtyping import Array, Float
+
+from ..control.policy import Inputs, Policy, Taps
+from ..physics.dynamics import AbstractDynamics
+from ..physics.state import State
+from ..tasks.task import AbstractTask
+from . import taps
+from .rollout import Trajectory, rollout, tapped_rollout
+
+
+class PolicyState(eqx.Module):
+    """A policy and the state of its optimiser, which knows ``policy.layers`` only."""
+
+    policy: Policy
+    optimiser: optax.OptState
+
+
+def policy_loss(
+    policy: Policy, dynamics: AbstractDynamics[Any], task: AbstractTask, x0: State, *, delay: int = 0
+) -> Float[Array, ""]:
+    """Minus the reward, averaged over ticks and over the batch of starts ``x0``. The plain form of the objective."""
+
+    def fly(x: State) -> Trajectory:
+        return rollout(dynamics, task, policy, x, delay=delay)
+
+    flown = jax.vmap(fly)(x0)
+    return -jnp.mean(flown.reward)
+
+
+def policy_gradient(
+    policy: Policy, dynamics: AbstractDynamics[Any], task: AbstractTask, x0: State, *, delay: int = 0
+) -> tuple[Float[Array, ""], tuple[eqx.nn.Linear, ...]]:
+    """:func:`policy_loss` and its gradient with respect to ``policy.layers``, by taps."""
+
+    def loss(zeros: Taps) -> tuple[Float[Array, ""], Inputs]:
+        def fly(x: State, z: Taps) -> tuple[Trajectory, Inputs]:
+            return tapped_rollout(dynamics, task, policy, x, z, delay=delay)
+
+        flown, inputs = jax.vmap(fly)(x0, zeros)
+        return -jnp.mean(flown.reward), inputs
+
+    return taps.value_and_grad(loss, policy, (x0.p.shape[0], task.horizon))
+
+
+def bptt(
+    state: PolicyState,
+    dynamics: AbstractDynamics[Any],
+    task: AbstractTask,
+    x0: State,
+    *,
+    optimiser: optax.GradientTransformation,
+    delay: int = 0,
+) -> tuple[PolicyState, Float[Array, " epochs"]]:
+    """One optimiser step per epoch; ``x0`` holds the starts, epochs x environments. Also returns each epoch's loss.
+
+    Pure and traceable: callers compile it once. A step with a gradient that is not finite is skipped, since one bad
+    start must not destroy a policy.
+    """
+
+    def epoch(state: PolicyState, starts: State) -> tuple[PolicyState, Float[Array, ""]]:
+        loss, gradient = policy_gradient(state.policy, dynamics, task, starts, delay=delay)
+        update, memory = optimiser.update(gradient, state.optimiser, state.policy.layers)
+        layers = optax.apply_updates(state.policy.layers, update)
+        fine = jnp.isfinite(optax.global_norm(gradient))
+        layers, memory = jax.tree.map(
+            lambda new, old: jnp.where(fine, new, old), (layers, memory), (state.policy.layers, state.optimiser)
+        )
+        policy = eqx.tree_at(lambda p: p.layers, state.policy, layers)
+        return PolicyState(policy, memory), loss
+
+    return lax.scan(epoch, state, x0)

@@ -1,0 +1,68 @@
+"""Train a policy from scratch in the nominal model (paper, Sec. IV-A.2)."""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import optax
+from jax import random
+from jaxtyping import Array, Float, Key
+
+from ..control.policy import Policy
+from ..physics.dynamics import AbstractDynamics
+from ..physics.state import State
+from ..tasks.task import AbstractTask
+from .bptt import PolicyState, bptt
+
+Chunk = Callable[[PolicyState, Key[Array, ""]], tuple[PolicyState, Float[Array, " epochs"]]]
+
+
+def starts(task: AbstractTask, key: Key[Array, ""], epochs: int, envs: int) -> State:
+    """Random starts, epochs x environments; the key is consumed."""
+    return jax.vmap(jax.vmap(task.reset))(random.split(key, (epochs, envs)))
+
+
+def training_chunk(
+    dynamics: AbstractDynamics[Any],
+    task: AbstractTask,
+    *,
+    optimiser: optax.GradientTransformation,
+    envs: int,
+    epochs: int,
+    delay: int = 0,
+) -> Chunk:
+    """A compiled function that trains for ``epochs`` epochs on fresh starts.
+
+    Training is cut into such chunks, so that progress can be shown and an interrupted run keeps what it has.
+    """
+
+    @jax.jit
+    def chunk(state: PolicyState, key: Key[Array, ""]) -> tuple[PolicyState, Float[Array, " epochs"]]:
+        return bptt(state, dynamics, task, starts(task, key, epochs, envs), optimiser=optimiser, delay=delay)
+
+    return chunk
+
+
+def pretrain(
+    policy: Policy,
+    dynamics: AbstractDynamics[Any],
+    task: AbstractTask,
+    key: Key[Array, ""],
+    *,
+    optimiser: optax.GradientTransformation,
+    epochs: int,
+    envs: int,
+    delay: int = 0,
+    chunk: int = 10,
+) -> Iterator[tuple[PolicyState, Float[Array, " chunk"]]]:
+    """Yield the trained state and the losses of each ``chunk`` epochs; the key is consumed.
+
+    Raises ``ValueError`` if ``epochs`` is not a multiple of ``chunk``, since every chunk runs the same program.
+    """
+    if epochs % chunk or epochs <= 0:
+        raise ValueError(f"epochs = {epochs} must be a positive multiple of {chunk}")
+    run = training_chunk(dynamics, task, optimiser=optimiser, envs=envs, epochs=chunk, delay=delay)
+    state = PolicyState(policy, optimiser.init(policy.layers))
+    for k in random.split(key, epochs // chunk):
+        state, losses = run(state, k)
+        yield state, losses

@@ -1,0 +1,173 @@
+"""Models of motion: x_{t+1} = f(x_t, u_t), one control tick at a time.
+
+The four configurations of the paper's runtime study (Sec. IV-C) are four expressions::
+
+    Hybrid(PointMass(dt), r)                                        # the paper's choice
+    Hybrid(PointMass(dt), r, backprop=True)
+    StraightThrough(Hybrid(Rotors(vehicle, dt), r), PointMass(dt))
+    StraightThrough(Hybrid(Rotors(vehicle, dt), r), Hybrid(PointMass(dt), r, backprop=True))
+"""
+
+import abc
+from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from . import so3
+from .state import STANDARD_GRAVITY, Command, State, StateDot
+
+X = TypeVar("X")
+
+
+class AbstractDynamics(eqx.Module, Generic[X]):
+    """One control tick of a model whose own state is ``X``, and how ``X`` relates to a :class:`State`."""
+
+    if TYPE_CHECKING:  # to a type checker an abstract variable would be a dataclass field
+
+        @property
+        def dt(self) -> float:
+            """Control tick [s]; static."""
+    else:
+        dt: eqx.AbstractVar[float]
+
+    @abc.abstractmethod
+    def init(self, x: State) -> X:
+        """Lift: the model's state when the vehicle hovers in the state ``x``."""
+
+    @abc.abstractmethod
+    def state(self, s: X) -> State:
+        """Project the model's state on the vehicle's."""
+
+    @abc.abstractmethod
+    def with_state(self, s: X, x: State) -> X:
+        """Write ``x`` back; what is hidden in ``s`` stays."""
+
+    @abc.abstractmethod
+    def step(self, s: X, u: Command, a_ext: Float[Array, "3"]) -> X:
+        """One tick under the command ``u`` and the external acceleration ``a_ext`` (world [m/s^2]), both held."""
+
+
+def f_a(x: State, u: Command, a_ext: Float[Array, "3"]) -> StateDot:
+    """Eq. (1) of the paper: p' = v, R' = R [omega_cmd]x, v' = R c + g, plus an external acceleration [m/s^2]."""
+    thrust = x.R[:, 2] * u.c  # R @ [0, 0, c]
+    gravity = jnp.array([0.0, 0.0, -STANDARD_GRAVITY], dtype=x.p.dtype)
+    return StateDot(p=x.v, omega=u.omega, v=thrust + gravity + a_ext)
+
+
+class PointMass(AbstractDynamics[State]):
+    """The low-fidelity model: Eq. (1), integrated by Runge-Kutta 4 over the coupled p, R, v (paper, Sec. III-E).
+
+    Within a tick the body rates are constant, so each stage's attitude ``R exp([omega] tau)`` is exact and on SO(3).
+    """
+
+    dt: float = eqx.field(static=True)
+
+    def init(self, x: State) -> State:
+        """Identity."""
+        return x
+
+    def state(self, s: State) -> State:
+        """Identity."""
+        return s
+
+    def with_state(self, s: State, x: State) -> State:
+        """The new state; nothing is hidden."""
+        return x
+
+    def step(self, s: State, u: Command, a_ext: Float[Array, "3"]) -> State:
+        """One Runge-Kutta step of ``dt`` seconds."""
+        h = self.dt
+        middle = so3.mul(s.R, so3.exp(0.5 * h * u.omega))
+        end = so3.mul(s.R, so3.exp(h * u.omega))
+        a1 = f_a(s, u, a_ext).v
+        a2 = f_a(State(s.p, middle, s.v), u, a_ext).v  # = a3: the acceleration depends on R, c and a_ext alone
+        a4 = f_a(State(s.p, end, s.v), u, a_ext).v
+        p = s.p + h * s.v + h**2 / 6.0 * (a1 + 2.0 * a2)
+        v = s.v + h / 6.0 * (a1 + 4.0 * a2 + a4)
+        return State(p, end, v)
+
+
+class Residual(Protocol):
+    """Predicts the acceleration that a model misses, world frame [m/s^2]. Any function of (x, u) will do."""
+
+    def __call__(self, x: State, u: Command, /) -> Float[Array, "3"]:
+        """Missing acceleration in the state ``x`` while ``u`` acts."""
+        ...
+
+
+class Hybrid(AbstractDynamics[X]):
+    """Any model plus a residual, evaluated once and held over the tick (paper, Sec. III-E).
+
+    With ``backprop=False`` no gradient flows through the residual: neither to its weights nor, through its inputs,
+    to state and command. That is the paper's back-propagation "through the analytical model only".
+    """
+
+    base: AbstractDynamics[X]
+    residual: Residual
+    backprop: bool = eqx.field(static=True, default=False)
+
+    @property
+    def dt(self) -> float:
+        """Control tick of the base model [s]."""
+        return self.base.dt
+
+    def init(self, x: State) -> X:
+        """As the base model."""
+        return self.base.init(x)
+
+    def state(self, s: X) -> State:
+        """As the base model."""
+        return self.base.state(s)
+
+    def with_state(self, s: X, x: State) -> X:
+        """As the base model."""
+        return self.base.with_state(s, x)
+
+    def step(self, s: X, u: Command, a_ext: Float[Array, "3"]) -> X:
+        """The base model's tick with the residual added to ``a_ext``."""
+        a_res = self.residual(self.base.state(s), u)
+        return self.base.step(s, u, a_ext + (a_res if self.backprop else lax.stop_gradient(a_res)))
+
+
+class StraightThrough(AbstractDynamics[X]):
+    """The value of one model, the gradient of another: forward ``forward``, backward ``backward``.
+
+    Only (p, R, v) carries a gradient; what is hidden in the forward model's state does not.
+    """
+
+    forward: AbstractDynamics[X]
+    backward: AbstractDynamics[State]
+
+    def __check_init__(self) -> None:
+        """Raise ``ValueError`` if the two models tick at different rates."""
+        if self.forward.dt != self.backward.dt:
+            raise ValueError(f"StraightThrough: forward.dt = {self.forward.dt} s, backward.dt = {self.backward.dt} s")
+
+    @property
+    def dt(self) -> float:
+        """Control tick of both models [s]."""
+        return self.forward.dt
+
+    def init(self, x: State) -> X:
+        """As the forward model."""
+        return self.forward.init(x)
+
+    def state(self, s: X) -> State:
+        """As the forward model."""
+        return self.forward.state(s)
+
+    def with_state(self, s: X, x: State) -> X:
+        """As the forward model."""
+        return self.forward.with_state(s, x)
+
+    def step(self, s: X, u: Command, a_ext: Float[Array, "3"]) -> X:
+        """The forward model's tick, with the backward model's derivative at the same state and command."""
+        ahead = self.forward.step(lax.stop_gradient(s), lax.stop_gradient(u), lax.stop_gradient(a_ext))
+        back = self.backward.step(self.forward.state(s), u, a_ext)
+        value = self.forward.state(ahead)
+        surrogate = jax.tree.map(lambda f, b: f + (b - lax.stop_gradient(b)), value, back)
+        return self.forward.with_state(ahead, surrogate)

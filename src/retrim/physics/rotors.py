@@ -1,0 +1,144 @@
+"""A rotor-level model at 1 kHz: rate loop, mixer, motors with lag, thrust-map error, rotor drag, rigid body.
+
+The first realistic plant, and a high-fidelity model for :class:`StraightThrough`. Rotors are ordered front-right,
+back-left, back-right, front-left; the first two turn so that their drag torque acts towards -z.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from . import so3
+from .dynamics import AbstractDynamics
+from .state import STANDARD_GRAVITY, Command, State
+from .vehicle import Vehicle
+
+SUBSTEP = 1e-3  # [s]
+
+
+class RotorState(eqx.Module):
+    """State of the rotor-level model."""
+
+    x: State
+    omega: Float[Array, "3"]
+    """Body rates [rad/s]."""
+    motors: Float[Array, "4"]
+    """Rotor speeds [rad/s]."""
+    integral: Float[Array, "3"]
+    """Integral of the rate error [rad]."""
+    omega_dot: Float[Array, "3"]
+    """Body angular acceleration over the last millisecond [rad/s^2], for the D term."""
+
+
+class RateLoop(eqx.Module):
+    """PID on body rates, in units of angular acceleration. All gains are per axis."""
+
+    kp: Float[Array, "3"]
+    """[1/s]"""
+    ki: Float[Array, "3"]
+    """[1/s^2]"""
+    kd: Float[Array, "3"]
+    """[-]; acts on the measured angular acceleration"""
+    integral_max: Float[Array, ""]
+    """Clamp of the integral [rad]."""
+
+
+def default_rate_loop() -> RateLoop:
+    """Settles in about 0.1 s on both quadrotors of the paper."""
+    return RateLoop(
+        kp=jnp.array([25.0, 25.0, 12.5]),
+        ki=jnp.array([37.0, 37.0, 37.0]),
+        kd=jnp.array([0.05, 0.05, 0.0]),
+        integral_max=jnp.array(0.1),
+    )
+
+
+class Rotors(AbstractDynamics[RotorState]):
+    """Rotor-level quadrotor under a CTBR command.
+
+    ``thrust_gain`` multiplies the true thrust: the error of the thrust map. ``drag`` [1/s] is the linear rotor drag
+    per body axis at hover speed; it grows in proportion to the rotor speeds (blade-element theory, first order).
+    """
+
+    vehicle: Vehicle
+    loop: RateLoop
+    thrust_gain: Float[Array, ""]
+    drag: Float[Array, "3"]
+    dt: float = eqx.field(static=True)
+
+    def __check_init__(self) -> None:
+        """Raise ``ValueError`` if the tick is not a whole number of milliseconds."""
+        if abs(self.dt / SUBSTEP - round(self.dt / SUBSTEP)) > 1e-6 or self.dt < SUBSTEP:
+            raise ValueError(f"Rotors.dt = {self.dt} s must be a whole number of milliseconds")
+
+    @classmethod
+    def of(cls, vehicle: Vehicle, dt: float, *, thrust_error: float = 0.035) -> "Rotors":
+        """The realistic defaults: +3.5 % thrust, rotor drag 0.3, 0.3, 0.37 1/s."""
+        return cls(vehicle, default_rate_loop(), jnp.array(1.0 + thrust_error), jnp.array([0.3, 0.3, 0.37]), dt)
+
+    def init(self, x: State) -> RotorState:
+        """Hovering rotors, no rotation."""
+        motors = jnp.ones(4, dtype=x.p.dtype) * self.vehicle.hover_speed
+        return RotorState(x, jnp.zeros_like(x.p), motors, jnp.zeros_like(x.p), jnp.zeros_like(x.p))
+
+    def state(self, s: RotorState) -> State:
+        """(p, R, v)."""
+        return s.x
+
+    def with_state(self, s: RotorState, x: State) -> RotorState:
+        """Replace (p, R, v)."""
+        return RotorState(x, s.omega, s.motors, s.integral, s.omega_dot)
+
+    def step(self, s: RotorState, u: Command, a_ext: Float[Array, "3"]) -> RotorState:
+        """One control tick of 1 ms substeps."""
+        after, _ = lax.scan(lambda s, _: (self.substep(s, u, a_ext), None), s, length=round(self.dt / SUBSTEP))
+        return after
+
+    def substep(self, s: RotorState, u: Command, a_ext: Float[Array, "3"]) -> RotorState:
+        """One millisecond: rate loop, motors, forces, rigid body (semi-implicit, attitude on SO(3))."""
+        car, h = self.vehicle, SUBSTEP
+        speeds, integral = self.rate_loop(s, u)
+        motors = speeds + (s.motors - speeds) * jnp.exp(-h / car.motor_tau)
+        thrusts = car.thrust_coefficient * self.thrust_gain * motors**2
+        force, torque = self.wrench(s, motors, thrusts)
+        omega_dot = (torque - jnp.cross(s.omega, car.inertia * s.omega)) / car.inertia
+        omega = s.omega + h * omega_dot
+        gravity = jnp.array([0.0, 0.0, -STANDARD_GRAVITY], dtype=s.x.p.dtype)
+        a = s.x.R @ force / car.mass + gravity + a_ext
+        x = State(s.x.p + h * s.x.v + 0.5 * h**2 * a, s.x.R @ so3.exp(h * omega), s.x.v + h * a)
+        return RotorState(x, omega, motors, integral, omega_dot)
+
+    def rate_loop(self, s: RotorState, u: Command) -> tuple[Float[Array, "4"], Float[Array, "3"]]:
+        """Rotor speeds [rad/s] to command, and the integral of the rate error [rad]."""
+        car, loop = self.vehicle, self.loop
+        low, high = car.command_min, car.command_max
+        error = jnp.clip(u.omega, low.omega, high.omega) - s.omega
+        integral = jnp.clip(s.integral + SUBSTEP * error, -loop.integral_max, loop.integral_max)
+        wanted = loop.kp * error + loop.ki * integral - loop.kd * s.omega_dot
+        torque = car.inertia * wanted + jnp.cross(s.omega, car.inertia * s.omega)
+        thrusts = self.mixed(car.mass * jnp.clip(u.c, low.c, high.c), torque)
+        idle = car.thrust_coefficient * car.motor_min**2
+        return jnp.sqrt(jnp.clip(thrusts, idle, car.thrust_max / 4.0) / car.thrust_coefficient), integral
+
+    def mixed(self, thrust: Float[Array, ""], torque: Float[Array, "3"]) -> Float[Array, "4"]:
+        """Thrust of each rotor [N] that gives the collective ``thrust`` [N] and the ``torque`` [Nm]."""
+        arm, kappa = self.vehicle.arm, self.vehicle.torque_ratio
+        levers = jnp.stack([arm[1], arm[0], kappa])
+        return thrust / 4.0 + _signs(thrust.dtype).T @ (torque / levers) / 4.0
+
+    def wrench(
+        self, s: RotorState, motors: Float[Array, "4"], thrusts: Float[Array, "4"]
+    ) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+        """Force [N] and torque [Nm] of all rotors in the body frame; the inverse of the mixer, plus rotor drag."""
+        car = self.vehicle
+        levers = jnp.stack([car.arm[1], car.arm[0], car.torque_ratio])
+        torque = levers * (_signs(thrusts.dtype) @ thrusts)
+        drag = car.mass * self.drag * (jnp.mean(motors) / car.hover_speed) * (s.x.R.T @ s.x.v)
+        up = jnp.array([0.0, 0.0, 1.0], dtype=thrusts.dtype)
+        return jnp.sum(thrusts) * up - drag, torque
+
+
+def _signs(dtype: jnp.dtype) -> Float[Array, "3 4"]:
+    """How each rotor's thrust turns the body about x, y and z."""
+    return jnp.array([[-1.0, 1.0, -1.0, 1.0], [-1.0, 1.0, 1.0, -1.0], [-1.0, -1.0, 1.0, 1.0]], dtype=dtype)

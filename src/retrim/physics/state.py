@@ -1,0 +1,81 @@
+"""What a quadrotor is and what it is told: state x = (p, R, v), command u = (c, omega).
+
+Frames, here and everywhere: the world frame has z up; the body frame is forward-left-up; ``R`` maps body to world.
+"""
+
+from typing import Self, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from . import so3
+
+T = TypeVar("T")
+
+STANDARD_GRAVITY = 9.81  # [m/s^2], the paper's u_hover = [9.81, 0, 0, 0]
+
+
+class StateDot(eqx.Module):
+    """Rate of change of a :class:`State`; the attitude moves by body rates."""
+
+    p: Float[Array, "3"]
+    """Velocity, world [m/s]."""
+    omega: Float[Array, "3"]
+    """Body rates [rad/s]."""
+    v: Float[Array, "3"]
+    """Acceleration, world [m/s^2]."""
+
+
+class State(eqx.Module):
+    """x = (p, R, v): 15 numbers (paper, Sec. III-B)."""
+
+    p: Float[Array, "3"]
+    """Position, world [m]."""
+    R: Float[Array, "3 3"]
+    """Attitude, body to world."""
+    v: Float[Array, "3"]
+    """Velocity, world [m/s]."""
+
+    @classmethod
+    def at(cls, p: Float[Array, "3"]) -> Self:
+        """At rest and level at the position ``p`` [m]."""
+        return cls(p, jnp.eye(3, dtype=p.dtype), jnp.zeros_like(p))
+
+    def moved(self, rate: StateDot, h: float) -> "State":
+        """The state after moving at a constant ``rate`` for ``h`` seconds; the attitude stays on SO(3)."""
+        return State(self.p + h * rate.p, so3.mul(self.R, so3.exp(h * rate.omega)), self.v + h * rate.v)
+
+    def vector(self) -> Float[Array, "15"]:
+        """[p, vec R (row by row), v]."""
+        return jnp.concatenate([self.p, self.R.reshape(9), self.v])
+
+
+class Command(eqx.Module):
+    """u = (c, omega): collective thrust and body rates (CTBR), 4 numbers."""
+
+    c: Float[Array, ""]
+    """Mass-normalised collective thrust along body z [m/s^2]; 9.81 hovers."""
+    omega: Float[Array, "3"]
+    """Body rates [rad/s]."""
+
+    @classmethod
+    def hover(cls) -> Self:
+        """u_hover = [9.81, 0, 0, 0]."""
+        return cls(jnp.array(STANDARD_GRAVITY), jnp.zeros(3))
+
+    def vector(self) -> Float[Array, "4"]:
+        """[c, omega]."""
+        return jnp.concatenate([self.c[None], self.omega])
+
+    @classmethod
+    def of(cls, vector: Float[Array, "4"]) -> Self:
+        """Inverse of :meth:`vector`."""
+        return cls(vector[0], vector[1:])
+
+
+def where(condition: Array, yes: T, no: T) -> T:
+    """``jnp.where`` leaf by leaf, for a scalar condition."""
+    chosen: T = jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
+    return chosen

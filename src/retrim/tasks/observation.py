@@ -1,0 +1,62 @@
+"""o = h(x): what a policy sees. The same function serves roll-outs, evaluation and flight."""
+
+import abc
+from typing import Generic, TypeVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..physics.state import STANDARD_GRAVITY, Command, State
+
+M = TypeVar("M")
+
+POSITION_SCALE = 1.5  # [m], half the side of the world box of the published training set-up
+VELOCITY_SCALE = 5.0  # [m/s], the same
+
+
+class AbstractObservation(eqx.Module, Generic[M]):
+    """h(x) and what it must remember between ticks (``M``, of fixed shape)."""
+
+    @property
+    @abc.abstractmethod
+    def size(self) -> int:
+        """Length of the observation."""
+
+    @abc.abstractmethod
+    def init(self, x: State) -> M:
+        """Memory at the start of a flight or roll-out."""
+
+    @abc.abstractmethod
+    def __call__(self, memory: M, t: Float[Array, ""], x: State, last: Command) -> tuple[Float[Array, " o"], M]:
+        """Observation at time ``t`` [s], given the command issued one tick ago; and the new memory."""
+
+
+class StateObs(AbstractObservation[Float[Array, "history 4"]]):
+    """o = [p, R, v] and the last ``history`` commands, oldest first: 15 + 4 ``history`` numbers.
+
+    The paper has ``history=0`` (15 numbers); the authors' code 3 (27 numbers), which restores the Markov property
+    under a command delay of up to three ticks. Position is relative to ``origin``; every entry is scaled to order one.
+    """
+
+    origin: Float[Array, "3"]
+    omega_max: Float[Array, "3"]
+    history: int = eqx.field(static=True, default=0)
+
+    @property
+    def size(self) -> int:
+        """15 + 4 ``history``."""
+        return 15 + 4 * self.history
+
+    def init(self, x: State) -> Float[Array, "history 4"]:
+        """As if the vehicle had hovered until now."""
+        return jnp.zeros((self.history, 4), dtype=x.p.dtype)
+
+    def __call__(
+        self, memory: Float[Array, "history 4"], t: Float[Array, ""], x: State, last: Command
+    ) -> tuple[Float[Array, " o"], Float[Array, "history 4"]]:
+        """Scaled state and commands."""
+        scaled = jnp.concatenate([(last.c / STANDARD_GRAVITY - 1.0)[None], last.omega / self.omega_max])
+        memory = jnp.concatenate([memory, scaled[None]])[1:]
+        state = jnp.concatenate([(x.p - self.origin) / POSITION_SCALE, x.R.reshape(9), x.v / VELOCITY_SCALE])
+        return jnp.concatenate([state, memory.reshape(-1)]), memory

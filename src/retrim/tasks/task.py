@@ -1,0 +1,61 @@
+"""What a task must say: where it starts, what it rewards, when it is lost, how its error is measured."""
+
+import abc
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Key
+
+from ..physics.state import Command, State
+from .observation import AbstractObservation
+
+
+class AbstractTask(eqx.Module):
+    """One drone, one task. Times are seconds since the start; positions are world coordinates [m]."""
+
+    if TYPE_CHECKING:  # to a type checker an abstract variable would be a dataclass field
+
+        @property
+        def dt(self) -> float:
+            """Control tick [s]; static."""
+
+        @property
+        def horizon(self) -> int:
+            """Ticks of one training roll-out; static."""
+
+        @property
+        def observation(self) -> AbstractObservation[Any]:
+            """h(x): what the policy sees, in training and in flight."""
+    else:
+        dt: eqx.AbstractVar[float]
+        horizon: eqx.AbstractVar[int]
+        observation: eqx.AbstractVar[AbstractObservation]
+
+    @abc.abstractmethod
+    def reset(self, key: Key[Array, ""]) -> State:
+        """A random start; the key is consumed."""
+
+    @abc.abstractmethod
+    def reward(self, t: Float[Array, ""], x: State, u: Command) -> Float[Array, ""]:
+        """r(x_t, u_t), differentiable; ``u`` is the command that acts from ``t`` on."""
+
+    @abc.abstractmethod
+    def alive(self, t: Float[Array, ""], x: State) -> Bool[Array, ""]:
+        """False once the vehicle is lost; false also for a state that is not finite."""
+
+    @abc.abstractmethod
+    def error(self, t: Float[Array, ""], x: State) -> Float[Array, ""]:
+        """The paper's metric: distance from where the vehicle should be [m]."""
+
+
+def huber(y: Float[Array, " n"]) -> Float[Array, ""]:
+    """Huber loss with threshold 1 of the 2-norm of ``y``: |y|^2 / 2 up to 1, |y| - 1/2 beyond.
+
+    The paper says "the Huber loss" of a vector and leaves open whether of its norm or of each component; the norm does
+    not depend on the choice of axes. Exact, with an exact gradient, at zero.
+    """
+    squared = jnp.sum(y * y)
+    inside = squared <= 1.0
+    norm = jnp.sqrt(jnp.where(inside, jnp.ones_like(squared), squared))
+    return jnp.where(inside, 0.5 * squared, norm - 0.5)

@@ -1,0 +1,1 @@
+"""Pictures; nothing else imports this but the command line."""

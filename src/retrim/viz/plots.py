@@ -1,0 +1,118 @@
+"""Pictures of flights: the only place that imports matplotlib."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+# Okabe and Ito's colours, distinguishable with any colour vision.
+BASE, ADAPTED, UPDATE, PUSH, INK = "#D55E00", "#0072B2", "#009E73", "#E69F00", "#333333"
+
+
+@dataclass(frozen=True)
+class Track:
+    """One flight, as it is drawn."""
+
+    t: np.ndarray
+    """[s]"""
+    p: np.ndarray
+    """World [m], ticks x 3."""
+    error: np.ndarray
+    """[m]"""
+    swaps: tuple[float, ...] = ()
+    """When a new policy took over [s]."""
+    crashed: bool = False
+
+
+@dataclass(frozen=True)
+class Push:
+    """A disturbance while it lasts."""
+
+    start: float
+    """[s]"""
+    end: float
+    a: tuple[float, float, float]
+    """World [m/s^2]."""
+
+
+def flight_figure(
+    title: str, base: list[Track], adapted: list[Track], pushes: list[Push], goal: tuple[float, float, float]
+) -> Figure:
+    """Error over time beside the path from above; base against adapted, one thin line a flight, the mean thick."""
+    with plt.rc_context(
+        {"font.size": 11, "axes.spines.top": False, "axes.spines.right": False, "svg.fonttype": "none"}
+    ):
+        figure, (left, right) = plt.subplots(
+            1, 2, figsize=(13, 5.4), width_ratios=(1.9, 1), layout="constrained", facecolor="white"
+        )
+        figure.suptitle(title, fontsize=14, fontweight="bold", color=INK)
+        _errors(left, base, adapted, pushes)
+        _paths(right, base, adapted, goal)
+    return figure
+
+
+def save(figure: Figure, folder: Path, name: str) -> list[Path]:
+    """Write PNG and SVG; returns their paths."""
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = [folder / f"{name}.{kind}" for kind in ("png", "svg")]
+    for path in paths:
+        figure.savefig(path, dpi=130, metadata={"Date": None} if path.suffix == ".svg" else None)
+    plt.close(figure)
+    return paths
+
+
+def _errors(axes: Axes, base: list[Track], adapted: list[Track], pushes: list[Push]) -> None:
+    top = 1.15 * max((float(np.nanmax(track.error)) for track in (*base, *adapted)), default=1.0)
+    for push in pushes:
+        strength = "  ".join(f"{a:+g}" for a in push.a)
+        axes.axvspan(push.start, push.end, color=PUSH, alpha=0.13 if push.a[0] >= 0 else 0.28, linewidth=0)
+        axes.text(
+            (push.start + push.end) / 2, 0.985 * top, f"pushed by ({strength}) m/s²",
+            ha="center", va="top", color="#8a5a00", fontsize=10, zorder=5,
+            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 2},
+        )  # fmt: skip
+    swaps = sorted({round(t, 2) for track in adapted for t in track.swaps})
+    for i, t in enumerate(swaps):
+        axes.axvline(t, color=UPDATE, linestyle="--", linewidth=1.2, label=None if i else "new policy takes over")
+    for tracks, color, name in ((base, BASE, "base policy"), (adapted, ADAPTED, "adapted in flight")):
+        for track in tracks:
+            axes.plot(track.t, track.error, color=color, alpha=0.35, linewidth=0.8)
+            if track.crashed:
+                axes.plot(track.t[-1], track.error[-1], "x", color=color, markersize=10)
+        whole = [track.error for track in tracks if not track.crashed]
+        if whole:
+            mean = np.mean(whole, axis=0)
+            final = f"{100 * mean[-100:].mean():.1f} cm off at the end"
+            axes.plot(tracks[0].t[: len(mean)], mean, color=color, linewidth=2.4, label=f"{name}: {final}")
+    axes.set(xlabel="time [s]", ylabel="distance from the target [m]", ylim=(0, top))
+    axes.margins(x=0)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=3, frameon=False)
+
+
+def _paths(axes: Axes, base: list[Track], adapted: list[Track], goal: tuple[float, float, float]) -> None:
+    for tracks, color, name in ((base, BASE, "base"), (adapted, ADAPTED, "adapted")):
+        for i, track in enumerate(tracks):
+            axes.plot(track.p[:, 0], track.p[:, 1], color=color, alpha=0.35, linewidth=0.9)
+            axes.plot(
+                *track.p[0, :2],
+                ".",
+                color="#999999",
+                markersize=5,
+                label="starts" if i == 0 and color == BASE else None,
+            )
+        for i, track in enumerate(tracks):
+            axes.plot(
+                *track.p[-1, :2], "o", color=color, markersize=7, markeredgecolor="white",
+                label=None if i else f"{name}, at the end",
+            )  # fmt: skip
+    axes.plot(goal[0], goal[1], "+", color=INK, markersize=18, markeredgewidth=2, label="target")
+    axes.set(xlabel="x [m]", ylabel="y [m]", title="the same flights from above")
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=2, frameon=False)
