@@ -4,6 +4,7 @@ Compute time is charged to flight time. Work that is due at a tick sees what was
 visible only after the seconds it is charged, exactly as if a learner had worked beside the flight.
 """
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -71,7 +72,7 @@ class _Learner:
         began = time.perf_counter()
         publish = job()
         seconds = time.perf_counter() - began if self._charge is None else self._charge
-        self._ready = (tick + max(1, -int(-seconds // self._dt)), publish)
+        self._ready = (tick + max(1, math.ceil(seconds / self._dt - 1e-6)), publish)
 
 
 class AdaptivePilot:

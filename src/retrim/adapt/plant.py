@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -30,6 +30,7 @@ class Sample(NamedTuple):
     """Measured acceleration, world [m/s^2], if the plant has one."""
 
 
+@runtime_checkable
 class Plant(Protocol):
     """Three calls. ``stop`` is idempotent, leaves the vehicle safe, and is always called at the end of a flight."""
 

@@ -33,7 +33,7 @@ class PolicyController(AbstractController[tuple[Any, Command]]):
 
     def init(self, x: State) -> tuple[Any, Command]:
         """As if the vehicle had hovered until now."""
-        return self.observation.init(x), Command.hover()
+        return self.observation.init(x), self.policy.u_hover
 
     def __call__(
         self, memory: tuple[Any, Command], t: Float[Array, ""], x: State

@@ -9,9 +9,9 @@ from jaxtyping import Array, Float, Key
 from ..physics.state import Command
 from ..physics.vehicle import Vehicle
 
-Taps = tuple[Float[Array, " _"], ...]
-"""One vector per layer, added to the pre-activation; see :mod:`retrim.learn.taps`."""
-Inputs = tuple[Float[Array, " _"], ...]
+Taps = tuple[Float[Array, "... _"], ...]
+"""One vector per layer (in :mod:`retrim.learn` with rows in front), added to the pre-activation."""
+Inputs = tuple[Float[Array, "... _"], ...]
 """What each layer was given."""
 
 

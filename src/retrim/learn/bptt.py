@@ -70,7 +70,7 @@ def bptt(
         loss, gradient = policy_gradient(state.policy, dynamics, task, starts, delay=delay)
         update, memory = optimiser.update(gradient, state.optimiser, state.policy.layers)
         layers = optax.apply_updates(state.policy.layers, update)
-        fine = jnp.isfinite(optax.global_norm(gradient))
+        fine = jnp.isfinite(optax.tree.norm(gradient))
         layers, memory = jax.tree.map(
             lambda new, old: jnp.where(fine, new, old), (layers, memory), (state.policy.layers, state.optimiser)
         )

@@ -155,7 +155,7 @@ def fit_residual(
     sigma^2 is 2 sigma u v^T. Also returns the ensemble's summed data error of each step.
     """
     features = jax.vmap(lambda x, u: jnp.concatenate([x.vector(), u.vector()]))(rows.x, rows.u)
-    features = (features - state.residual.offset) / state.residual.scale
+    features = (features - state.residual.offset[None]) / state.residual.scale[None]
     weight = rows.valid.astype(features.dtype)
     weight = weight / jnp.maximum(jnp.sum(weight), 1.0)
 

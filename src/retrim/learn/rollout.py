@@ -84,15 +84,16 @@ def _scan(
         # A lost vehicle is frozen where it last was well: a diverging state turns masked rewards into NaN gradients.
         s = where(survived, after, lax.stop_gradient(s))
         worst = jnp.minimum(worst, lax.stop_gradient(reward))
-        return (s, memory, u, waiting, survived, worst), (Trajectory(x, acting, reward, alive), inputs)
+        return (s, memory, u, waiting, survived, worst), ((x, acting, reward, alive), inputs)
 
     start = (
         dynamics.init(x0),
         task.observation.init(x0),
         hover,
         (hover,) * delay,
-        task.alive(jnp.zeros_like(x0.p[0]), x0),
+        jnp.array(True),
         jnp.zeros_like(x0.p[0]),
     )
     ticks = jnp.arange(task.horizon, dtype=x0.p.dtype)
-    return lax.scan(tick, start, (ticks, taps))[1]  # type: ignore[no-any-return]
+    _, (flown, inputs) = lax.scan(tick, start, (ticks, taps))
+    return Trajectory(*flown), inputs

@@ -3,7 +3,7 @@
 Disturbances belong to the plant. The nominal model never hears of them.
 """
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from .state import State
 
 
+@runtime_checkable
 class Disturbance(Protocol):
     """Any function of time [s] and state will do."""
 

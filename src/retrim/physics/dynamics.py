@@ -9,7 +9,7 @@ The four configurations of the paper's runtime study (Sec. IV-C) are four expres
 """
 
 import abc
-from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING, Generic, Protocol, TypeVar, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -91,6 +91,7 @@ class PointMass(AbstractDynamics[State]):
         return State(p, end, v)
 
 
+@runtime_checkable
 class Residual(Protocol):
     """Predicts the acceleration that a model misses, world frame [m/s^2]. Any function of (x, u) will do."""
 

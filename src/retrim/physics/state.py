@@ -3,14 +3,12 @@
 Frames, here and everywhere: the world frame has z up; the body frame is forward-left-up; ``R`` maps body to world.
 """
 
-from typing import Self, TypeVar
+from typing import TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
-
-from . import so3
 
 T = TypeVar("T")
 
@@ -39,13 +37,9 @@ class State(eqx.Module):
     """Velocity, world [m/s]."""
 
     @classmethod
-    def at(cls, p: Float[Array, "3"]) -> Self:
+    def at(cls, p: Float[Array, "3"]) -> "State":
         """At rest and level at the position ``p`` [m]."""
         return cls(p, jnp.eye(3, dtype=p.dtype), jnp.zeros_like(p))
-
-    def moved(self, rate: StateDot, h: float) -> "State":
-        """The state after moving at a constant ``rate`` for ``h`` seconds; the attitude stays on SO(3)."""
-        return State(self.p + h * rate.p, so3.mul(self.R, so3.exp(h * rate.omega)), self.v + h * rate.v)
 
     def vector(self) -> Float[Array, "15"]:
         """[p, vec R (row by row), v]."""
@@ -61,7 +55,7 @@ class Command(eqx.Module):
     """Body rates [rad/s]."""
 
     @classmethod
-    def hover(cls) -> Self:
+    def hover(cls) -> "Command":
         """u_hover = [9.81, 0, 0, 0]."""
         return cls(jnp.array(STANDARD_GRAVITY), jnp.zeros(3))
 
@@ -70,7 +64,7 @@ class Command(eqx.Module):
         return jnp.concatenate([self.c[None], self.omega])
 
     @classmethod
-    def of(cls, vector: Float[Array, "4"]) -> Self:
+    def of(cls, vector: Float[Array, "4"]) -> "Command":
         """Inverse of :meth:`vector`."""
         return cls(vector[0], vector[1:])
 

@@ -1,0 +1,268 @@
+"""The loop as a whole: buffer, gate, adapter, and the virtual clock that charges compute to flight time."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import random
+
+from helpers import hover_task, tiny_preset
+from retrim import presets
+from retrim.adapt import AdaptivePilot, ControllerPilot, Sample, Schedule, SimPlant, fly
+from retrim.adapt.adapter import Adapter
+from retrim.adapt.buffer import RollingBuffer
+from retrim.adapt.gate import judge
+from retrim.control import Policy, PolicyController
+from retrim.learn import pretrain
+from retrim.physics import Command, PointMass, State, small
+
+pytestmark = pytest.mark.usefixtures("optax_promotion")
+
+
+def at(*p):
+    return State.at(jnp.array(p))
+
+
+# ---- buffer
+
+
+def test_window_has_a_fixed_shape_and_masks_what_is_missing():
+    buffer = RollingBuffer(4)
+    with pytest.raises(ValueError, match="no tick was pushed"):
+        buffer.window()
+    for i in range(6):
+        buffer.push(at(float(i), 0.0, 1.0), Command(jnp.array(float(i)), jnp.zeros(3)))
+        window = buffer.window()
+        assert window.x.p.shape == (4, 3)
+        assert int(window.valid.sum()) == min(i + 1, 4)
+        newest = np.arange(max(0, i - 3), i + 1)
+        np.testing.assert_array_equal(window.x.p[np.asarray(window.valid), 0], newest)
+        np.testing.assert_array_equal(window.u.c[np.asarray(window.valid)], newest)
+
+
+def test_window_is_a_copy():
+    buffer = RollingBuffer(2)
+    buffer.push(at(1.0, 0.0, 1.0), Command.hover())
+    before = buffer.window()
+    buffer.push(at(2.0, 0.0, 1.0), Command.hover())
+    buffer.push(at(3.0, 0.0, 1.0), Command.hover())
+    assert float(before.x.p[-1, 0]) == 1.0
+
+
+def test_buffer_size():
+    with pytest.raises(ValueError, match="size = 1 must be at least 2"):
+        RollingBuffer(1)
+
+
+# ---- gate
+
+
+@pytest.fixture(scope="module")
+def trained():
+    """A fresh policy and one that hovers better, with the preset of both."""
+    with jax.numpy_dtype_promotion("standard"):
+        preset = tiny_preset()
+        fresh = presets.policy(preset, random.key(0))
+        *_, (state, _) = pretrain(
+            fresh,
+            presets.nominal(preset),
+            presets.task(preset),
+            random.key(1),
+            optimiser=presets.optimiser(preset),
+            epochs=60,
+            envs=8,
+            delay=1,
+        )
+        return preset, fresh, state.policy
+
+
+def verdict(candidate, incumbent, preset):
+    task = presets.task(preset)
+    x0 = jax.vmap(task.reset)(random.split(random.key(5), 4))
+    return judge(candidate, incumbent, presets.nominal(preset), task, x0, delay=preset.delay)
+
+
+def test_gate_admits_the_better_and_refuses_the_worse(trained):
+    preset, fresh, better = trained
+    found = verdict(better, fresh, preset)
+    assert bool(found.admitted)
+    assert float(found.candidate) < float(found.incumbent)
+    found = verdict(fresh, better, preset)
+    assert not bool(found.admitted)
+    assert "worse than the incumbent" in found.reason()
+
+
+def test_gate_refuses_nan_by_name(trained):
+    preset, fresh, _ = trained
+    broken = eqx.tree_at(lambda p: p.layers[1].bias, fresh, fresh.layers[1].bias.at[3].set(jnp.nan))
+    found = verdict(broken, fresh, preset)
+    assert not bool(found.admitted)
+    assert found.reason() == "a weight is not finite"
+
+
+def test_gate_admits_an_equal_and_replaces_a_broken_incumbent(trained):
+    preset, fresh, _ = trained
+    assert bool(verdict(fresh, fresh, preset).admitted)
+    broken = eqx.tree_at(lambda p: p.layers[1].bias, fresh, fresh.layers[1].bias.at[3].set(jnp.nan))
+    assert bool(verdict(fresh, broken, preset).admitted)
+
+
+# ---- adapter
+
+
+@pytest.mark.parametrize(("field", "value"), [("iters", 0), ("epochs", 0), ("envs", -1), ("delay", -1)])
+def test_impossible_sizes_are_refused_at_construction(field, value):
+    adapter = presets.adapter(tiny_preset())
+    fields = {name: getattr(adapter, name) for name in adapter.__dataclass_fields__}
+    with pytest.raises(ValueError, match=rf"Adapter\.{field} = {value}"):
+        Adapter(**(fields | {field: value}))
+
+
+def pilot(preset, policy, *, schedule=None, sinks=()):
+    adapter = presets.adapter(preset)
+    state = adapter.init(policy, presets.residual(preset, random.key(2)))
+    return AdaptivePilot(
+        adapter,
+        state,
+        schedule or presets.schedule(preset),
+        random.key(3),
+        dt=presets.DT,
+        window=preset.adapt.window,
+        sinks=sinks,
+    )
+
+
+def adaptive_flight(preset, policy, seconds, **options):
+    flying = pilot(preset, policy, **options)
+    plant = SimPlant(presets.plant_model("small"), presets.disturbance("large"))
+    log = fly(plant, flying, presets.flight_starts(preset, 1)[0], ticks=round(seconds / presets.DT))
+    return log, flying
+
+
+BRISK = Schedule(0.6, 1.0, 0.1, 0.3)
+
+
+def test_lockstep_repeats_bit_for_bit(trained):
+    preset, _, policy = trained
+    first, one = adaptive_flight(preset, policy, 3.2, schedule=BRISK)
+    second, two = adaptive_flight(preset, policy, 3.2, schedule=BRISK)
+    for a, b in zip(first, second, strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert one.events == two.events
+    assert {"residual"} < {e.kind for e in one.events}
+    jax.tree.map(np.testing.assert_array_equal, one.state, two.state)
+
+
+def test_results_appear_only_after_their_charge(trained):
+    """Residuals are due every 0.6 s and cost 0.1 s; policies every 1 s and cost 0.3 s."""
+    preset, _, policy = trained
+    _, flown = adaptive_flight(preset, policy, 3.0, schedule=BRISK)
+    times = lambda *kinds: [e.t for e in flown.events if e.kind in kinds]  # noqa: E731
+    np.testing.assert_allclose(times("residual"), [0.7, 1.3, 1.9, 2.5], atol=1e-9)
+    np.testing.assert_allclose(times("policy", "rejected"), [1.3, 2.3], atol=1e-9)
+
+
+def test_commands_are_the_old_policys_until_the_swap(trained):
+    """The flight equals an unadapted one up to the tick at which the first policy appears, and differs after it."""
+    preset, _, policy = trained
+    log, flown = adaptive_flight(preset, policy, 2.4, schedule=BRISK)
+    plant = SimPlant(presets.plant_model("small"), presets.disturbance("large"))
+    base = ControllerPilot(PolicyController(presets.task(preset).observation, policy))
+    plain = fly(plant, base, presets.flight_starts(preset, 1)[0], ticks=120)
+    swap = next(round(e.t / presets.DT) for e in flown.events if e.kind == "policy")
+    np.testing.assert_array_equal(log.u[: swap + 1], plain.u[: swap + 1])
+    assert not np.array_equal(log.u[swap + 1], plain.u[swap + 1])
+
+
+def test_a_busy_learner_is_skipped_not_queued(trained):
+    preset, _, policy = trained
+    _, flown = adaptive_flight(preset, policy, 2.5, schedule=Schedule(10.0, 0.5, 0.1, 0.7))
+    assert [round(e.t, 2) for e in flown.events if e.kind == "skipped"] == [1.0, 2.0]
+
+
+def test_measured_charge_uses_the_clock(trained):
+    preset, _, policy = trained
+    _, flown = adaptive_flight(preset, policy, 1.5, schedule=Schedule(0.5, 10.0, None, None))
+    assert all(e.t > 0.5 for e in flown.events if e.kind == "residual")
+
+
+def test_one_trace_over_many_cycles(trained):
+    """New weights, optimiser states, windows and keys never compile again."""
+    preset, _, policy = trained
+    traces = []
+
+    class Counting(type(presets.task(preset))):
+        def reward(self, t, x, u):
+            traces.append(1)
+            return super().reward(t, x, u)
+
+    original = presets.task(preset)
+    fields = {name: getattr(original, name) for name in original.__dataclass_fields__}
+    adapter = eqx.tree_at(lambda a: a.task, presets.adapter(preset), Counting(**fields))
+    state = adapter.init(policy, presets.residual(preset, random.key(2)))
+    flying = AdaptivePilot(adapter, state, BRISK, random.key(3), dt=presets.DT, window=preset.adapt.window)
+    plant = SimPlant(presets.plant_model("small"), presets.disturbance("large"))
+    x0 = presets.flight_starts(preset, 1)[0]
+    fly(plant, flying, x0, ticks=60)
+    compiled = len(traces)
+    assert compiled > 0
+    fly(plant, flying, x0, ticks=250)
+    assert sum(e.kind in ("policy", "rejected") for e in flying.events) >= 4
+    assert len(traces) == compiled
+
+
+def test_adaptation_cuts_the_error_under_the_large_disturbance():
+    """The whole loop, at reduced size: after three updates at least three times closer than the base policy."""
+    preset = presets.changed(
+        presets.load("fast"),
+        pretrain={"hidden": (64, 64), "epochs": 120, "horizon": 100},
+        adapt={"improve_every": 2.0, "refine_every": 1.0, "rate": 3e-3},
+    )
+    policy = presets.policy(preset, random.key(0))
+    run = pretrain(
+        policy,
+        presets.nominal(preset),
+        presets.task(preset),
+        random.key(1),
+        optimiser=presets.optimiser(preset),
+        epochs=120,
+        envs=16,
+        delay=preset.delay,
+    )
+    *_, (state, _) = run
+    x0 = presets.flight_starts(preset, 1)[0]
+    plant = SimPlant(presets.plant_model("small"), presets.disturbance("large"))
+    base = fly(plant, ControllerPilot(PolicyController(presets.task(preset).observation, state.policy)), x0, ticks=500)
+    adapted = fly(plant, pilot(preset, state.policy), x0, ticks=500)
+    before, after = (np.linalg.norm(log.p[-50:] - preset.goal, axis=1).mean() for log in (base, adapted))
+    assert after < before / 3
+
+
+def test_a_fit_that_is_not_finite_is_dropped(trained):
+    preset, _, policy = trained
+    adapter = presets.adapter(preset)
+    state = adapter.init(policy, presets.residual(preset, random.key(2)))
+    buffer = RollingBuffer(preset.adapt.window)
+    for i in range(10):
+        buffer.push(at(0.0, 0.0, 1.0 + float("nan") * (i == 5)), Command.hover())
+    kept, _ = adapter.refine(state.residual, buffer.window())
+    jax.tree.map(np.testing.assert_array_equal, kept, state.residual)
+
+
+def test_the_nominal_model_and_the_task_do_not_know_the_plant():
+    """What the learner holds does not change with the plant's disturbance or vehicle error."""
+    adapter = presets.adapter(presets.load("paper"))
+    assert isinstance(adapter.nominal, PointMass)
+    assert isinstance(hover_task(), type(adapter.task))
+    assert not jax.tree.leaves(adapter.nominal)
+
+
+def test_pilot_starts_its_memory_anew_at_time_zero(key):
+    task = hover_task(history=2)
+    policy = jax.tree.map(lambda leaf: leaf + 0.1, Policy.of(task.observation.size, small(), key=key, hidden=(8,)))
+    flying = ControllerPilot(PolicyController(task.observation, policy))
+    start = Sample(0.0, at(0.5, 0.0, 1.0), Command.hover())
+    first = flying(start).vector()
+    flying(Sample(0.02, at(0.4, 0.0, 1.0), Command.hover()))
+    np.testing.assert_array_equal(flying(start).vector(), first)

@@ -1,0 +1,28 @@
+"""Strict everywhere: double precision, no silent promotion of types or ranks; shapes are checked by the import hook."""
+
+import os
+
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # the compile cache warns of what does not matter
+
+import jax
+import pytest
+
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+jax.config.update("jax_numpy_rank_promotion", "raise")
+
+from retrim.cli.session import enable_compile_cache  # noqa: E402  (after the configuration)
+
+enable_compile_cache()  # shared by the workers
+
+
+@pytest.fixture
+def optax_promotion():
+    """For tests that run an optimiser: optax multiplies Python floats by integer counters."""
+    with jax.numpy_dtype_promotion("standard"):
+        yield
+
+
+@pytest.fixture
+def key():
+    return jax.random.key(0)

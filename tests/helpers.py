@@ -1,0 +1,48 @@
+"""Small things that many tests need: random states, a small task, a small preset."""
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+from jax import random
+
+from retrim import presets
+from retrim.physics import Command, State, small, so3
+from retrim.tasks import Hover, StateObs
+
+GOAL = (0.0, 0.0, 1.0)
+
+
+def random_state(key, spread=1.0):
+    kp, kr, kv = random.split(key, 3)
+    return State(spread * random.normal(kp, (3,)), so3.exp(random.normal(kr, (3,))), spread * random.normal(kv, (3,)))
+
+
+def random_command(key):
+    kc, kw = random.split(key)
+    return Command(9.81 + random.normal(kc, ()), random.normal(kw, (3,)))
+
+
+def hover_task(*, horizon=5, history=0, heading=math.pi, box=5.0):
+    goal = jnp.array(GOAL)
+    observation = StateObs(goal, small().omega_max, history)
+    return Hover(goal, observation, jnp.array(box), jnp.array(heading), 0.02, horizon)
+
+
+def tiny_preset(**changes):
+    """The fast preset with a network and bursts so small that a test can afford them."""
+    preset = presets.changed(
+        presets.load("fast"),
+        pretrain={"hidden": (32, 32), "epochs": 60, "envs": 8, "horizon": 60},
+        adapt={"iters": 20, "epochs": 3, "envs": 4},
+    )
+    return presets.changed(preset, **changes) if changes else preset
+
+
+def stacked(trees):
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
+
+
+def replaced(module, **fields):
+    return dataclasses.replace(module, **fields)

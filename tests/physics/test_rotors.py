@@ -1,0 +1,146 @@
+"""Physics that a rotor-level model must obey, for both vehicles."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import random
+
+from helpers import random_command, random_state, replaced
+from retrim.physics import Command, Rotors, State, large, small, so3
+from retrim.physics.rotors import RotorState
+
+VEHICLES = {"small": small, "large": large}
+
+
+@pytest.fixture(params=list(VEHICLES))
+def exact(request):
+    """No thrust error, no drag."""
+    model = Rotors.of(VEHICLES[request.param](), 0.02, thrust_error=0.0)
+    return replaced(model, drag=jnp.zeros(3))
+
+
+def flown(model, s, u, seconds, a_ext=None):
+    step = jax.jit(lambda s: model.step(s, u, jnp.zeros(3) if a_ext is None else a_ext))
+    for _ in range(round(seconds / model.dt)):
+        s = step(s)
+    return s
+
+
+def test_hover_balance(exact):
+    s = flown(exact, exact.init(State.at(jnp.zeros(3))), Command.hover(), 2.0)
+    np.testing.assert_allclose(s.x.p, 0.0, atol=1e-10)
+    np.testing.assert_allclose(s.x.R, np.eye(3), atol=1e-12)
+    force, torque = exact.wrench(s, s.motors, exact.vehicle.thrust_coefficient * s.motors**2)
+    np.testing.assert_allclose(force, [0, 0, float(exact.vehicle.mass) * 9.81], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(torque, 0.0, atol=1e-12)
+
+
+def test_thrust_error_is_the_stated_acceleration():
+    model = replaced(Rotors.of(small(), 0.02, thrust_error=0.035), drag=jnp.zeros(3))
+    s = flown(model, model.init(State.at(jnp.zeros(3))), Command.hover(), 1.0)
+    assert s.x.v[2] == pytest.approx(0.035 * 9.81 * 1.0, rel=1e-6)
+
+
+def test_mixer_and_wrench_are_inverse(exact, key):
+    force, torque = jnp.array(5.0), 1e-3 * random.normal(key, (3,))
+    thrusts = exact.mixed(force, torque)
+    found_force, found_torque = exact.wrench(exact.init(State.at(jnp.zeros(3))), jnp.zeros(4), thrusts)
+    np.testing.assert_allclose(found_force[2], force, rtol=1e-12)
+    np.testing.assert_allclose(found_torque, torque, atol=1e-14)
+
+
+def test_each_rotor_turns_the_body_as_its_place_says(exact):
+    """Front-right, back-left, back-right, front-left; torque = r x f in a forward-left-up frame."""
+    ax, ay = (float(a) for a in exact.vehicle.arm)
+    places = [(ax, -ay), (-ax, ay), (-ax, -ay), (ax, ay)]
+    for i, (x, y) in enumerate(places):
+        _, torque = exact.wrench(exact.init(State.at(jnp.zeros(3))), jnp.zeros(4), jnp.eye(4)[i])
+        np.testing.assert_allclose(torque[:2], np.cross([x, y, 0], [0, 0, 1])[:2], atol=1e-12)
+        assert np.sign(torque[2]) == (-1 if i < 2 else 1)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_rate_step_response(exact, axis):
+    """Reaches 63 % within 150 ms (yaw 300 ms), overshoots by less than 25 %, settles on the command."""
+    u = Command(jnp.array(9.81), 1.0 * jnp.eye(3)[axis])
+    s, rates = exact.init(State.at(jnp.zeros(3))), []
+    step = jax.jit(lambda s: exact.substep(s, u, jnp.zeros(3)))
+    for _ in range(1500):
+        s = step(s)
+        rates.append(float(s.omega[axis]))
+    assert rates[300 if axis == 2 else 150] > 0.63
+    assert max(rates) < 1.25
+    assert rates[-1] == pytest.approx(1.0, abs=0.03)
+
+
+def test_mirror_symmetry(exact, key):
+    """Left and right are the same: mirror the start and the command in y, and the flight is mirrored."""
+    M = jnp.diag(jnp.array([1.0, -1.0, 1.0]))
+    x, u = random_state(key, 0.3), random_command(key)
+    mirrored = State(M @ x.p, M @ x.R @ M, M @ x.v)
+    s = flown(exact, exact.init(x), u, 0.2)
+    t = flown(exact, exact.init(mirrored), Command(u.c, -M @ u.omega), 0.2)
+    np.testing.assert_allclose(t.x.p, M @ s.x.p, atol=1e-10)
+    np.testing.assert_allclose(t.x.R, M @ s.x.R @ M, atol=1e-10)
+
+
+def test_drag_takes_energy_and_thrustless_flight_creates_none():
+    model = Rotors.of(small(), 0.02)
+    v = jnp.array([3.0, -2.0, 1.0])
+    x, zero = State(jnp.zeros(3), so3.exp(jnp.array([0.3, 0.2, 0.1])), v), jnp.zeros(3)
+    s = RotorState(x, zero, jnp.zeros(4), zero, zero)
+    force, _ = model.wrench(s, model.vehicle.hover_speed * jnp.ones(4), jnp.zeros(4))
+    power = (s.x.R @ force) @ v
+    assert power < 0.0
+    assert power == pytest.approx(-float(model.vehicle.mass) * float(model.drag @ (s.x.R.T @ v) ** 2), rel=1e-12)
+
+
+def test_commands_are_limited(exact):
+    wild = Command(jnp.array(1e4), jnp.array([1e3, 0.0, 0.0]))
+    s = flown(exact, exact.init(State.at(jnp.zeros(3))), wild, 0.5)
+    car = exact.vehicle
+    thrusts = car.thrust_coefficient * s.motors**2
+    assert float(jnp.sum(thrusts)) <= float(car.thrust_max) * (1 + 1e-9)
+    assert float(jnp.max(jnp.abs(s.omega))) < 1.5 * float(car.omega_max[0])
+
+
+def test_gradients_are_finite(exact, key):
+    for k in random.split(key, 3):
+        x, u = random_state(k), random_command(k)
+        J = jax.jacobian(lambda u, x: exact.step(exact.init(x), u, jnp.zeros(3)).x.vector(), (0, 1))(u, x)
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(J))
+
+
+def test_lift_and_project(exact, key):
+    x, y = random_state(key), random_state(random.key(7))
+    s = exact.init(x)
+    jax.tree.map(np.testing.assert_array_equal, exact.state(s), x)
+    jax.tree.map(np.testing.assert_array_equal, exact.state(exact.with_state(s, y)), y)
+
+
+@pytest.mark.parametrize("dt", [0.0005, 0.0205, 0.0])
+def test_tick_must_be_whole_milliseconds(dt):
+    with pytest.raises(ValueError, match=r"Rotors\.dt"):
+        Rotors.of(small(), dt)
+
+
+@pytest.mark.parametrize("make", VEHICLES.values(), ids=VEHICLES)
+def test_vehicles(make):
+    car = make()
+    assert float(car.mass) * 9.81 < float(car.thrust_max)
+    assert float(car.command_min.c) < 9.81 < float(car.command_max.c)
+    assert 4 * float(car.thrust_coefficient) * float(car.hover_speed) ** 2 == pytest.approx(float(car.mass) * 9.81)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("mass", -1.0, r"Vehicle\.mass = -1\.0 must be positive"),
+        ("motor_tau", float("nan"), r"Vehicle\.motor_tau = nan"),
+        ("thrust_max", 1.0, r"cannot lift its weight, 1\.86 N"),
+    ],
+)
+def test_impossible_vehicles(field, value, message):
+    with pytest.raises(ValueError, match=message):
+        replaced(small(), **{field: jnp.array(value)})

@@ -1,0 +1,77 @@
+"""Axioms of SO(3), also next to the identity, and gradients where they usually break."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from retrim.physics import so3
+
+SCALES = [1.0, 1e-2, 1e-4, 1e-7, 0.0]
+vectors = st.tuples(*[st.floats(-1.7, 1.7)] * 3).map(np.array)  # shorter than pi
+
+
+@pytest.mark.parametrize("scale", SCALES)
+@settings(max_examples=20, deadline=None)
+@given(w=vectors)
+def test_exp_is_a_rotation(scale, w):
+    R = so3.exp(jnp.asarray(scale * w))
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-14)
+    np.testing.assert_allclose(np.linalg.det(R), 1.0, atol=1e-14)
+
+
+@pytest.mark.parametrize("scale", SCALES)
+@settings(max_examples=20, deadline=None)
+@given(w=vectors)
+def test_log_inverts_exp(scale, w):
+    w = scale * w
+    np.testing.assert_allclose(so3.log(so3.exp(jnp.asarray(w))), w, rtol=1e-8, atol=1e-15)
+
+
+@settings(max_examples=20, deadline=None)
+@given(w=vectors, a=st.floats(-1, 1), b=st.floats(-1, 1))
+def test_one_parameter_subgroup(w, a, b):
+    w = jnp.asarray(w)
+    np.testing.assert_allclose(so3.mul(so3.exp(a * w), so3.exp(b * w)), so3.exp((a + b) * w), atol=1e-14)
+    np.testing.assert_allclose(so3.exp(-w), so3.exp(w).T, atol=1e-15)
+
+
+@settings(max_examples=20, deadline=None)
+@given(w=vectors, v=vectors, y=vectors)
+def test_adjoint_and_products(w, v, y):
+    w, v, y = (jnp.asarray(u) for u in (w, v, y))
+    R = so3.exp(w)
+    np.testing.assert_allclose(so3.mul(so3.mul(R, so3.exp(v)), R.T), so3.exp(so3.act(R, v)), atol=1e-13)
+    np.testing.assert_allclose(so3.hat(w) @ y, jnp.cross(w, y), atol=1e-14)
+    np.testing.assert_allclose(so3.vee(so3.hat(w)), w)
+    np.testing.assert_allclose(so3.act(R, y), R @ y, atol=1e-14)
+
+
+def test_exp_agrees_with_the_matrix_exponential():
+    w = jnp.array([0.4, -1.1, 0.7])
+    np.testing.assert_allclose(so3.exp(w), jax.scipy.linalg.expm(so3.hat(w)), atol=1e-14)
+
+
+@pytest.mark.parametrize("scale", SCALES)
+def test_derivative_at_and_near_zero(scale):
+    w = scale * jnp.array([0.3, -0.5, 0.2])
+    J = jax.jacobian(so3.exp)(w)
+    assert np.isfinite(J).all()
+    step = 1e-6
+    for i in range(3):
+        e = step * jnp.eye(3)[i]
+        np.testing.assert_allclose(J[:, :, i], (so3.exp(w + e) - so3.exp(w - e)) / (2 * step), atol=1e-9)
+    assert np.isfinite(jax.jacobian(lambda u: so3.log(so3.exp(u)))(w)).all()
+
+
+def test_second_derivative_is_finite_at_zero():
+    assert np.isfinite(jax.hessian(lambda w: so3.exp(w)[0, 1])(jnp.zeros(3))).all()
+
+
+def test_elementary_rotations():
+    q = jnp.array(jnp.pi / 2)
+    np.testing.assert_allclose(so3.act(so3.rotz(q), jnp.array([1.0, 0, 0])), [0, 1, 0], atol=1e-15)
+    np.testing.assert_allclose(so3.act(so3.rotx(q), jnp.array([0, 1.0, 0])), [0, 0, 1], atol=1e-15)
+    np.testing.assert_allclose(so3.act(so3.roty(q), jnp.array([0, 0, 1.0])), [1, 0, 0], atol=1e-15)

@@ -1,0 +1,113 @@
+"""The paper's rewards by hand-computed cases; starts; bounds; observations, the same in training and in flight."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import random
+
+from helpers import GOAL, hover_task, random_command, random_state, replaced
+from retrim import presets
+from retrim.adapt import ControllerPilot, Sample
+from retrim.control import Policy, PolicyController
+from retrim.learn import rollout
+from retrim.physics import Command, PointMass, State, small, so3
+from retrim.tasks import StateObs, huber
+
+
+@pytest.mark.parametrize(
+    ("y", "value"), [((3.0, 4.0, 0.0), 4.5), ((0.3, 0.4, 0.0), 0.125), ((0.6, 0.8, 0.0), 0.5), ((0.0, 0.0, 0.0), 0.0)]
+)
+def test_huber_of_the_norm(y, value):
+    assert huber(jnp.array(y)) == pytest.approx(value, abs=1e-15)
+
+
+def test_huber_gradient():
+    np.testing.assert_array_equal(jax.grad(huber)(jnp.zeros(3)), 0.0)
+    np.testing.assert_allclose(jax.grad(huber)(jnp.array([3.0, 4.0, 0.0])), [0.6, 0.8, 0.0], rtol=1e-14)
+    np.testing.assert_allclose(jax.grad(huber)(jnp.array([0.3, 0.4, 0.0])), [0.3, 0.4, 0.0], rtol=1e-14)
+
+
+def test_reward_by_hand():
+    """|5 (p - p_des)| = 2.5 -> 2; |v| = .5 -> .125; |omega| = 2 -> 1.5; |u - u_hover| = sqrt(1.5^2 + 2^2) -> 2."""
+    task = hover_task()
+    x = State(jnp.array([0.5, 0.0, 1.0]), jnp.eye(3), jnp.array([0.0, 0.3, 0.4]))
+    u = Command(jnp.array(9.81 + 1.5), jnp.array([0.0, 2.0, 0.0]))
+    assert task.reward(jnp.array(0.0), x, u) == pytest.approx(-(2.0 + 0.1 * 0.125 + 0.1 * 1.5 + 0.5 * 2.0), rel=1e-12)
+    assert task.reward(jnp.array(0.0), State.at(jnp.array(GOAL)), Command.hover()) == 0.0
+
+
+def test_reward_is_differentiable_everywhere(key):
+    task = hover_task()
+    for x, u in [(State.at(jnp.array(GOAL)), Command.hover()), (random_state(key), random_command(key))]:
+        gradient = jax.grad(lambda xu: task.reward(jnp.array(0.0), *xu))((x, u))
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
+
+
+@pytest.mark.parametrize("heading", [math.pi, 0.1 * math.pi])
+def test_starts_keep_to_their_bounds(heading):
+    task = hover_task(heading=heading)
+    x = jax.vmap(task.reset)(random.split(random.key(3), 2000))
+    away = np.asarray(x.p) - GOAL
+    assert np.abs(away).max() <= 1.0
+    assert np.abs(away).max(axis=0).min() > 0.95  # and use them
+    gram = jnp.einsum("nij,nkj->nik", x.R, x.R)
+    np.testing.assert_allclose(gram, np.broadcast_to(np.eye(3), gram.shape), atol=1e-12)
+    tilt = np.arccos(np.asarray(x.R)[:, 2, 2])
+    assert tilt.max() <= math.hypot(0.1 * math.pi, 0.1 * math.pi)
+    turned = np.abs(np.arctan2(np.asarray(x.R)[:, 1, 0], np.asarray(x.R)[:, 0, 0]))
+    assert 0.9 * heading < turned.max() <= heading + 0.15
+    assert np.asarray(x.v).std() == pytest.approx(0.1, rel=0.05)
+
+
+def test_alive():
+    task, t = hover_task(box=2.0), jnp.array(0.0)
+    assert task.alive(t, State.at(jnp.array([1.9, 0.0, 1.0])))
+    assert not task.alive(t, State.at(jnp.array([2.1, 0.0, 1.0])))
+    assert not task.alive(t, State.at(jnp.array([jnp.nan, 0.0, 1.0])))
+    x = State.at(jnp.array(GOAL))
+    assert not task.alive(t, replaced(x, v=jnp.array([jnp.inf, 0.0, 0.0])))
+
+
+def test_error_is_the_distance():
+    assert hover_task().error(jnp.array(0.0), State.at(jnp.array([0.3, 0.4, 1.0]))) == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("history", [0, 2, 3])
+def test_observation_layout(history, key):
+    observation = StateObs(jnp.array(GOAL), small().omega_max, history)
+    x, memory = random_state(key), None
+    memory = observation.init(x)
+    commands = [Command(jnp.array(9.81 * (1.0 + k)), jnp.array([6.0, 0.0, -4.0]) * k) for k in range(4)]
+    for u in commands:
+        o, memory = observation(memory, jnp.array(0.0), x, u)
+    assert o.shape == (observation.size,) == (15 + 4 * history,)
+    np.testing.assert_allclose(o[:3], (np.asarray(x.p) - GOAL) / 1.5)
+    np.testing.assert_array_equal(o[3:12], np.asarray(x.R).reshape(9))
+    np.testing.assert_allclose(o[12:15], np.asarray(x.v) / 5.0)
+    newest = [[k, k, 0.0, -k] for k in range(4)][4 - history :]
+    np.testing.assert_allclose(o[15:], np.reshape(newest, -1), atol=1e-12)
+
+
+def test_simulation_and_flight_see_the_same(key):
+    """Fly the states of a simulated roll-out through the pilot: it must issue the very commands of the roll-out."""
+    task = hover_task(horizon=12, history=3)
+    policy = Policy.of(task.observation.size, small(), key=key, hidden=(8,))
+    policy = jax.tree.map(lambda leaf: leaf + 0.1, policy)  # so that what is seen matters
+    x0 = task.reset(key)
+    simulated = rollout(PointMass(0.02), task, policy, x0)
+    pilot = ControllerPilot(PolicyController(task.observation, policy))
+    for k in range(task.horizon):
+        x = jax.tree.map(lambda leaf, k=k: leaf[k], simulated.x)
+        u = pilot(Sample(k * 0.02, x, Command.hover()))
+        np.testing.assert_allclose(u.vector(), Command(simulated.u.c[k], simulated.u.omega[k]).vector(), rtol=1e-12)
+
+
+def test_flight_starts_are_the_same_for_every_preset():
+    starts = [presets.flight_starts(presets.load(name), 8) for name in presets.PRESETS]
+    for others in starts[1:]:
+        jax.tree.map(np.testing.assert_array_equal, starts[0], others)
+    for x in starts[0]:
+        assert float(jnp.linalg.norm(so3.log(x.R))) < math.sqrt(3) * 0.1 * math.pi
