@@ -1,9 +1,5 @@
 """Strict everywhere: double precision, no silent promotion of types or ranks; shapes are checked by the import hook."""
 
-import os
-
-os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # the compile cache warns of what does not matter
-
 import jax
 import pytest
 

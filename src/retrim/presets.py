@@ -5,6 +5,7 @@ name or an impossible value is an error that gives its path.
 """
 
 import dataclasses
+import functools
 import math
 import tomllib
 from pathlib import Path
@@ -50,8 +51,8 @@ class Pretrain:
     """Adam's rate at the start; it falls to zero along a cosine. The paper is silent; the authors' code has 5e-3."""
     b2: float = Field(default=0.999, ge=0, lt=1)
     """Adam's second decay."""
-    clip: PositiveFloat = math.inf
-    """Largest norm of a gradient."""
+    clip: PositiveFloat | None = None
+    """Largest norm of a gradient; none is clipped by default."""
     hidden: tuple[PositiveInt, ...] = (512, 512)
     """Hidden layers of the policy."""
     heading: float = Field(default=math.pi, ge=0, le=math.pi)
@@ -80,8 +81,8 @@ class Adapt:
     """Starts per step."""
     rate: PositiveFloat = 1e-3
     """Adam's rate at the start of an update; it falls to zero along a cosine."""
-    clip: PositiveFloat = math.inf
-    """Largest norm of a gradient."""
+    clip: PositiveFloat | None = None
+    """Largest norm of a gradient; none is clipped by default."""
     refine_charge: PositiveFloat = 0.2
     """Flight time until a fitted residual is used [s]."""
     improve_charge: PositiveFloat = 1.0
@@ -197,6 +198,7 @@ def nominal(preset: Preset) -> PointMass:
     return PointMass(DT)
 
 
+@functools.partial(jax.jit, static_argnums=0)
 def policy(preset: Preset, key: Key[Array, ""]) -> Policy:
     """An untrained policy; the key is consumed."""
     return Policy.of(task(preset).observation.size, vehicle(preset), key=key, hidden=preset.pretrain.hidden)
@@ -206,7 +208,8 @@ def optimiser(preset: Preset) -> optax.GradientTransformation:
     """For pretraining: Adam under a cosine, behind a clip."""
     p = preset.pretrain
     return optax.chain(
-        optax.clip_by_global_norm(p.clip), optax.adam(optax.cosine_decay_schedule(p.rate, p.epochs), b2=p.b2)
+        optax.clip_by_global_norm(p.clip or math.inf),
+        optax.adam(optax.cosine_decay_schedule(p.rate, p.epochs), b2=p.b2),
     )
 
 
@@ -219,7 +222,7 @@ def adapter(preset: Preset) -> Adapter:
         residual_rate=jnp.array(a.residual_rate),
         beta=jnp.array(a.beta),
         policy_rate=jnp.array(a.rate),
-        clip=jnp.array(a.clip),
+        clip=jnp.array(a.clip or math.inf),
         delay=preset.delay,
         plant_delay=preset.plant_delay,
         iters=a.iters,
@@ -228,6 +231,7 @@ def adapter(preset: Preset) -> Adapter:
     )
 
 
+@functools.partial(jax.jit, static_argnums=0)
 def residual(preset: Preset, key: Key[Array, ""]) -> EnsembleResidual:
     """An ensemble that predicts zero; the key is consumed."""
     return EnsembleResidual.of(jnp.array(preset.goal), vehicle(preset).omega_max, key=key)
@@ -262,5 +266,5 @@ def disturbance(name: str) -> Disturbance:
 def flight_starts(preset: Preset, n: int, seed: int = 0) -> list[State]:
     """``n`` starts, the same for every preset: goal +- 1 m per axis, 18 degrees about each axis, 0.1 m/s."""
     here = dataclasses.replace(preset, pretrain=dataclasses.replace(preset.pretrain, heading=TILT))
-    batch = jax.vmap(task(here).reset)(random.split(random.key(seed), n))
+    batch = jax.jit(lambda key: jax.vmap(task(here).reset)(random.split(key, n)))(random.key(seed))
     return [jax.tree.map(lambda leaf, i=i: jnp.asarray(np.asarray(leaf)[i]), batch) for i in range(n)]

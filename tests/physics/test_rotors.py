@@ -133,6 +133,13 @@ def test_vehicles(make):
     assert 4 * float(car.thrust_coefficient) * float(car.hover_speed) ** 2 == pytest.approx(float(car.mass) * 9.81)
 
 
+def test_vehicles_can_be_made_under_a_transformation():
+    """A mass may be traced: mapped over, or differentiated."""
+    hover = lambda mass: replaced(small(), mass=mass).hover_speed  # noqa: E731
+    np.testing.assert_allclose(jax.vmap(hover)(jnp.array([0.19, 0.76]))[1], 2 * hover(jnp.array(0.19)))
+    assert jax.grad(hover)(jnp.array(0.19)) > 0
+
+
 @pytest.mark.parametrize(
     ("field", "value", "message"),
     [

@@ -33,7 +33,7 @@ def names(tree: Any) -> dict[str, Any]:
 
 def pack(tree: Any, *, kind: str, about: Mapping[str, str]) -> bytes:
     """The arrays of ``tree`` and what ``about`` says of them."""
-    tensors = {name: np.ascontiguousarray(np.asarray(leaf)) for name, leaf in names(tree).items()}
+    tensors = {name: np.array(leaf, order="C") for name, leaf in names(tree).items()}
     header = {**about, "format": FORMAT, "kind": kind, "checksum": _checksum(tensors)}
     return save(tensors, metadata=header)
 

@@ -187,7 +187,7 @@ def rows(flights: Sequence[Flight], *, task: str, plant: str, vehicle: str) -> l
                 "method": method,
                 "metric": "steady_error_m",
                 "mean": float(steady.mean()) if len(steady) else None,
-                "std": float(steady.std(ddof=1)) if len(steady) > 1 else (0.0 if len(steady) else None),
+                "std": float(steady.std(ddof=1)) if len(steady) > 1 else None,
                 "n": len(group),
                 "crashes": sum(f.log.crashed for f in group),
             }
@@ -199,7 +199,7 @@ def cell(row: dict[str, Any]) -> str:
     """Mean +- standard deviation [m], with crashes."""
     if row["mean"] is None:
         return f"crashed, {row['crashes']} of {row['n']}"
-    text = f"{row['mean']:.3f} ± {row['std']:.3f}"
+    text = f"{row['mean']:.3f}" + (f" ± {row['std']:.3f}" if row["std"] is not None else "")
     return text + (f", {row['crashes']} of {row['n']} crashed" if row["crashes"] else "")
 
 

@@ -1,11 +1,7 @@
 """The command line: picks the command, sets up JAX, turns errors into one clear line and an exit code."""
 
-import os
 import sys
 from collections.abc import Callable
-
-# Before jax is imported: its compile cache warns of machine features that do not matter here.
-os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 import tyro
 

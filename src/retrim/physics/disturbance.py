@@ -6,6 +6,7 @@ Disturbances belong to the plant. The nominal model never hears of them.
 from typing import Protocol, runtime_checkable
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -39,7 +40,7 @@ class Reversing(eqx.Module):
 
     def __check_init__(self) -> None:
         """Raise ``ValueError`` if the period is not positive."""
-        if not self.period > 0:
+        if not isinstance(self.period, jax.core.Tracer) and not self.period > 0:
             raise ValueError(f"Reversing.period = {float(self.period)} s must be positive")
 
     def __call__(self, t: Float[Array, ""], x: State) -> Float[Array, "3"]:

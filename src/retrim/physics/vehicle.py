@@ -6,6 +6,7 @@ The quadrotors are functions rather than constants, since an array made at impor
 import dataclasses
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -35,7 +36,9 @@ class Vehicle(eqx.Module):
     """kappa in Q = kappa T of one rotor [m]."""
 
     def __check_init__(self) -> None:
-        """Raise ``ValueError``, naming the field, where no such vehicle can exist."""
+        """Raise ``ValueError``, naming the field, where no such vehicle can exist; traced values are not checked."""
+        if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(self)):
+            return
         for field in dataclasses.fields(self):
             value = jnp.asarray(getattr(self, field.name))
             if not bool(jnp.all(jnp.isfinite(value) & (value > 0))):

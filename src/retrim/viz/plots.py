@@ -55,6 +55,7 @@ def flight_figure(
         figure.suptitle(title, fontsize=14, fontweight="bold", color=INK)
         _errors(left, base, adapted, pushes)
         _paths(right, base, adapted, goal)
+        figure.legend(loc="outside lower center", ncols=4, frameon=False)
     return figure
 
 
@@ -71,11 +72,12 @@ def save(figure: Figure, folder: Path, name: str) -> list[Path]:
 def _errors(axes: Axes, base: list[Track], adapted: list[Track], pushes: list[Push]) -> None:
     top = 1.15 * max((float(np.nanmax(track.error)) for track in (*base, *adapted)), default=1.0)
     for push in pushes:
-        strength = "  ".join(f"{a:+g}" for a in push.a)
         axes.axvspan(push.start, push.end, color=PUSH, alpha=0.13 if push.a[0] >= 0 else 0.28, linewidth=0)
+        same = len(set(push.a)) == 1
+        strength = f"{push.a[0]:+g} m/s² per axis" if same else "({:+g}, {:+g}, {:+g}) m/s²".format(*push.a)
         axes.text(
-            (push.start + push.end) / 2, 0.985 * top, f"pushed by ({strength}) m/s²",
-            ha="center", va="top", color="#8a5a00", fontsize=10, zorder=5,
+            (push.start + push.end) / 2, 0.985 * top, strength if len(pushes) > 1 else f"pushed by {strength}",
+            ha="center", va="top", color="#8a5a00", fontsize=9 if len(pushes) > 1 else 11, zorder=5,
             bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 2},
         )  # fmt: skip
     swaps = sorted({round(t, 2) for track in adapted for t in track.swaps})
@@ -93,7 +95,6 @@ def _errors(axes: Axes, base: list[Track], adapted: list[Track], pushes: list[Pu
             axes.plot(tracks[0].t[: len(mean)], mean, color=color, linewidth=2.4, label=f"{name}: {final}")
     axes.set(xlabel="time [s]", ylabel="distance from the target [m]", ylim=(0, top))
     axes.margins(x=0)
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=3, frameon=False)
 
 
 def _paths(axes: Axes, base: list[Track], adapted: list[Track], goal: tuple[float, float, float]) -> None:
@@ -115,4 +116,3 @@ def _paths(axes: Axes, base: list[Track], adapted: list[Track], goal: tuple[floa
     axes.plot(goal[0], goal[1], "+", color=INK, markersize=18, markeredgewidth=2, label="target")
     axes.set(xlabel="x [m]", ylabel="y [m]", title="the same flights from above")
     axes.set_aspect("equal", adjustable="datalim")
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=2, frameon=False)
