@@ -20,9 +20,10 @@ def test_layers(monkeypatch):
     assert importlinter.lint_imports(config_filename="pyproject.toml") == 0
 
 
-@pytest.mark.parametrize(
-    "package", ["retrim", *(f"retrim.{n}" for n in ("physics", "tasks", "control", "learn", "adapt"))]
-)
+FOLDERS = ("physics", "tasks", "control", "learn", "adapt")
+
+
+@pytest.mark.parametrize("package", ["retrim", *(f"retrim.{name}" for name in FOLDERS)])
 def test_public_names_have_docstrings(package):
     module = importlib.import_module(package)
     for name, thing in vars(module).items():

@@ -207,10 +207,8 @@ def policy(preset: Preset, key: Key[Array, ""]) -> Policy:
 def optimiser(preset: Preset) -> optax.GradientTransformation:
     """For pretraining: Adam under a cosine, behind a clip."""
     p = preset.pretrain
-    return optax.chain(
-        optax.clip_by_global_norm(p.clip or math.inf),
-        optax.adam(optax.cosine_decay_schedule(p.rate, p.epochs), b2=p.b2),
-    )
+    schedule = optax.cosine_decay_schedule(p.rate, p.epochs)
+    return optax.chain(optax.clip_by_global_norm(p.clip or math.inf), optax.adam(schedule, b2=p.b2))
 
 
 def adapter(preset: Preset) -> Adapter:

@@ -12,7 +12,7 @@ import pytest
 
 from retrim.cli.pictures import pushes
 
-SMALL = "[pretrain]\nhidden = [32, 32]\nhorizon = 60\nenvs = 8\nepochs = 30\n[adapt]\nepochs = 4\nenvs = 4\niters = 20\nrefine_every = 1.0\nimprove_every = 1.5\nrefine_charge = 0.1\nimprove_charge = 0.3\n"  # noqa: E501
+SMALL = "[pretrain]\nhidden = [64, 64]\nhorizon = 100\nepochs = 60\n[adapt]\nepochs = 4\nenvs = 4\niters = 20\nrefine_every = 1.0\nimprove_every = 1.5\nrefine_charge = 0.1\nimprove_charge = 0.3\n"  # noqa: E501
 ENVIRONMENT = {**os.environ, "COLUMNS": "160", "NO_COLOR": "1"}
 
 
@@ -48,13 +48,15 @@ def test_pretrain_writes_policy_and_results(folder):
         "run_s",
         "rows",
     } <= results.keys()
-    assert len(results["losses"]) == 30
-    assert results["rows"][0]["epochs"] == 30
+    assert len(results["losses"]) == 60
+    assert results["rows"][0]["epochs"] == 60
     assert (folder / "p" / "policy.safetensors").stat().st_size > 1000
 
 
 def test_fly_writes_rows_events_and_pictures(folder):
-    out = retrim("fly", "--policy", "p", "--seconds", "5", "--starts", "2", "--out", "f", cwd=folder)
+    out = retrim(
+        "fly", "--policy", "p", "--disturbance", "none", "--seconds", "5", "--starts", "2", "--out", "f", cwd=folder
+    )
     results = json.loads((folder / "f" / "results.json").read_text())
     assert [row["method"] for row in results["rows"]] == ["base", "full"]
     for row in results["rows"]:
@@ -66,7 +68,7 @@ def test_fly_writes_rows_events_and_pictures(folder):
     events = [json.loads(line) for line in (folder / "f" / "events.jsonl").read_text().splitlines()]
     assert {e["event"] for e in events} >= {"residual"}
     for kind in ("png", "svg"):
-        assert (folder / "f" / f"hover_large.{kind}").stat().st_size > 10_000
+        assert (folder / "f" / f"hover_small.{kind}").stat().st_size > 10_000
     assert "steady-state hover error [m]" in out
 
 
@@ -101,7 +103,7 @@ def test_default_folder(folder):
         (("pretrain", "dance"), 2, "invalid choice 'dance'"),
         (("pretrain", "hover", "--epochs", "0"), 1, "pretrain.epochs: Input should be greater than 0"),
         (("bench", "--works", "nap"), 2, "no work nap; there are pretrain-paper"),
-        ((), 2, "required"),
+        ((), 2, "Expected one of {pretrain, fly"),
     ],
 )
 def test_wrong_input_gives_one_clear_message(folder, words, code, message):
