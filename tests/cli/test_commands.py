@@ -55,7 +55,7 @@ def test_pretrain_writes_policy_and_results(folder):
 
 def test_fly_writes_rows_events_and_pictures(folder):
     out = retrim(
-        "fly", "--policy", "p", "--disturbance", "none", "--seconds", "5", "--starts", "2", "--out", "f", cwd=folder
+        "fly", "--policy", "p", "--disturbance", "small", "--seconds", "5", "--starts", "2", "--out", "f", cwd=folder
     )
     results = json.loads((folder / "f" / "results.json").read_text())
     assert [row["method"] for row in results["rows"]] == ["base", "full"]

@@ -1,7 +1,7 @@
 """``retrim reproduce``: tables of the paper, written where the documentation keeps them."""
 
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import tyro
@@ -9,6 +9,7 @@ import tyro
 from .. import presets
 from .flights import Flight
 from .hover_table import fly_table, hover_table
+from .pictures import picture
 from .session import Stopwatch, commit, console, machine, run_folder, write_results
 from .training import nominal_error, train
 
@@ -29,7 +30,7 @@ def reproduce(
         seeds: Training seeds; each also seeds the starts and the learners of its flights.
         seconds: Length of a flight.
         starts: Flights per disturbance, method and seed.
-        out: Folder for hover.md and results.json; a new one under runs/ by default.
+        out: Folder for hover.md, hover.json and a picture; a new one under runs/ by default.
     """
     watch = Stopwatch()
     folder = run_folder(out, "reproduce")
@@ -44,7 +45,7 @@ def reproduce(
         f"Commit {commit()}; {machine()}.",
         "",
     ]
-    rows, interrupted = [], False
+    rows, interrupted, pictured = list[dict[str, Any]](), False, list[Path]()
     for name in preset:
         settings = presets.load(name)
         flights: list[Flight] = []
@@ -56,6 +57,8 @@ def reproduce(
                 break
             errors.append(nominal_error(settings, policy))
             flown, interrupted = fly_table(settings, policy, seconds=seconds, starts=starts, seed=seed)
+            if name == preset[0] and seed == seeds[0]:
+                pictured = picture(flown, settings, "large", settings.vehicle, folder) if flown else []
             flights += flown
             if interrupted:
                 break
@@ -76,7 +79,9 @@ def reproduce(
             break
     compiling = f"Compiling {watch.compile_s:.0f} s, all else {watch.total_s - watch.compile_s:.0f} s."
     lines += [compiling + (" Interrupted: incomplete." if interrupted else ""), ""]
+    if pictured:
+        lines += [f"![{preset[0]}, large disturbance, seed {seeds[0]}]({pictured[0].name})", ""]
     (folder / "hover.md").write_text("\n".join(lines))
-    write_results(folder, seeds=seeds, watch=watch, rows=rows, interrupted=interrupted)
+    write_results(folder, name=table, seeds=seeds, watch=watch, rows=rows, interrupted=interrupted)
     console.print(f"[bold]{folder / 'hover.md'}[/]", soft_wrap=True)
     return 130 if interrupted else 0

@@ -110,9 +110,10 @@ def write_results(
     watch: Stopwatch,
     rows: Sequence[dict[str, Any]],
     interrupted: bool = False,
+    name: str = "results",
     **more: Any,
 ) -> Path:
-    """``results.json`` in ``folder``."""
+    """``results.json`` (or another ``name``) in ``folder``."""
     results = {
         "schema": SCHEMA,
         "command": " ".join(["retrim", *sys.argv[1:]]),
@@ -127,6 +128,6 @@ def write_results(
         "rows": list(rows),
         **more,
     }
-    path = folder / "results.json"
+    path = folder / f"{name}.json"
     path.write_text(json.dumps(results, indent=2) + "\n")
     return path
