@@ -5,13 +5,14 @@ import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from rich.table import Table
 
 from .bench_works import WORKS
-from .session import Stopwatch, console, run_folder, write_results
+from .session import Stopwatch, commit, console, machine, run_folder, write_results
 
 
 def bench(works: tuple[str, ...] = tuple(WORKS), out: Path | None = None) -> int:
@@ -21,7 +22,7 @@ def bench(works: tuple[str, ...] = tuple(WORKS), out: Path | None = None) -> int
 
     Args:
         works: Which; all by default.
-        out: Folder for results.json; a new one under runs/ by default.
+        out: Folder for results.json and bench.md; a new one under runs/ by default.
     """
     unknown = [name for name in works if name not in WORKS]
     if unknown:
@@ -52,8 +53,29 @@ def bench(works: tuple[str, ...] = tuple(WORKS), out: Path | None = None) -> int
     console.print(shown)
     folder = run_folder(out, "bench")
     path = write_results(folder, seeds=[0], watch=watch, rows=rows, interrupted=interrupted)
+    (folder / "bench.md").write_text(markdown(rows, commit(), machine()))
     console.print(f"[bold]{path}[/]", soft_wrap=True)
     return 130 if interrupted else 0
+
+
+def markdown(rows: Sequence[dict[str, Any]], commit: str, machine: str) -> str:
+    """The table as a document."""
+    lines = [
+        "# Bench",
+        "",
+        "Made by `retrim bench`. Each work in a process of its own; compiling apart, from an empty cache unless the",
+        "work says otherwise; the run is the median of the runs. Peak memory is the process's, jax included.",
+        "",
+        f"Commit {commit}; {machine}.",
+        "",
+        "| work | compile [s] | run [s] | goal | peak [MB] | remarks |",
+        "|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        compiled, ran = _seconds(row["compile_s"]), _seconds(row["run_s"])
+        cells = row["work"], compiled, f"**{ran}**", row["goal"], f"{row['peak_mb']:.0f}", row["remarks"]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join([*lines, ""])
 
 
 def _measured(name: str, cache: Path) -> dict[str, Any]:

@@ -45,10 +45,11 @@ def policy_gradient(
         def fly(x: State, z: Taps) -> tuple[Trajectory, Inputs]:
             return tapped_rollout(dynamics, task, policy, x, z, delay=delay)
 
-        flown, inputs = jax.vmap(fly)(x0, zeros)
+        # Ticks in front, as the scan lays them out: no transposition of what is as large as all activations.
+        flown, inputs = jax.vmap(fly, in_axes=(0, 1), out_axes=(0, 1))(x0, zeros)
         return -jnp.mean(flown.reward), inputs
 
-    return taps.value_and_grad(loss, policy, (x0.p.shape[0], task.horizon))
+    return taps.value_and_grad(loss, policy, (task.horizon, x0.p.shape[0]))
 
 
 def bptt(
