@@ -1,4 +1,4 @@
-"""The house rules that a machine can check: layers, docstrings, sizes, no addresses, every number's one home."""
+"""The house rules that a machine can check: layers, docstrings, sizes, no addresses in the pins."""
 
 import ast
 import importlib

@@ -15,8 +15,9 @@ class PolicyError(ValueError):
     """A policy file that must not be flown. The text names the file, what is wrong, and what was expected."""
 
 
-def save_policy(path: Path, policy: Policy, preset: Preset) -> None:
+def save_policy(path: str | Path, policy: Policy, preset: Preset) -> None:
     """Write ``policy`` and the preset it was trained with to ``path``; the folder is made if need be."""
+    path = Path(path)
     about = {"preset": presets.dump(preset), "task": preset.task, "architecture": _architecture(policy)}
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(path.name + ".partial")
@@ -24,19 +25,22 @@ def save_policy(path: Path, policy: Policy, preset: Preset) -> None:
     partial.replace(path)  # an interrupted write leaves the old file
 
 
-def load_policy(path: Path) -> tuple[Policy, Preset]:
+def load_policy(path: str | Path) -> tuple[Policy, Preset]:
     """Read a policy and its preset from a file, or from a folder that holds ``policy.safetensors``.
 
     Raises :class:`PolicyError` for a file that is missing, truncated, damaged, of another kind or architecture, or has
     weights that are not finite.
     """
+    path = Path(path)
     file = path / "policy.safetensors" if path.is_dir() else path
     if not file.is_file():
         raise PolicyError(f"{file}: no such file; `retrim pretrain hover --out DIR` makes one")
     try:
+        if (size := file.stat().st_size) > wire.MAX_BYTES:
+            raise PolicyError(f"{file}: {size} bytes, more than the {wire.MAX_BYTES} that are accepted")
         data = file.read_bytes()
         header = wire.describe(data, kind="policy", source=str(file))
-        preset = presets.parse(header.get("preset", "{}"), source=f"{file}, header, preset")
+        preset = presets.parse(header.get("preset", ""), source=f"{file}, header, preset")
         like = jax.eval_shape(lambda: presets.policy(preset, random.key(0)))
         wanted = _architecture(like)
         if header.get("architecture") != wanted:

@@ -17,7 +17,16 @@ import numpy as np
 import optax
 from jax import random
 from jaxtyping import Array, Key
-from pydantic import ConfigDict, Field, NonNegativeInt, PositiveFloat, PositiveInt, TypeAdapter, ValidationError
+from pydantic import (
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    TypeAdapter,
+    ValidationError,
+)
 from pydantic.dataclasses import dataclass
 
 from .adapt.adapter import Adapter
@@ -32,6 +41,7 @@ from .physics.vehicle import Vehicle, large, small
 from .tasks.hover import TILT, Hover
 from .tasks.observation import StateObs
 
+STARTS = 1  # folded into a seed for the starts of flights, so that they share no key with training
 DT = 0.02  # [s]: 50 Hz (paper, Sec. III-E)
 VEHICLES = {"small": small, "large": large}
 _STRICT = ConfigDict(extra="forbid")
@@ -63,9 +73,9 @@ class Pretrain:
 class Adapt:
     """Adaptation in flight (paper, Sec. IV-A.3)."""
 
-    window: int = Field(default=100, ge=4)
+    window: int = Field(default=100, ge=12)
     """Ticks of flight that are remembered: 2 s."""
-    refine_every: PositiveFloat = 3.0
+    refine_every: float = Field(default=3.0, ge=DT, allow_inf_nan=False)
     """Time between residual fits [s]."""
     iters: PositiveInt = 100
     """Steps of one fit."""
@@ -73,7 +83,7 @@ class Adapt:
     """Adam's rate of the fit."""
     beta: float = Field(default=1e-3, ge=0)
     """Weight of the spectral penalty; the paper gives none."""
-    improve_every: PositiveFloat = 5.0
+    improve_every: float = Field(default=5.0, ge=DT, allow_inf_nan=False)
     """Time between policy updates [s]."""
     epochs: PositiveInt = 30
     """Optimiser steps of one update."""
@@ -83,9 +93,9 @@ class Adapt:
     """Adam's rate at the start of an update; it falls to zero along a cosine."""
     clip: PositiveFloat | None = None
     """Largest norm of a gradient; none is clipped by default."""
-    refine_charge: PositiveFloat = 0.2
+    refine_charge: float = Field(default=0.2, gt=0, allow_inf_nan=False)
     """Flight time until a fitted residual is used [s]."""
-    improve_charge: PositiveFloat = 1.0
+    improve_charge: float = Field(default=1.0, gt=0, allow_inf_nan=False)
     """Flight time until an improved policy flies [s]."""
 
 
@@ -97,15 +107,15 @@ class Preset:
     task: Literal["hover"] = "hover"
     vehicle: Literal["small", "large"] = "small"
     """The vehicle that the policy is trained for."""
-    goal: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    goal: tuple[FiniteFloat, FiniteFloat, FiniteFloat] = (0.0, 0.0, 1.0)
     """Where to hover, world [m]."""
     box: PositiveFloat = 5.0
     """A vehicle farther than this from the goal along an axis is lost [m]."""
     history: NonNegativeInt = 0
     """Past commands in the observation."""
-    delay: NonNegativeInt = 0
+    delay: int = Field(default=0, ge=0, le=10)
     """Command delay inside the simulator [ticks]."""
-    plant_delay: NonNegativeInt = 1
+    plant_delay: int = Field(default=1, ge=0, le=10)
     """Declared command delay of the plant [ticks], for pairing accelerations with commands."""
     pretrain: Pretrain = Field(default_factory=Pretrain)
     adapt: Adapt = Field(default_factory=Adapt)
@@ -164,7 +174,7 @@ def parse(values: dict[str, Any] | str | bytes, *, source: str) -> Preset:
         raise PresetError(f"{source}: {wrong}") from error
 
 
-def changed(preset: Preset, **tables: dict[str, Any]) -> Preset:
+def changed(preset: Preset, **tables: Any) -> Preset:
     """The preset with some values replaced, as in ``changed(preset, adapt={"epochs": 5})``; validated."""
     return parse(_merged(values(preset), tables), source="flags")
 
@@ -204,8 +214,9 @@ def policy(preset: Preset, key: Key[Array, ""]) -> Policy:
     return Policy.of(task(preset).observation.size, vehicle(preset), key=key, hidden=preset.pretrain.hidden)
 
 
+@functools.cache
 def optimiser(preset: Preset) -> optax.GradientTransformation:
-    """For pretraining: Adam under a cosine, behind a clip."""
+    """For pretraining: Adam under a cosine, behind a clip. The same object for the same preset, so nothing retraces."""
     p = preset.pretrain
     schedule = optax.cosine_decay_schedule(p.rate, p.epochs)
     return optax.chain(optax.clip_by_global_norm(p.clip or math.inf), optax.adam(schedule, b2=p.b2))
@@ -264,5 +275,7 @@ def disturbance(name: str) -> Disturbance:
 def flight_starts(preset: Preset, n: int, seed: int = 0) -> list[State]:
     """``n`` starts, the same for every preset: goal +- 1 m per axis, 18 degrees about each axis, 0.1 m/s."""
     here = dataclasses.replace(preset, pretrain=dataclasses.replace(preset.pretrain, heading=TILT))
-    batch = jax.jit(lambda key: jax.vmap(task(here).reset)(random.split(key, n)))(random.key(seed))
+    batch = jax.jit(lambda key: jax.vmap(task(here).reset)(random.split(key, n)))(
+        random.fold_in(random.key(seed), STARTS)
+    )
     return [jax.tree.map(lambda leaf, i=i: jnp.asarray(np.asarray(leaf)[i]), batch) for i in range(n)]

@@ -79,7 +79,8 @@ def test_another_kind_of_file(file):
 
 
 def test_another_kind_of_message(file):
-    edited(file, kind="residual")
+    data = wire.pack({"a": jnp.zeros(3)}, kind="residual", about={})
+    file.write_bytes(data)
     with pytest.raises(PolicyError, match="holds a 'residual', expected a 'policy'"):
         load_policy(file)
 
@@ -120,6 +121,18 @@ def test_integers_are_refused(file):
         load_policy(file)
 
 
+def test_a_changed_header_breaks_the_checksum(file, preset):
+    edited(file, preset=presets.dump(presets.changed(preset, plant_delay=2)))
+    with pytest.raises(PolicyError, match="checksum does not match"):
+        load_policy(file)
+
+
+def test_a_header_without_preset(file):
+    edited(file, preset="")
+    with pytest.raises(PolicyError, match="header, preset"):
+        load_policy(file)
+
+
 def test_a_changed_weight_breaks_the_checksum(file):
     edited(file, lambda t: t | {"layers.0.bias": t["layers.0.bias"] + 1e-3})
     with pytest.raises(PolicyError, match="checksum does not match"):
@@ -136,8 +149,9 @@ def test_flipped_bytes_never_load_silently(file, policy, data):
     damaged = file.with_name("damaged.safetensors")
     damaged.write_bytes(whole)
     with contextlib.suppress(PolicyError):
-        found, _ = load_policy(damaged)
+        found, found_preset = load_policy(damaged)
         jax.tree.map(np.testing.assert_array_equal, found, policy)
+        assert found_preset == load_policy(file)[1]
 
 
 def test_float32_files_load_in_double_precision_and_back(tmp_path, preset, policy):
@@ -179,6 +193,8 @@ def test_the_papers_numbers():
         ("adapt.modee = 3", r"adapt\.modee: Unexpected keyword argument"),
         ("pretrain.epochs = -3", r"pretrain\.epochs: Input should be greater than 0"),
         ("pretrain.rate = 'fast'", r"pretrain\.rate: Input should be a valid number"),
+        ("adapt.improve_every = 0.005", r"adapt\.improve_every: Input should be greater than or equal to 0\.02"),
+        ("goal = [nan, 0.0, 1.0]", r"goal\.0: Input should be a finite number"),
         ("vehicle = 'medium'", r"vehicle: Input should be 'small' or 'large'"),
         ("= 3", r"overlay\.toml: Invalid statement"),
     ],

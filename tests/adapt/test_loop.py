@@ -14,8 +14,8 @@ from retrim.adapt.adapter import Adapter
 from retrim.adapt.buffer import RollingBuffer
 from retrim.adapt.gate import judge
 from retrim.control import Policy, PolicyController
-from retrim.learn import pretrain
-from retrim.physics import Command, PointMass, State, small
+from retrim.learn import PolicyState, pretrain
+from retrim.physics import Command, State, small
 
 pytestmark = pytest.mark.usefixtures("optax_promotion")
 
@@ -184,7 +184,10 @@ def test_a_busy_learner_is_skipped_not_queued(trained):
 def test_measured_charge_uses_the_clock(trained):
     preset, _, policy = trained
     _, flown = adaptive_flight(preset, policy, 1.5, schedule=Schedule(0.5, 10.0, None, None))
-    assert all(e.t > 0.5 for e in flown.events if e.kind == "residual")
+    (first, *_) = [e.t for e in flown.events if e.kind == "residual"]
+    _, slow = adaptive_flight(preset, policy, 1.5, schedule=Schedule(0.5, 10.0, 0.4, None))
+    assert first > 0.5
+    assert first != next(e.t for e in slow.events if e.kind == "residual")
 
 
 def test_one_trace_over_many_cycles(trained):
@@ -246,16 +249,41 @@ def test_a_fit_that_is_not_finite_is_dropped(trained):
     buffer = RollingBuffer(preset.adapt.window)
     for i in range(10):
         buffer.push(at(0.0, 0.0, 1.0 + float("nan") * (i == 5)), Command.hover())
-    kept, _ = adapter.refine(state.residual, buffer.window())
+    kept, _, sound = adapter.refine(state.residual, buffer.window())
+    assert not sound
     jax.tree.map(np.testing.assert_array_equal, kept, state.residual)
 
 
-def test_the_nominal_model_and_the_task_do_not_know_the_plant():
-    """What the learner holds does not change with the plant's disturbance or vehicle error."""
-    adapter = presets.adapter(presets.load("paper"))
-    assert isinstance(adapter.nominal, PointMass)
-    assert isinstance(hover_task(), type(adapter.task))
-    assert not jax.tree.leaves(adapter.nominal)
+def broken_improve(self, s, residual, window, key):
+    """An update that went wrong."""
+    bad = eqx.tree_at(lambda p: p.layers[0].bias, s.policy, jnp.full_like(s.policy.layers[0].bias, jnp.nan))
+    task = self.task
+    x0 = jax.vmap(task.reset)(random.split(key, 2))
+    return PolicyState(bad, s.optimiser), judge(bad, s.policy, self.nominal, task, x0, delay=self.delay)
+
+
+def test_a_refused_policy_is_logged_and_never_flies(trained, monkeypatch):
+    preset, _, policy = trained
+    monkeypatch.setattr(Adapter, "improve", broken_improve)
+    log, flown = adaptive_flight(preset, policy, 3.0, schedule=BRISK)
+    plant = SimPlant(presets.plant_model("small"), presets.disturbance("large"))
+    base = ControllerPilot(PolicyController(presets.task(preset).observation, policy))
+    plain = fly(plant, base, presets.flight_starts(preset, 1)[0], ticks=150)
+    np.testing.assert_array_equal(log.u, plain.u)
+    refused = [e for e in flown.events if e.kind == "rejected"]
+    assert [round(e.t, 2) for e in refused] == [1.3, 2.3]
+    assert {e.note for e in refused} == {"a weight is not finite"}
+    jax.tree.map(np.testing.assert_array_equal, flown.state.policy.policy, policy)
+
+
+def test_a_second_flight_keeps_what_was_learnt_and_forgets_what_was_seen(trained):
+    preset, _, policy = trained
+    _, flying = adaptive_flight(preset, policy, 1.5, schedule=BRISK)
+    learnt = flying.state
+    plant = SimPlant(presets.plant_model("small"), presets.disturbance("large"))
+    fly(plant, flying, presets.flight_starts(preset, 1)[0], ticks=10)
+    assert len(flying._buffer) == 10
+    jax.tree.map(np.testing.assert_array_equal, flying.state, learnt)
 
 
 def test_pilot_starts_its_memory_anew_at_time_zero(key):

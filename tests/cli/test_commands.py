@@ -2,17 +2,22 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from retrim.cli.pictures import pushes
+from retrim import presets
+from retrim.adapt import Log
+from retrim.cli.flights import Flight, Plan, cell, rows
+from retrim.cli.pictures import picture, pushes
 
-SMALL = "[pretrain]\nhidden = [64, 64]\nhorizon = 100\nepochs = 60\n[adapt]\nepochs = 4\nenvs = 4\niters = 20\nrefine_every = 1.0\nimprove_every = 1.5\nrefine_charge = 0.1\nimprove_charge = 0.3\n"  # noqa: E501
+SMALL = "[pretrain]\nhidden = [64, 64]\nepochs = 150\n[adapt]\nepochs = 4\nenvs = 4\niters = 20\nrefine_every = 1.0\nimprove_every = 1.5\nrefine_charge = 0.1\nimprove_charge = 0.3\n"  # noqa: E501
 ENVIRONMENT = {**os.environ, "COLUMNS": "160", "NO_COLOR": "1"}
 
 
@@ -48,8 +53,8 @@ def test_pretrain_writes_policy_and_results(folder):
         "run_s",
         "rows",
     } <= results.keys()
-    assert len(results["losses"]) == 60
-    assert results["rows"][0]["epochs"] == 60
+    assert len(results["losses"]) == 150
+    assert results["rows"][0]["epochs"] == 150
     assert (folder / "p" / "policy.safetensors").stat().st_size > 1000
 
 
@@ -108,6 +113,48 @@ def test_default_folder(folder):
 )
 def test_wrong_input_gives_one_clear_message(folder, words, code, message):
     assert message in retrim(*words, cwd=folder, code=code)
+
+
+def test_an_overlay_cannot_change_what_the_weights_were_trained_for(folder):
+    (folder / "other.toml").write_text("history = 3\n")
+    out = retrim("fly", "--policy", "p", "--config", "other.toml", cwd=folder, code=1)
+    assert "history = 3, but the policy was trained with 2" in out
+
+
+def flight(start, *, crashed, error, method="base"):
+    ticks = 10 if crashed else 200
+    log = Log(0.02 * np.arange(ticks), *(np.zeros((ticks, n)) for n in (3, 9, 3, 4)), crashed)
+    return Flight(Plan("large", method, start), log, np.full(ticks, error), ())
+
+
+def test_crashes_are_counted_and_left_out_of_the_mean():
+    found = [
+        flight(0, crashed=False, error=0.1),
+        flight(1, crashed=False, error=0.3),
+        flight(2, crashed=True, error=9.0),
+    ]
+    (row,) = rows(found, task="hover", plant="simple", vehicle="small")
+    assert (row["n"], row["crashes"]) == (3, 1)
+    assert row["mean"] == pytest.approx(0.2)
+    assert row["std"] == pytest.approx(np.std([0.1, 0.3], ddof=1))
+    assert cell(row) == "0.200 ± 0.141, 1 of 3 crashed"
+    (row,) = rows(found[2:], task="hover", plant="simple", vehicle="small")
+    assert (row["mean"], row["std"], cell(row)) == (None, None, "crashed, 1 of 1")
+
+
+def test_a_picture_with_crashes_and_without_adapted_flights(tmp_path):
+    found = [flight(0, crashed=False, error=0.1), flight(1, crashed=True, error=3.0)]
+    assert all(path.exists() for path in picture(found, presets.load("fast"), "large", "small", tmp_path))
+
+
+@pytest.mark.usefixtures("optax_promotion")
+def test_the_readme_example_runs(folder, monkeypatch, capsys):
+    """The Python of the README, as printed, on a shorter flight."""
+    text = (Path(__file__).parents[2] / "README.md").read_text()
+    (code,) = re.findall(r"```python\n(.*?)```", text, re.S)
+    monkeypatch.chdir(folder)
+    exec(code.replace("ticks=1500", "ticks=100"), {})
+    assert "Event(" in capsys.readouterr().out
 
 
 def test_help_of_every_command(folder):

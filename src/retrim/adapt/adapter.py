@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import optax
 from jax import random
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Bool, Float, Key
 
 from ..control.policy import Policy
 from ..learn.bptt import PolicyState, bptt
@@ -63,14 +63,15 @@ class Adapter(eqx.Module):
         return AdaptState(fresh, ResidualState.of(residual, self._residual_optimiser()))
 
     @eqx.filter_jit
-    def refine(self, s: ResidualState, window: Window) -> tuple[ResidualState, Float[Array, ""]]:
+    def refine(self, s: ResidualState, window: Window) -> tuple[ResidualState, Float[Array, ""], Bool[Array, ""]]:
         """Fit the residual to the window, from where the last fit ended; and its error, root mean square [m/s^2].
 
-        A fit that is not finite is dropped: the old state comes back.
+        A fit that is not finite is dropped: the old state comes back, and the last value is false.
         """
         rows = residual_targets(window, self.nominal, delay=self.plant_delay)
         fitted, errors = fit_residual(s, rows, optimiser=self._residual_optimiser(), iters=self.iters, beta=self.beta)
-        return where(finite(fitted), fitted, s), jnp.sqrt(errors[-1])
+        sound = finite(fitted)
+        return where(sound, fitted, s), jnp.sqrt(errors[-1]), sound
 
     @eqx.filter_jit
     def improve(

@@ -26,6 +26,10 @@ class RollingBuffer:
         """Append the state at a tick and the command issued at it."""
         self._rows.append((x, u))
 
+    def clear(self) -> None:
+        """Forget everything."""
+        self._rows.clear()
+
     def window(self) -> Window:
         """A snapshot of fixed shape; while it fills, the oldest tick is repeated in front and marked invalid.
 

@@ -41,7 +41,7 @@ class Event(NamedTuple):
     t: float
     """When it became visible [s]."""
     kind: str
-    """``residual``, ``policy``, ``rejected`` (a policy that the gate refused) or ``skipped`` (the learner was busy)."""
+    """``residual``, ``policy``, ``rejected`` (a result that must not be used) or ``skipped`` (the learner was busy)."""
     note: str
 
 
@@ -57,6 +57,10 @@ class _Learner:
         if self._ready is not None and self._ready[0] <= tick:
             publish, self._ready = self._ready[1], None
             publish()
+
+    def cancel(self) -> None:
+        """Drop what is under way."""
+        self._ready = None
 
     def due(self, tick: int) -> bool:
         """Whether work should start at this tick."""
@@ -101,6 +105,11 @@ class AdaptivePilot:
 
     def __call__(self, sample: Sample) -> Command:
         """Publish what is ready, fly one tick, start what is due."""
+        if sample.t == 0.0:  # another flight: what was learnt stays, what was seen or under way does not
+            self._buffer.clear()
+            self._refiner.cancel()
+            self._improver.cancel()
+            self._tick = 0
         self._now = sample.t
         for learner in (self._refiner, self._improver):
             learner.deliver(self._tick)
@@ -121,11 +130,14 @@ class AdaptivePilot:
         learner.work(self._tick, lambda: job(window))
 
     def _refine(self, window: Window) -> Callable[[], None]:
-        fitted, error = jax.block_until_ready(self._adapter.refine(self.state.residual, window))
+        fitted, error, sound = jax.block_until_ready(self._adapter.refine(self.state.residual, window))
 
         def publish() -> None:
             self.state = AdaptState(self.state.policy, fitted)
-            self._tell("residual", f"rms error {float(error):.3f} m/s^2")
+            if sound:
+                self._tell("residual", f"rms error {float(error):.3f} m/s^2")
+            else:
+                self._tell("rejected", "the residual's fit is not finite")
 
         return publish
 

@@ -32,10 +32,10 @@ def names(tree: Any) -> dict[str, Any]:
 
 
 def pack(tree: Any, *, kind: str, about: Mapping[str, str]) -> bytes:
-    """The arrays of ``tree`` and what ``about`` says of them."""
+    """The arrays of ``tree`` and what ``about`` says of them; the checksum covers both."""
     tensors = {name: np.array(leaf, order="C") for name, leaf in names(tree).items()}
-    header = {**about, "format": FORMAT, "kind": kind, "checksum": _checksum(tensors)}
-    return save(tensors, metadata=header)
+    header = {**about, "format": FORMAT, "kind": kind}
+    return save(tensors, metadata=header | {"checksum": _checksum(tensors, header)})
 
 
 def describe(data: bytes, *, kind: str, source: str) -> dict[str, str]:
@@ -57,7 +57,10 @@ def describe(data: bytes, *, kind: str, source: str) -> dict[str, str]:
 def unpack(data: bytes, like: T, *, kind: str, source: str) -> T:
     """The tree in ``data``, of the structure, shapes and types of ``like``; raises :class:`WireError` otherwise."""
     header = describe(data, kind=kind, source=source)
-    tensors = load(data)
+    try:
+        tensors = load(data)
+    except (SafetensorError, KeyError, ValueError) as error:
+        raise WireError(f"{source}: a tensor of a type that is not used here ({error})") from error
     expected = names(like)
     for name in sorted(expected.keys() | tensors.keys()):
         if name not in tensors:
@@ -71,7 +74,7 @@ def unpack(data: bytes, like: T, *, kind: str, source: str) -> T:
             raise WireError(f"{source}: tensor {name!r} has type {there.dtype}, expected floating point")
         if not np.isfinite(there).all():
             raise WireError(f"{source}: tensor {name!r} has {np.sum(~np.isfinite(there))} weights that are not finite")
-    if header.get("checksum") != _checksum(tensors):
+    if header.pop("checksum", None) != _checksum(tensors, header):
         raise WireError(f"{source}: the checksum does not match; the file was damaged or edited")
     leaves = [jnp.asarray(tensors[name], dtype=wanted.dtype) for name, wanted in expected.items()]
     tree: T = jax.tree.unflatten(jax.tree.structure(like), leaves)
@@ -83,8 +86,8 @@ def _metadata(data: bytes) -> dict[str, str]:
     return dict(json.loads(data[8 : 8 + size]).get("__metadata__", {}))
 
 
-def _checksum(tensors: Mapping[str, np.ndarray]) -> str:
-    digest = hashlib.sha256()
+def _checksum(tensors: Mapping[str, np.ndarray], header: Mapping[str, str]) -> str:
+    digest = hashlib.sha256(json.dumps(dict(header), sort_keys=True).encode())
     for name in sorted(tensors):
         digest.update(name.encode())
         digest.update(tensors[name].tobytes())

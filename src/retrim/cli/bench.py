@@ -28,7 +28,7 @@ def bench(works: tuple[str, ...] = tuple(WORKS), out: Path | None = None) -> int
     if unknown:
         console.print(f"[bold red]retrim:[/] no work {', '.join(unknown)}; there are {', '.join(WORKS)}")
         return 2
-    watch, rows, interrupted = Stopwatch(), list[dict[str, Any]](), False
+    watch, rows, interrupted, failed = Stopwatch(), list[dict[str, Any]](), False, False
     shown = Table(title="retrim bench", caption="peak memory of the process, jax included")
     for heading in ("work", "compile, s", "run, s", "peak, MB", "goal", "remarks"):
         shown.add_column(heading, overflow="fold")
@@ -36,10 +36,16 @@ def bench(works: tuple[str, ...] = tuple(WORKS), out: Path | None = None) -> int
         for name in works:
             try:
                 with console.status(f"{name}: {WORKS[name].title} ..."):
+                    if name == "programs-warm" and not any(Path(cache).iterdir()):
+                        _measured("programs-cold", Path(cache))
                     row = _measured(name, Path(cache))
             except KeyboardInterrupt:
                 interrupted = True
                 break
+            except OSError as error:
+                failed = True
+                console.print(f"[bold red]{name}:[/] {error}")
+                continue
             rows.append(row)
             shown.add_row(
                 row["work"],
@@ -55,7 +61,7 @@ def bench(works: tuple[str, ...] = tuple(WORKS), out: Path | None = None) -> int
     path = write_results(folder, seeds=[0], watch=watch, rows=rows, interrupted=interrupted)
     (folder / "bench.md").write_text(markdown(rows, commit(), machine()))
     console.print(f"[bold]{path}[/]", soft_wrap=True)
-    return 130 if interrupted else 0
+    return 130 if interrupted else int(failed)
 
 
 def markdown(rows: Sequence[dict[str, Any]], commit: str, machine: str) -> str:

@@ -1,15 +1,20 @@
 """Many flights of one policy: several disturbances, methods and starts, on as many threads as there are cores."""
 
+import contextlib
 import os
+import signal
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import random
+from jaxtyping import Array
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from .. import presets
@@ -17,13 +22,15 @@ from ..adapt.buffer import RollingBuffer
 from ..adapt.lockstep import AdaptivePilot, Event
 from ..adapt.plant import ControllerPilot, Log, Pilot, Sample, fly
 from ..adapt.plants.sim import SimPlant
-from ..adapt.sink import Sink
 from ..control.controller import PolicyController
 from ..control.policy import Policy
+from ..physics.state import State
 from ..presets import Preset
+from ..tasks.task import AbstractTask
 from .session import console
 
 Method = Literal["base", "full"]
+LEARNERS = 2  # folded into a seed for the learners of flights
 STEADY = 2.0  # [s]: the steady-state error is the mean over this long at the end of a flight
 
 
@@ -72,63 +79,65 @@ class Campaign:
         starts: int,
         seed: int,
         measured: bool = False,
-        sinks: Sequence[Sink] = (),
     ) -> None:
         self.preset, self.policy = preset, policy
-        self._ticks, self._seed, self._sinks = round(seconds / presets.DT), seed, tuple(sinks)
+        self._ticks, self._seed, self._workers = round(seconds / presets.DT), seed, 1 if measured else _cores()
         self._adapter = presets.adapter(preset)
         self._schedule = presets.schedule(preset, measured=measured)
         self._model = presets.plant_model(vehicle)
         self._starts = presets.flight_starts(preset, starts, seed)
         self.stop = threading.Event()
 
-    def warm_up(self) -> None:
-        """Compile every program of a flight before the first take-off."""
+    def warm_up(self, disturbances: Iterable[str]) -> None:
+        """Compile every program of the flights before the first take-off."""
         x0 = self._starts[0]
         with console.status("compiling the programs of a flight (kept in a cache for the next time) ..."):
-            plan = Plan("none", "full", 0)
-            plant = SimPlant(self._model, presets.disturbance(plan.disturbance))
-            pilot = self._pilot(plan)
-            fly(plant, pilot, x0, ticks=2)
+            pilot = self._pilot(0)
+            for disturbance in dict.fromkeys(disturbances):
+                plant = SimPlant(self._model, presets.disturbance(disturbance))
+                fly(plant, pilot, x0, ticks=2, alive=self._alive)
             buffer = RollingBuffer(self.preset.adapt.window)
             buffer.push(x0, self.policy.u_hover)
             state, window = pilot.state, buffer.window()
             jax.block_until_ready(self._adapter.refine(state.residual, window))
-            key = random.key(0)
-            jax.block_until_ready(self._adapter.improve(state.policy, state.residual.residual, window, key))
+            residual = state.residual.residual
+            jax.block_until_ready(self._adapter.improve(state.policy, residual, window, random.key(0)))
 
     def fly(self, plans: Sequence[Plan]) -> tuple[list[Flight], bool]:
-        """The flights in the order of ``plans``, and whether Ctrl-C cut them short (then some are missing)."""
-        done: dict[Plan, Flight] = {}
+        """The flights in the order of ``plans``, and whether Ctrl-C cut them short (then some are missing).
+
+        With ``--charge measured`` they fly one after another, so that none is charged for another's work.
+        """
         columns = (
             TextColumn("{task.description}"),
             BarColumn(),
             TextColumn("{task.fields[flown]}"),
             TimeRemainingColumn(),
         )
-        workers = max(1, min(len(plans), _cores()))
+        futures: dict[Plan, Future[Flight]] = {}
         interrupted = False
-        with Progress(*columns, console=console) as progress, ThreadPoolExecutor(workers) as pool:
+        with Progress(*columns, console=console) as progress, ThreadPoolExecutor(self._workers) as pool:
             bar = progress.add_task("flying", total=len(plans) * self._ticks, flown="")
-            futures: dict[Future[Flight], Plan] = {
-                pool.submit(self._fly, plan, _Ticker(progress, bar)): plan for plan in plans
-            }
             try:
-                for future in as_completed(futures):
-                    done[futures[future]] = future.result()
-                    progress.update(bar, flown=f"{len(done)} of {len(plans)} flights")
+                for plan in plans:
+                    futures[plan] = pool.submit(self._fly, plan, _Ticker(progress, bar))
+                for flown, future in enumerate(as_completed(futures.values()), start=1):
+                    future.result()
+                    progress.update(bar, flown=f"{flown} of {len(plans)} flights")
             except KeyboardInterrupt:
                 interrupted = True
                 self.stop.set()
-                pool.shutdown(wait=True, cancel_futures=True)
             except BaseException:
                 self.stop.set()
-                pool.shutdown(wait=True, cancel_futures=True)
                 raise
-        return [done[plan] for plan in plans if plan in done], interrupted
+            finally:
+                with _deaf_to_interrupts():  # a further Ctrl-C must not lose what is done
+                    pool.shutdown(wait=True, cancel_futures=True)
+        done = (futures[plan] for plan in plans if plan in futures)
+        return [f.result() for f in done if not f.cancelled() and f.exception() is None], interrupted
 
-    def _pilot(self, plan: Plan) -> AdaptivePilot:
-        k_residual, k_learn = random.split(random.fold_in(random.key(self._seed + 1), plan.start))
+    def _pilot(self, start: int) -> AdaptivePilot:
+        k_residual, k_learn = random.split(random.fold_in(random.fold_in(random.key(self._seed), LEARNERS), start))
         state = self._adapter.init(self.policy, presets.residual(self.preset, k_residual))
         return AdaptivePilot(
             self._adapter,
@@ -137,24 +146,47 @@ class Campaign:
             k_learn,
             dt=presets.DT,
             window=self.preset.adapt.window,
-            sinks=self._sinks,
         )
 
     def _fly(self, plan: Plan, ticker: "_Ticker") -> Flight:
-        adaptive = self._pilot(plan) if plan.method == "full" else None
+        adaptive = self._pilot(plan.start) if plan.method == "full" else None
         pilot: Pilot = adaptive or ControllerPilot(PolicyController(self._adapter.task.observation, self.policy))
         plant = SimPlant(self._model, presets.disturbance(plan.disturbance))
-        goal, box = np.array(self.preset.goal), self.preset.box
-
-        def alive(sample: Sample) -> bool:
-            if self.stop.is_set():
-                raise KeyboardInterrupt
-            away = np.abs(np.asarray(sample.x.p) - goal)
-            return bool((away <= box).all())  # false for NaN too
-
-        log = fly(plant, pilot, self._starts[plan.start], ticks=self._ticks, alive=alive, sinks=(ticker,))
-        error = np.linalg.norm(log.p - goal, axis=1)
+        log = fly(plant, pilot, self._starts[plan.start], ticks=self._ticks, alive=self._alive, sinks=(ticker,))
+        error = np.asarray(_errors(self._adapter.task, log.t, State(*map(jnp.asarray, (log.p, log.R, log.v)))))
         return Flight(plan, log, error, tuple(adaptive.events) if adaptive else ())
+
+    def _alive(self, sample: Sample) -> bool:
+        if self.stop.is_set():
+            raise _Stopped
+        return bool(_still_alive(self._adapter.task, np.float64(sample.t), sample.x))
+
+
+class _Stopped(Exception):
+    """A flight was given up."""
+
+
+@eqx.filter_jit
+def _still_alive(task: AbstractTask, t: Any, x: State) -> Array:
+    return task.alive(jnp.asarray(t, dtype=x.p.dtype), x)
+
+
+@eqx.filter_jit
+def _errors(task: AbstractTask, t: Any, x: State) -> Array:
+    return jax.vmap(task.error)(jnp.asarray(t, dtype=x.p.dtype), x)
+
+
+@contextlib.contextmanager
+def _deaf_to_interrupts() -> Iterator[None]:
+    """Ignore Ctrl-C for a moment; only the main thread may, and only it receives one."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 class _Ticker:

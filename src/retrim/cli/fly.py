@@ -8,6 +8,7 @@ from rich.table import Table
 from .. import presets
 from ..adapt.sink import JsonlSink
 from ..checkpoint import load_policy
+from ..presets import Preset
 from .flights import Campaign, Flight, Plan, cell, rows
 from .pictures import picture
 from .session import Stopwatch, console, run_folder, write_results
@@ -31,7 +32,7 @@ def fly(
         policy: A policy.safetensors, or the folder that holds one.
         disturbance: What pushes the vehicle.
         adapt: full: also fly it while residual and policy are re-trained; none: only as it is.
-        vehicle: Quadrotor to fly; that which the policy was trained for by default.
+        vehicle: Quadrotor that the plant simulates; that which the policy was trained for by default.
         config: TOML file that overlays the policy's own preset, for example with a table [adapt].
         charge: fixed: learning costs the preset's flight time, so that a run repeats bit for bit; measured: what the
             clock says.
@@ -43,7 +44,7 @@ def fly(
     watch = Stopwatch()
     weights, preset = load_policy(policy)
     if config is not None:
-        preset = presets.overlaid(preset, config)
+        preset = _same_policy(preset, presets.overlaid(preset, config), config)
     if seconds < 3.0 or starts < 1:
         raise presets.PresetError(f"--seconds {seconds:g} --starts {starts}: at least 3 s and 1 start are needed")
     flown_on = vehicle or preset.vehicle
@@ -52,7 +53,7 @@ def fly(
         preset, weights, vehicle=flown_on, seconds=seconds, starts=starts, seed=seed, measured=charge == "measured"
     )
     methods: tuple[Literal["base", "full"], ...] = ("base", "full") if adapt == "full" else ("base",)
-    campaign.warm_up()
+    campaign.warm_up([disturbance])
     plans = [Plan(disturbance, method, i) for method in methods for i in range(starts)]
     flights, interrupted = campaign.fly(plans)
     if not flights:
@@ -72,6 +73,17 @@ def fly(
     for path in picture(flights, preset, disturbance, flown_on, folder):
         console.print(f"[bold]{path}[/]", soft_wrap=True)
     return 130 if interrupted else 0
+
+
+def _same_policy(trained: Preset, overlaid: Preset, config: Path) -> Preset:
+    """``overlaid``, unless it changes what the weights were trained for."""
+    for name in ("task", "vehicle", "history"):
+        before, after = getattr(trained, name), getattr(overlaid, name)
+        if before != after:
+            raise presets.PresetError(f"{config}: {name} = {after!r}, but the policy was trained with {before!r}")
+    if trained.pretrain != overlaid.pretrain:
+        raise presets.PresetError(f"{config}: [pretrain] cannot change for a policy that is trained")
+    return overlaid
 
 
 def write_events(flights: list[Flight], folder: Path) -> None:

@@ -22,7 +22,7 @@ PAPER = {  # Table I [m]
 def fly_table(preset: Preset, policy: Policy, *, seconds: float, starts: int, seed: int) -> tuple[list[Flight], bool]:
     """Every flight of the table, and whether Ctrl-C cut them short."""
     campaign = Campaign(preset, policy, vehicle=preset.vehicle, seconds=seconds, starts=starts, seed=seed)
-    campaign.warm_up()
+    campaign.warm_up(LEVELS)
     return campaign.fly([Plan(level, method, i) for level in LEVELS for method in METHODS for i in range(starts)])
 
 

@@ -4,6 +4,7 @@ import sys
 from collections.abc import Callable
 
 import tyro
+from rich.markup import escape
 
 from ..adapt.plant import PlantError
 from ..checkpoint import PolicyError
@@ -32,7 +33,7 @@ def main() -> None:
             COMMANDS, prog="retrim", description="Re-train neural flight policies in seconds, in flight."
         )
     except (PolicyError, PresetError, PlantError, OSError) as error:
-        console.print(f"[bold red]retrim:[/] {error}", soft_wrap=True, markup=True)
+        console.print(f"[bold red]retrim:[/] {escape(str(error))}", soft_wrap=True)
         code = 1
     except KeyboardInterrupt:
         console.print("interrupted")

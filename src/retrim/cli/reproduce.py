@@ -3,10 +3,10 @@
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 import tyro
 
 from .. import presets
+from ..presets import Preset
 from .flights import Flight
 from .hover_table import fly_table, hover_table
 from .pictures import picture
@@ -34,54 +34,78 @@ def reproduce(
     """
     watch = Stopwatch()
     folder = run_folder(out, "reproduce")
-    lines = [
-        "# Hover (Table I of the paper, base policy and full adaptation)",
-        "",
-        f"Made by `retrim reproduce {table}`. Steady-state error [m]: mean over the last 2 s of {seconds:g} s; mean ±",
-        f"standard deviation over {len(seeds)} training seeds ({', '.join(map(str, seeds))}) x {starts} starts. Plant",
-        "`simple`, small quadrotor. Learning is charged to flight time, by the preset's fixed figures. The paper's",
-        "rows are from its own, different plant.",
-        "",
-        f"Commit {commit()}; {machine()}.",
-        "",
-    ]
-    rows, interrupted, pictured = list[dict[str, Any]](), False, list[Path]()
+    sections, rows, interrupted = list[str](), list[dict[str, Any]](), False
     for name in preset:
         settings = presets.load(name)
-        flights: list[Flight] = []
-        errors: list[float] = []
+        flights, errors, interrupted = _flown(settings, seeds, seconds, starts)
+        if flights:
+            found = hover_table(flights, settings)
+            console.print(found.shown)
+            rows += [{**row, "preset": name} for row in found.rows]
+            sections += _section(name, found.lines, flights, errors)
+        pictured = [f for f in flights if f.plan.disturbance == "large"][: 2 * starts]  # those of the first seed
+        if name == preset[0] and pictured:
+            path, _ = picture(pictured, settings, "large", settings.vehicle, folder)
+            sections += [f"![{name}, large disturbance, seed {seeds[0]}]({path.name})", ""]
+        # after each preset, so that an interruption loses nothing
+        text = [*_head(seeds, seconds, starts), *sections, *_foot(watch, interrupted)]
+        (folder / "hover.md").write_text("\n".join(text))
+        write_results(folder, name=table, seeds=seeds, watch=watch, rows=rows, interrupted=interrupted)
+        if interrupted:
+            break
+    console.print(f"[bold]{folder / 'hover.md'}[/]", soft_wrap=True)
+    return 130 if interrupted else 0
+
+
+def _flown(
+    settings: Preset, seeds: tuple[int, ...], seconds: float, starts: int
+) -> tuple[list[Flight], list[float], bool]:
+    """All flights of one preset, the policies' errors in their own model, and whether Ctrl-C cut them short."""
+    flights, errors, interrupted = list[Flight](), list[float](), False
+    try:
         for seed in seeds:
-            console.print(f"[bold]{name}[/], seed {seed}")
+            console.print(f"[bold]{settings.name}[/], seed {seed}")
             policy, _, interrupted = train(settings, seed)
             if interrupted:
                 break
             errors.append(nominal_error(settings, policy))
             flown, interrupted = fly_table(settings, policy, seconds=seconds, starts=starts, seed=seed)
-            if name == preset[0] and seed == seeds[0]:
-                pictured = picture(flown, settings, "large", settings.vehicle, folder) if flown else []
             flights += flown
             if interrupted:
                 break
-        if not flights:
-            break
-        found = hover_table(flights, settings)
-        rows += [{**row, "preset": name} for row in found.rows]
-        console.print(found.shown)
-        swaps = [len(f.swaps) for f in flights if f.plan.method == "full"]
-        own = ", ".join(f"{1000 * e:.1f}" for e in errors)
-        lines += [f"## Preset `{name}`", "", *found.lines, ""]
-        lines += [
-            f"Hover error in its own model, by seed: {own} mm.",
-            f"Policies admitted per adapted flight: {np.mean(swaps):.1f}.",
-            "",
-        ]
-        if interrupted:
-            break
-    compiling = f"Compiling {watch.compile_s:.0f} s, all else {watch.total_s - watch.compile_s:.0f} s."
-    lines += [compiling + (" Interrupted: incomplete." if interrupted else ""), ""]
-    if pictured:
-        lines += [f"![{preset[0]}, large disturbance, seed {seeds[0]}]({pictured[0].name})", ""]
-    (folder / "hover.md").write_text("\n".join(lines))
-    write_results(folder, name=table, seeds=seeds, watch=watch, rows=rows, interrupted=interrupted)
-    console.print(f"[bold]{folder / 'hover.md'}[/]", soft_wrap=True)
-    return 130 if interrupted else 0
+    except KeyboardInterrupt:
+        interrupted = True
+    return flights, errors, interrupted
+
+
+def _head(seeds: tuple[int, ...], seconds: float, starts: int) -> list[str]:
+    many = f"{len(seeds)} training seeds ({', '.join(map(str, seeds))}) x {starts} starts"
+    return [
+        "# Hover (Table I of the paper, base policy and full adaptation)",
+        "",
+        f"Made by `retrim reproduce hover`. Steady-state error [m], over the last 2 s of {seconds:g} s: mean ±",
+        f"standard deviation over {many}. Plant `simple`, small quadrotor. Learning",
+        "is charged to flight time, by the preset's fixed figures. The paper's rows are from its own plant.",
+        "",
+        f"Commit {commit()}; {machine()}.",
+        "",
+    ]
+
+
+def _section(name: str, lines: list[str], flights: list[Flight], errors: list[float]) -> list[str]:
+    own = ", ".join(f"{1000 * error:.1f}" for error in errors)
+    events = [e.kind for f in flights for e in f.events]
+    return [
+        f"## Preset `{name}`",
+        "",
+        *lines,
+        "",
+        f"Hover error in its own model, by seed: {own} mm. The gate admitted {events.count('policy')} policies,",
+        f"and refused {events.count('rejected')}. Crashed: {sum(f.log.crashed for f in flights)} of {len(flights)} flights.",
+        "",
+    ]
+
+
+def _foot(watch: Stopwatch, interrupted: bool) -> list[str]:
+    times = f"Compiling {watch.compile_s:.0f} s, all else {watch.total_s - watch.compile_s:.0f} s."
+    return [times + (" Interrupted: incomplete." if interrupted else ""), ""]

@@ -1,5 +1,6 @@
 """What every command shares: the folder of a run, what machine it ran on, and results for machines."""
 
+import functools
 import json
 import os
 import platform
@@ -69,10 +70,12 @@ def enable_compile_cache() -> Path | None:
 def run_folder(out: Path | None, command: str) -> Path:
     """``out``, or a fresh folder under ``runs/`` named after the command and the time; made at once."""
     folder = out or Path("runs") / f"{command}-{datetime.now():%Y%m%d-%H%M%S}"
+    commit()  # remembered from before the command writes anything into the checkout
     folder.mkdir(parents=True, exist_ok=True)
     return folder
 
 
+@functools.cache
 def commit() -> str:
     """Commit of the checkout that this package lies in, with ``-dirty`` for local changes; or ``unknown``."""
     here = Path(__file__).parent

@@ -1,15 +1,22 @@
 """Pretraining with a progress bar."""
 
+import dataclasses
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import random
+from jaxtyping import Array
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from .. import presets
 from ..control.policy import Policy
 from ..learn.pretrain import pretrain
 from ..learn.rollout import rollout
+from ..physics.dynamics import PointMass
+from ..physics.state import State
 from ..presets import Preset
+from ..tasks.hover import Hover
 from .session import console
 
 CHUNK = 10
@@ -49,8 +56,16 @@ def train(preset: Preset, seed: int) -> tuple[Policy, list[float], bool]:
 def nominal_error(preset: Preset, policy: Policy, *, n: int = 64, seed: int = 1) -> float:
     """Mean error in the policy's own model over the last half second of 6 s, from ``n`` starts of its training [m]."""
     task = presets.task(preset)
-    long = type(task)(task.goal, task.observation, task.box, task.heading, task.dt, horizon=round(6.0 / task.dt))
+    long = dataclasses.replace(task, horizon=round(6.0 / task.dt))
     x0 = jax.vmap(long.reset)(random.split(random.key(seed), n))
-    one = lambda x: rollout(presets.nominal(preset), long, policy, x, delay=preset.delay)  # noqa: E731
-    flown = jax.jit(jax.vmap(one))(x0)
-    return float(jnp.mean(jnp.linalg.norm(flown.x.p - task.goal, axis=-1)[:, -25:]))
+    return float(_settled(policy, presets.nominal(preset), long, x0, preset.delay))
+
+
+@eqx.filter_jit
+def _settled(policy: Policy, dynamics: PointMass, task: Hover, x0: State, delay: int) -> Array:
+    def error(x: State) -> Array:
+        flown = rollout(dynamics, task, policy, x, delay=delay)
+        last = jax.tree.map(lambda leaf: leaf[-25:], flown.x)
+        return jnp.mean(jax.vmap(task.error)(jnp.zeros(25, dtype=x.p.dtype), last))
+
+    return jnp.mean(jax.vmap(error)(x0))

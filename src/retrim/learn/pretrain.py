@@ -1,8 +1,9 @@
 """Train a policy from scratch in the nominal model (paper, Sec. IV-A.2)."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
+import equinox as eqx
 import jax
 import optax
 from jax import random
@@ -14,33 +15,28 @@ from ..physics.state import State
 from ..tasks.task import AbstractTask
 from .bptt import PolicyState, bptt
 
-Chunk = Callable[[PolicyState, Key[Array, ""]], tuple[PolicyState, Float[Array, " epochs"]]]
-
 
 def starts(task: AbstractTask, key: Key[Array, ""], epochs: int, envs: int) -> State:
     """Random starts, epochs x environments; the key is consumed."""
     return jax.vmap(jax.vmap(task.reset))(random.split(key, (epochs, envs)))
 
 
-def training_chunk(
+@eqx.filter_jit
+def train_chunk(
+    state: PolicyState,
     dynamics: AbstractDynamics[Any],
     task: AbstractTask,
-    *,
+    key: Key[Array, ""],
     optimiser: optax.GradientTransformation,
-    envs: int,
     epochs: int,
-    delay: int = 0,
-) -> Chunk:
-    """A compiled function that trains for ``epochs`` epochs on fresh starts.
+    envs: int,
+    delay: int,
+) -> tuple[PolicyState, Float[Array, " epochs"]]:
+    """Train for ``epochs`` epochs on fresh starts; compiled once for the same optimiser, sizes and shapes.
 
     Training is cut into such chunks, so that progress can be shown and an interrupted run keeps what it has.
     """
-
-    @jax.jit
-    def chunk(state: PolicyState, key: Key[Array, ""]) -> tuple[PolicyState, Float[Array, " epochs"]]:
-        return bptt(state, dynamics, task, starts(task, key, epochs, envs), optimiser=optimiser, delay=delay)
-
-    return chunk
+    return bptt(state, dynamics, task, starts(task, key, epochs, envs), optimiser=optimiser, delay=delay)
 
 
 def pretrain(
@@ -61,8 +57,7 @@ def pretrain(
     """
     if epochs % chunk or epochs <= 0:
         raise ValueError(f"epochs = {epochs} must be a positive multiple of {chunk}")
-    run = training_chunk(dynamics, task, optimiser=optimiser, envs=envs, epochs=chunk, delay=delay)
     state = PolicyState(policy, optimiser.init(policy.layers))
     for k in random.split(key, epochs // chunk):
-        state, losses = run(state, k)
+        state, losses = train_chunk(state, dynamics, task, k, optimiser, chunk, envs, delay)
         yield state, losses

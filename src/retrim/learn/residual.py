@@ -152,7 +152,8 @@ def fit_residual(
     """Minimise, for each member, mean |a_res - f|^2 + beta sum_l sigma_max(W_l)^2; full batch, ``iters`` steps.
 
     The spectral norm comes from one power-iteration step per optimiser step, its vector kept as state; the gradient of
-    sigma^2 is 2 sigma u v^T. Also returns the ensemble's summed data error of each step.
+    sigma^2 is 2 sigma u v^T. Also returns the data error, its mean
+    over members, before each step.
     """
     features = jax.vmap(lambda x, u: jnp.concatenate([x.vector(), u.vector()]))(rows.x, rows.u)
     features = (features - state.residual.offset[None]) / state.residual.scale[None]

@@ -52,8 +52,8 @@ def log(R: Float[Array, "3 3"]) -> Float[Array, "3"]:
     axis_sin = vee(R)  # axis * sin(angle)
     squared = jnp.sum(axis_sin * axis_sin)
     cos = 0.5 * (jnp.trace(R) - 1.0)
-    small = squared < _SMALL
-    sin = jnp.sqrt(jnp.where(small, jnp.ones_like(squared), squared))
+    small = (squared < _SMALL) & (cos > 0.0)
+    sin = jnp.sqrt(jnp.where(small, jnp.ones_like(squared), jnp.maximum(squared, 1e-30)))
     near_zero = 1.0 + squared / 6.0  # angle / sin(angle), as a series in sin(angle)
     return jnp.where(small, near_zero, jnp.arctan2(sin, cos) / sin) * axis_sin
 
