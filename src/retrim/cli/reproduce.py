@@ -101,7 +101,8 @@ def _section(name: str, lines: list[str], flights: list[Flight], errors: list[fl
         *lines,
         "",
         f"Hover error in its own model, by seed: {own} mm. The gate admitted {events.count('policy')} policies,",
-        f"and refused {events.count('rejected')}. Crashed: {sum(f.log.crashed for f in flights)} of {len(flights)} flights.",
+        f"and refused {events.count('rejected')}.",
+        f"Crashed: {sum(f.log.crashed for f in flights)} of {len(flights)} flights.",
         "",
     ]
 
