@@ -5,7 +5,7 @@ from pathlib import Path
 import jax
 from jax import random
 
-from . import presets
+from . import build, presets
 from .adapt import wire
 from .control.policy import Policy
 from .presets import Preset
@@ -41,7 +41,7 @@ def load_policy(path: str | Path) -> tuple[Policy, Preset]:
         data = file.read_bytes()
         header = wire.describe(data, kind="policy", source=str(file))
         preset = presets.parse(header.get("preset", ""), source=f"{file}, header, preset")
-        like = jax.eval_shape(lambda: presets.policy(preset, random.key(0)))
+        like = jax.eval_shape(lambda: build.policy(preset, random.key(0)))
         wanted = _architecture(like)
         if header.get("architecture") != wanted:
             raise PolicyError(

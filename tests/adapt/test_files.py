@@ -14,7 +14,7 @@ from jax import random
 from safetensors.numpy import load_file, save_file
 
 from helpers import tiny_preset
-from retrim import PolicyError, PresetError, load_policy, presets, save_policy
+from retrim import PolicyError, PresetError, build, load_policy, presets, save_policy
 from retrim.adapt import wire
 
 
@@ -25,7 +25,7 @@ def preset():
 
 @pytest.fixture
 def policy(preset):
-    return presets.policy(preset, random.key(4))
+    return build.policy(preset, random.key(4))
 
 
 @pytest.fixture
@@ -46,7 +46,7 @@ def test_round_trip_is_exact(file, policy, preset):
 @pytest.mark.parametrize("name", presets.PRESETS)
 def test_every_preset_comes_back_from_its_file(tmp_path, name):
     small = presets.changed(presets.load(name), pretrain={"hidden": (8,)})
-    save_policy(tmp_path / "policy.safetensors", presets.policy(small, random.key(0)), small)
+    save_policy(tmp_path / "policy.safetensors", build.policy(small, random.key(0)), small)
     assert load_policy(tmp_path)[1] == small
 
 
@@ -165,7 +165,7 @@ def test_float32_files_load_in_double_precision_and_back(tmp_path, preset, polic
 def test_size_of_a_paper_policy(tmp_path):
     paper = presets.load("paper")
     with jax.enable_x64(False):
-        data = wire.pack(presets.policy(paper, random.key(0)), kind="policy", about={})
+        data = wire.pack(build.policy(paper, random.key(0)), kind="policy", about={})
     assert len(data) == pytest.approx(1.09e6, rel=0.01)
 
 
@@ -183,8 +183,8 @@ def test_the_papers_numbers():
     assert (p.epochs, p.envs, p.horizon, p.hidden) == (300, 100, 150, (512, 512))
     assert (a.window, a.refine_every, a.iters, a.improve_every, a.epochs, a.envs) == (100, 3.0, 100, 5.0, 30, 10)
     assert (paper.history, paper.delay) == (0, 0)
-    assert presets.task(paper).observation.size == 15
-    assert presets.task(presets.PRESETS["released"]).observation.size == 27
+    assert build.task(paper).observation.size == 15
+    assert build.task(presets.PRESETS["released"]).observation.size == 27
 
 
 @pytest.mark.parametrize(
@@ -220,7 +220,7 @@ def test_unknown_names():
     with pytest.raises(PresetError, match="no preset 'quick'; there are paper, released, fast"):
         presets.load("quick")
     with pytest.raises(PresetError, match="no disturbance 'huge'; there are none, small, large, reversing"):
-        presets.disturbance("huge")
+        build.disturbance("huge")
 
 
 def test_header_is_plain_json(file):

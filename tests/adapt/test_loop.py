@@ -8,7 +8,7 @@ import pytest
 from jax import random
 
 from helpers import hover_task, tiny_preset
-from retrim import presets
+from retrim import build, presets
 from retrim.adapt import AdaptivePilot, ControllerPilot, Sample, Schedule, SimPlant, fly
 from retrim.adapt.adapter import Adapter
 from retrim.adapt.buffer import RollingBuffer
@@ -63,13 +63,13 @@ def trained():
     """A fresh policy and one that hovers better, with the preset of both."""
     with jax.numpy_dtype_promotion("standard"):
         preset = tiny_preset()
-        fresh = presets.policy(preset, random.key(0))
+        fresh = build.policy(preset, random.key(0))
         *_, (state, _) = pretrain(
             fresh,
-            presets.nominal(preset),
-            presets.task(preset),
+            build.nominal(preset),
+            build.task(preset),
             random.key(1),
-            optimiser=presets.optimiser(preset),
+            optimiser=build.optimiser(preset),
             epochs=60,
             envs=8,
             delay=1,
@@ -78,9 +78,9 @@ def trained():
 
 
 def verdict(candidate, incumbent, preset):
-    task = presets.task(preset)
+    task = build.task(preset)
     x0 = jax.vmap(task.reset)(random.split(random.key(5), 4))
-    return judge(candidate, incumbent, presets.nominal(preset), task, x0, delay=preset.delay)
+    return judge(candidate, incumbent, build.nominal(preset), task, x0, delay=preset.delay)
 
 
 def test_gate_admits_the_better_and_refuses_the_worse(trained):
@@ -113,19 +113,19 @@ def test_gate_admits_an_equal_and_replaces_a_broken_incumbent(trained):
 
 @pytest.mark.parametrize(("field", "value"), [("iters", 0), ("epochs", 0), ("envs", -1), ("delay", -1)])
 def test_impossible_sizes_are_refused_at_construction(field, value):
-    adapter = presets.adapter(tiny_preset())
+    adapter = build.adapter(tiny_preset())
     fields = {name: getattr(adapter, name) for name in adapter.__dataclass_fields__}
     with pytest.raises(ValueError, match=rf"Adapter\.{field} = {value}"):
         Adapter(**(fields | {field: value}))
 
 
 def pilot(preset, policy, *, schedule=None, sinks=()):
-    adapter = presets.adapter(preset)
-    state = adapter.init(policy, presets.residual(preset, random.key(2)))
+    adapter = build.adapter(preset)
+    state = adapter.init(policy, build.residual(preset, random.key(2)))
     return AdaptivePilot(
         adapter,
         state,
-        schedule or presets.schedule(preset),
+        schedule or build.schedule(preset),
         random.key(3),
         dt=presets.DT,
         window=preset.adapt.window,
@@ -135,8 +135,8 @@ def pilot(preset, policy, *, schedule=None, sinks=()):
 
 def adaptive_flight(preset, policy, seconds, **options):
     flying = pilot(preset, policy, **options)
-    plant = SimPlant(presets.plant_model("small"), presets.disturbance("large"))
-    log = fly(plant, flying, presets.flight_starts(preset, 1)[0], ticks=round(seconds / presets.DT))
+    plant = SimPlant(build.plant_model("small"), build.disturbance("large"))
+    log = fly(plant, flying, build.flight_starts(preset, 1)[0], ticks=round(seconds / presets.DT))
     return log, flying
 
 
@@ -167,9 +167,9 @@ def test_commands_are_the_old_policys_until_the_swap(trained):
     """The flight equals an unadapted one up to the tick at which the first policy appears, and differs after it."""
     preset, _, policy = trained
     log, flown = adaptive_flight(preset, policy, 2.4, schedule=BRISK)
-    plant = SimPlant(presets.plant_model("small"), presets.disturbance("large"))
-    base = ControllerPilot(PolicyController(presets.task(preset).observation, policy))
-    plain = fly(plant, base, presets.flight_starts(preset, 1)[0], ticks=120)
+    plant = SimPlant(build.plant_model("small"), build.disturbance("large"))
+    base = ControllerPilot(PolicyController(build.task(preset).observation, policy))
+    plain = fly(plant, base, build.flight_starts(preset, 1)[0], ticks=120)
     swap = next(round(e.t / presets.DT) for e in flown.events if e.kind == "policy")
     np.testing.assert_array_equal(log.u[: swap + 1], plain.u[: swap + 1])
     assert not np.array_equal(log.u[swap + 1], plain.u[swap + 1])
@@ -195,18 +195,18 @@ def test_one_trace_over_many_cycles(trained):
     preset, _, policy = trained
     traces = []
 
-    class Counting(type(presets.task(preset))):
+    class Counting(type(build.task(preset))):
         def reward(self, t, x, u):
             traces.append(1)
             return super().reward(t, x, u)
 
-    original = presets.task(preset)
+    original = build.task(preset)
     fields = {name: getattr(original, name) for name in original.__dataclass_fields__}
-    adapter = eqx.tree_at(lambda a: a.task, presets.adapter(preset), Counting(**fields))
-    state = adapter.init(policy, presets.residual(preset, random.key(2)))
+    adapter = eqx.tree_at(lambda a: a.task, build.adapter(preset), Counting(**fields))
+    state = adapter.init(policy, build.residual(preset, random.key(2)))
     flying = AdaptivePilot(adapter, state, BRISK, random.key(3), dt=presets.DT, window=preset.adapt.window)
-    plant = SimPlant(presets.plant_model("small"), presets.disturbance("large"))
-    x0 = presets.flight_starts(preset, 1)[0]
+    plant = SimPlant(build.plant_model("small"), build.disturbance("large"))
+    x0 = build.flight_starts(preset, 1)[0]
     fly(plant, flying, x0, ticks=60)
     compiled = len(traces)
     assert compiled > 0
@@ -222,21 +222,21 @@ def test_adaptation_cuts_the_error_under_the_large_disturbance():
         pretrain={"hidden": (64, 64), "epochs": 120, "horizon": 100},
         adapt={"improve_every": 2.0, "refine_every": 1.0, "rate": 3e-3},
     )
-    policy = presets.policy(preset, random.key(0))
+    policy = build.policy(preset, random.key(0))
     run = pretrain(
         policy,
-        presets.nominal(preset),
-        presets.task(preset),
+        build.nominal(preset),
+        build.task(preset),
         random.key(1),
-        optimiser=presets.optimiser(preset),
+        optimiser=build.optimiser(preset),
         epochs=120,
         envs=16,
         delay=preset.delay,
     )
     *_, (state, _) = run
-    x0 = presets.flight_starts(preset, 1)[0]
-    plant = SimPlant(presets.plant_model("small"), presets.disturbance("large"))
-    base = fly(plant, ControllerPilot(PolicyController(presets.task(preset).observation, state.policy)), x0, ticks=500)
+    x0 = build.flight_starts(preset, 1)[0]
+    plant = SimPlant(build.plant_model("small"), build.disturbance("large"))
+    base = fly(plant, ControllerPilot(PolicyController(build.task(preset).observation, state.policy)), x0, ticks=500)
     adapted = fly(plant, pilot(preset, state.policy), x0, ticks=500)
     before, after = (np.linalg.norm(log.p[-50:] - preset.goal, axis=1).mean() for log in (base, adapted))
     assert after < before / 3
@@ -244,8 +244,8 @@ def test_adaptation_cuts_the_error_under_the_large_disturbance():
 
 def test_a_fit_that_is_not_finite_is_dropped(trained):
     preset, _, policy = trained
-    adapter = presets.adapter(preset)
-    state = adapter.init(policy, presets.residual(preset, random.key(2)))
+    adapter = build.adapter(preset)
+    state = adapter.init(policy, build.residual(preset, random.key(2)))
     buffer = RollingBuffer(preset.adapt.window)
     for i in range(10):
         buffer.push(at(0.0, 0.0, 1.0 + float("nan") * (i == 5)), Command.hover())
@@ -266,9 +266,9 @@ def test_a_refused_policy_is_logged_and_never_flies(trained, monkeypatch):
     preset, _, policy = trained
     monkeypatch.setattr(Adapter, "improve", broken_improve)
     log, flown = adaptive_flight(preset, policy, 3.0, schedule=BRISK)
-    plant = SimPlant(presets.plant_model("small"), presets.disturbance("large"))
-    base = ControllerPilot(PolicyController(presets.task(preset).observation, policy))
-    plain = fly(plant, base, presets.flight_starts(preset, 1)[0], ticks=150)
+    plant = SimPlant(build.plant_model("small"), build.disturbance("large"))
+    base = ControllerPilot(PolicyController(build.task(preset).observation, policy))
+    plain = fly(plant, base, build.flight_starts(preset, 1)[0], ticks=150)
     np.testing.assert_array_equal(log.u, plain.u)
     refused = [e for e in flown.events if e.kind == "rejected"]
     assert [round(e.t, 2) for e in refused] == [1.3, 2.3]
@@ -280,8 +280,8 @@ def test_a_second_flight_keeps_what_was_learnt_and_forgets_what_was_seen(trained
     preset, _, policy = trained
     _, flying = adaptive_flight(preset, policy, 1.5, schedule=BRISK)
     learnt = flying.state
-    plant = SimPlant(presets.plant_model("small"), presets.disturbance("large"))
-    fly(plant, flying, presets.flight_starts(preset, 1)[0], ticks=10)
+    plant = SimPlant(build.plant_model("small"), build.disturbance("large"))
+    fly(plant, flying, build.flight_starts(preset, 1)[0], ticks=10)
     assert len(flying._buffer) == 10
     jax.tree.map(np.testing.assert_array_equal, flying.state, learnt)
 

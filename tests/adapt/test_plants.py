@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from helpers import random_state
-from retrim import presets
+from retrim import build, presets
 from retrim.adapt import ControllerPilot, Plant, PlantError, SimPlant, fly
 from retrim.control import AbstractController
 from retrim.physics import Command, Constant, Rotors, State, small
 
-PLANTS = {"simple": lambda: SimPlant(presets.plant_model("small"), Constant(jnp.zeros(3)))}
+PLANTS = {"simple": lambda: SimPlant(build.plant_model("small"), Constant(jnp.zeros(3)))}
 START = State.at(jnp.array([0.3, -0.2, 1.5]))
 
 
@@ -175,7 +175,7 @@ def test_flights_are_in_the_dtype_of_their_start():
     plant = PLANTS["simple"]()
     with jax.enable_x64(False):
         plant32 = PLANTS["simple"]()
-        x0 = presets.flight_starts(presets.load("fast"), 1)[0]
+        x0 = build.flight_starts(presets.load("fast"), 1)[0]
         assert plant32.reset(x0).x.p.dtype == jnp.float32
         assert plant32.exchange(Command.hover()).x.p.dtype == jnp.float32
     assert plant.reset(START).x.p.dtype == jnp.float64

@@ -14,8 +14,9 @@ import pytest
 
 from retrim import presets
 from retrim.adapt import Log
-from retrim.cli.flights import Flight, Plan, cell, rows
+from retrim.cli.flights import Flight, Plan
 from retrim.cli.pictures import picture, pushes
+from retrim.cli.scores import cell, rows
 
 SMALL = "[pretrain]\nhidden = [64, 64]\nepochs = 150\n[adapt]\nepochs = 4\nenvs = 4\niters = 20\nrefine_every = 1.0\nimprove_every = 1.5\nrefine_charge = 0.1\nimprove_charge = 0.3\n"  # noqa: E501
 ENVIRONMENT = {**os.environ, "COLUMNS": "160", "NO_COLOR": "1"}

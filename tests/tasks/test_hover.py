@@ -9,7 +9,7 @@ import pytest
 from jax import random
 
 from helpers import GOAL, hover_task, random_command, random_state, replaced
-from retrim import presets
+from retrim import build, presets
 from retrim.adapt import ControllerPilot, Sample
 from retrim.control import Policy, PolicyController
 from retrim.learn import rollout
@@ -106,7 +106,7 @@ def test_simulation_and_flight_see_the_same(key):
 
 
 def test_flight_starts_are_the_same_for_every_preset():
-    starts = [presets.flight_starts(presets.load(name), 8) for name in presets.PRESETS]
+    starts = [build.flight_starts(presets.load(name), 8) for name in presets.PRESETS]
     for others in starts[1:]:
         jax.tree.map(np.testing.assert_array_equal, starts[0], others)
     for x in starts[0]:

@@ -16,7 +16,7 @@ import jax
 from jax import lax, random
 from jaxtyping import Array, Key
 
-from .. import presets
+from .. import build, presets
 from ..adapt.adapter import Adapter, AdaptState
 from ..adapt.buffer import RollingBuffer
 from ..adapt.gate import Verdict
@@ -61,10 +61,10 @@ def _compiled(jitted: Any, *arguments: Any) -> tuple[Any, float]:
 
 def _pretrain(preset: Preset, runs: int) -> dict[str, Any]:
     p, key = preset.pretrain, random.key(0)
-    optimiser = presets.optimiser(preset)
-    policy = presets.policy(preset, key)
+    optimiser = build.optimiser(preset)
+    policy = build.policy(preset, key)
     state = PolicyState(policy, optimiser.init(policy.layers))
-    fixed = presets.nominal(preset), presets.task(preset)
+    fixed = build.nominal(preset), build.task(preset)
     sizes = optimiser, 10, p.envs, preset.delay
     program, compile_s = _compiled(train_chunk, state, *fixed, key, *sizes)
 
@@ -87,16 +87,16 @@ def _pretrain(preset: Preset, runs: int) -> dict[str, Any]:
 def _learner() -> tuple[Adapter, AdaptState, Window]:
     """Adapter, its state with a residual that is not zero, and a full window of flight under the large disturbance."""
     preset = presets.load("paper")
-    policy = presets.policy(preset, random.key(0))
-    adapter = presets.adapter(preset)
-    plant = SimPlant(presets.plant_model("small"), presets.disturbance("large"))
+    policy = build.policy(preset, random.key(0))
+    adapter = build.adapter(preset)
+    plant = SimPlant(build.plant_model("small"), build.disturbance("large"))
     log_buffer = RollingBuffer(preset.adapt.window)
-    sample = plant.reset(presets.flight_starts(preset, 1)[0])
+    sample = plant.reset(build.flight_starts(preset, 1)[0])
     for _ in range(preset.adapt.window):
         log_buffer.push(sample.x, Command.hover())
         sample = plant.exchange(Command.hover())
     window = log_buffer.window()
-    state = adapter.init(policy, presets.residual(preset, random.key(1)))
+    state = adapter.init(policy, build.residual(preset, random.key(1)))
     return adapter, state, window
 
 
@@ -121,7 +121,7 @@ def _programs() -> dict[str, Any]:
 
     watch = Stopwatch()
     preset = presets.load("fast")
-    campaign = Campaign(preset, presets.policy(preset, random.key(0)), vehicle="small", seconds=3.0, starts=1, seed=0)
+    campaign = Campaign(preset, build.policy(preset, random.key(0)), vehicle="small", seconds=3.0, starts=1, seed=0)
     campaign.warm_up(["large"])
     return {"compile_s": watch.compile_s, "run_s": watch.total_s - watch.compile_s, "remarks": "preset fast"}
 
@@ -129,9 +129,9 @@ def _programs() -> dict[str, Any]:
 def _tick() -> dict[str, Any]:
     """One flight without adaptation: plant, observation, policy, checks."""
     preset = presets.load("fast")
-    controller = PolicyController(presets.task(preset).observation, presets.policy(preset, random.key(0)))
-    plant = SimPlant(presets.plant_model("small"), presets.disturbance("none"))
-    x0 = presets.flight_starts(preset, 1)[0]
+    controller = PolicyController(build.task(preset).observation, build.policy(preset, random.key(0)))
+    plant = SimPlant(build.plant_model("small"), build.disturbance("none"))
+    x0 = build.flight_starts(preset, 1)[0]
     began = time.perf_counter()
     fly(plant, ControllerPilot(controller), x0, ticks=2)
     compile_s = time.perf_counter() - began

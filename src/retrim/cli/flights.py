@@ -17,7 +17,7 @@ from jax import random
 from jaxtyping import Array
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from .. import presets
+from .. import build, presets
 from ..adapt.buffer import RollingBuffer
 from ..adapt.lockstep import AdaptivePilot, Event
 from ..adapt.plant import ControllerPilot, Log, Pilot, Sample, fly
@@ -82,10 +82,10 @@ class Campaign:
     ) -> None:
         self.preset, self.policy = preset, policy
         self._ticks, self._seed, self._workers = round(seconds / presets.DT), seed, 1 if measured else _cores()
-        self._adapter = presets.adapter(preset)
-        self._schedule = presets.schedule(preset, measured=measured)
-        self._model = presets.plant_model(vehicle)
-        self._starts = presets.flight_starts(preset, starts, seed)
+        self._adapter = build.adapter(preset)
+        self._schedule = build.schedule(preset, measured=measured)
+        self._model = build.plant_model(vehicle)
+        self._starts = build.flight_starts(preset, starts, seed)
         self.stop = threading.Event()
 
     def warm_up(self, disturbances: Iterable[str]) -> None:
@@ -94,7 +94,7 @@ class Campaign:
         with console.status("compiling the programs of a flight (kept in a cache for the next time) ..."):
             pilot = self._pilot(0)
             for disturbance in dict.fromkeys(disturbances):
-                plant = SimPlant(self._model, presets.disturbance(disturbance))
+                plant = SimPlant(self._model, build.disturbance(disturbance))
                 fly(plant, pilot, x0, ticks=2, alive=self._alive)
             buffer = RollingBuffer(self.preset.adapt.window)
             buffer.push(x0, self.policy.u_hover)
@@ -138,7 +138,7 @@ class Campaign:
 
     def _pilot(self, start: int) -> AdaptivePilot:
         k_residual, k_learn = random.split(random.fold_in(random.fold_in(random.key(self._seed), LEARNERS), start))
-        state = self._adapter.init(self.policy, presets.residual(self.preset, k_residual))
+        state = self._adapter.init(self.policy, build.residual(self.preset, k_residual))
         return AdaptivePilot(
             self._adapter,
             state,
@@ -151,7 +151,7 @@ class Campaign:
     def _fly(self, plan: Plan, ticker: "_Ticker") -> Flight:
         adaptive = self._pilot(plan.start) if plan.method == "full" else None
         pilot: Pilot = adaptive or ControllerPilot(PolicyController(self._adapter.task.observation, self.policy))
-        plant = SimPlant(self._model, presets.disturbance(plan.disturbance))
+        plant = SimPlant(self._model, build.disturbance(plan.disturbance))
         log = fly(plant, pilot, self._starts[plan.start], ticks=self._ticks, alive=self._alive, sinks=(ticker,))
         error = np.asarray(_errors(self._adapter.task, log.t, State(*map(jnp.asarray, (log.p, log.R, log.v)))))
         return Flight(plan, log, error, tuple(adaptive.events) if adaptive else ())
@@ -202,37 +202,6 @@ class _Ticker:
 
     def event(self, kind: str, **data: object) -> None:
         """Not shown."""
-
-
-def rows(flights: Sequence[Flight], *, task: str, plant: str, vehicle: str) -> list[dict[str, Any]]:
-    """One row of results per disturbance and method: mean and standard deviation over the starts that survived."""
-    table = []
-    for disturbance, method in dict.fromkeys((f.plan.disturbance, f.plan.method) for f in flights):
-        group = [f for f in flights if (f.plan.disturbance, f.plan.method) == (disturbance, method)]
-        steady = np.array([f.steady for f in group if not f.log.crashed])
-        table.append(
-            {
-                "task": task,
-                "plant": plant,
-                "vehicle": vehicle,
-                "disturbance": disturbance,
-                "method": method,
-                "metric": "steady_error_m",
-                "mean": float(steady.mean()) if len(steady) else None,
-                "std": float(steady.std(ddof=1)) if len(steady) > 1 else None,
-                "n": len(group),
-                "crashes": sum(f.log.crashed for f in group),
-            }
-        )
-    return table
-
-
-def cell(row: dict[str, Any]) -> str:
-    """Mean +- standard deviation [m], with crashes."""
-    if row["mean"] is None:
-        return f"crashed, {row['crashes']} of {row['n']}"
-    text = f"{row['mean']:.3f}" + (f" ± {row['std']:.3f}" if row["std"] is not None else "")
-    return text + (f", {row['crashes']} of {row['n']} crashed" if row["crashes"] else "")
 
 
 def _cores() -> int:

@@ -9,8 +9,9 @@ from .. import presets
 from ..adapt.sink import JsonlSink
 from ..checkpoint import load_policy
 from ..presets import Preset
-from .flights import Campaign, Flight, Plan, cell, rows
+from .flights import Campaign, Flight, Plan
 from .pictures import picture
+from .scores import cell, rows
 from .session import Stopwatch, console, run_folder, write_results
 
 

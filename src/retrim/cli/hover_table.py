@@ -8,7 +8,8 @@ from rich.table import Table
 
 from ..control.policy import Policy
 from ..presets import Preset
-from .flights import Campaign, Flight, Method, Plan, cell, rows
+from .flights import Campaign, Flight, Method, Plan
+from .scores import cell, rows
 
 LEVELS = ("none", "small", "large")
 METHODS: tuple[Method, ...] = ("base", "full")

@@ -7,7 +7,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from .. import presets
+from .. import build, presets
 from ..physics.state import State
 from ..presets import Preset
 from ..viz import plots
@@ -29,7 +29,7 @@ def picture(flights: Sequence[Flight], preset: Preset, disturbance: str, vehicle
 def pushes(disturbance: str, seconds: float) -> list[plots.Push]:
     """The spans of constant push of a disturbance that depends on time alone."""
     t = np.arange(round(seconds / presets.DT)) * presets.DT
-    push, nowhere = presets.disturbance(disturbance), State.at(jnp.zeros(3))
+    push, nowhere = build.disturbance(disturbance), State.at(jnp.zeros(3))
     a = np.stack([np.asarray(push(jnp.asarray(float(t_i)), nowhere)) for t_i in t[::5]])
     times = t[::5]
     edges = [0, *(np.flatnonzero(np.any(np.diff(a, axis=0) != 0, axis=1)) + 1), len(times)]

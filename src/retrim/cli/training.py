@@ -9,7 +9,7 @@ from jax import random
 from jaxtyping import Array
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from .. import presets
+from .. import build
 from ..control.policy import Policy
 from ..learn.pretrain import pretrain
 from ..learn.rollout import rollout
@@ -25,7 +25,7 @@ CHUNK = 10
 def train(preset: Preset, seed: int) -> tuple[Policy, list[float], bool]:
     """A pretrained policy, each epoch's loss, and whether Ctrl-C cut it short (then it is the last state reached)."""
     k_init, k_train = random.split(random.key(seed))
-    policy, losses, interrupted = presets.policy(preset, k_init), list[float](), False
+    policy, losses, interrupted = build.policy(preset, k_init), list[float](), False
     p = preset.pretrain
     columns = TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[loss]}"), TimeRemainingColumn()
     chunk = CHUNK if p.epochs % CHUNK == 0 else 1
@@ -36,10 +36,10 @@ def train(preset: Preset, seed: int) -> tuple[Policy, list[float], bool]:
         try:
             for state, chunk_losses in pretrain(
                 policy,
-                presets.nominal(preset),
-                presets.task(preset),
+                build.nominal(preset),
+                build.task(preset),
                 k_train,
-                optimiser=presets.optimiser(preset),
+                optimiser=build.optimiser(preset),
                 epochs=p.epochs,
                 envs=p.envs,
                 delay=preset.delay,
@@ -55,10 +55,10 @@ def train(preset: Preset, seed: int) -> tuple[Policy, list[float], bool]:
 
 def nominal_error(preset: Preset, policy: Policy, *, n: int = 64, seed: int = 1) -> float:
     """Mean error in the policy's own model over the last half second of 6 s, from ``n`` starts of its training [m]."""
-    task = presets.task(preset)
+    task = build.task(preset)
     long = dataclasses.replace(task, horizon=round(6.0 / task.dt))
     x0 = jax.vmap(long.reset)(random.split(random.key(seed), n))
-    return float(_settled(policy, presets.nominal(preset), long, x0, preset.delay))
+    return float(_settled(policy, build.nominal(preset), long, x0, preset.delay))
 
 
 @eqx.filter_jit
