@@ -1,5 +1,6 @@
 """Strict everywhere: double precision, no silent promotion of types or ranks; shapes are checked by the import hook."""
 
+import retrim  # noqa: F401  (before jax: it quiets the log of the compile cache)  # isort: skip
 import jax
 import pytest
 from hypothesis import settings
