@@ -14,6 +14,12 @@ from rich.table import Table
 from .bench_works import WORKS
 from .session import Stopwatch, commit, console, machine, run_folder, write_results
 
+HEADINGS = ("work", "run, s", "compile, s", "goal", "paper", "authors' code", "peak, MB", "remarks")
+CAPTION = (
+    "run: median of the runs. paper: reported for an RTX 4090. authors' code: measured on two CPU cores, compiling in "
+    "brackets. peak: memory of the process, jax included."
+)
+
 
 def bench(works: tuple[str, ...] = tuple(WORKS), out: Path | None = None) -> int:
     """Time the work of the paper's runtime study and of this project, each in a process of its own.
@@ -29,8 +35,8 @@ def bench(works: tuple[str, ...] = tuple(WORKS), out: Path | None = None) -> int
         console.print(f"[bold red]retrim:[/] no work {', '.join(unknown)}; there are {', '.join(WORKS)}")
         return 2
     watch, rows, interrupted, failed = Stopwatch(), list[dict[str, Any]](), False, False
-    shown = Table(title="retrim bench", caption="peak memory of the process, jax included")
-    for heading in ("work", "compile, s", "run, s", "peak, MB", "goal", "remarks"):
+    shown = Table(title="retrim bench", caption=CAPTION)
+    for heading in HEADINGS:
         shown.add_column(heading, overflow="fold")
     with tempfile.TemporaryDirectory() as cache:
         for name in works:
@@ -47,14 +53,7 @@ def bench(works: tuple[str, ...] = tuple(WORKS), out: Path | None = None) -> int
                 console.print(f"[bold red]{name}:[/] {error}")
                 continue
             rows.append(row)
-            shown.add_row(
-                row["work"],
-                _seconds(row["compile_s"]),
-                _seconds(row["run_s"]),
-                f"{row['peak_mb']:.0f}",
-                row["goal"],
-                row["remarks"],
-            )
+            shown.add_row(*_cells(row))
             console.print(f"{row['work']}: compile {_seconds(row['compile_s'])} s, run {_seconds(row['run_s'])} s")
     console.print(shown)
     folder = run_folder(out, "bench")
@@ -69,19 +68,17 @@ def markdown(rows: Sequence[dict[str, Any]], commit: str, machine: str) -> str:
     lines = [
         "# Bench",
         "",
-        "Made by `retrim bench`. Each work in a process of its own; compiling apart, from an empty cache unless the",
-        "work says otherwise; the run is the median of the runs. Peak memory is the process's, jax included.",
-        "",
-        f"Commit {commit}; {machine}.",
-        "",
-        "| work | compile [s] | run [s] | goal | peak [MB] | remarks |",
-        "|---|---|---|---|---|---|",
+        "Made by `retrim bench`. Each work in a process of its own, from an empty compile cache unless the",
     ]
-    for row in rows:
-        compiled, ran = _seconds(row["compile_s"]), _seconds(row["run_s"])
-        cells = row["work"], compiled, f"**{ran}**", row["goal"], f"{row['peak_mb']:.0f}", row["remarks"]
-        lines.append("| " + " | ".join(cells) + " |")
+    lines += [f"work says otherwise. {CAPTION}", "", f"Commit {commit}; {machine}.", ""]
+    lines += ["| " + " | ".join(HEADINGS) + " |", "|" + "---|" * len(HEADINGS)]
+    lines += ["| " + " | ".join(_cells(row)) + " |" for row in rows]
     return "\n".join([*lines, ""])
+
+
+def _cells(row: dict[str, Any]) -> list[str]:
+    times = _seconds(row["run_s"]), _seconds(row["compile_s"])
+    return [row["work"], *times, row["goal"], row["paper"], row["authors"], f"{row['peak_mb']:.0f}", row["remarks"]]
 
 
 def _measured(name: str, cache: Path) -> dict[str, Any]:
