@@ -36,8 +36,8 @@ def bench(works: tuple[str, ...] = tuple(WORKS), out: Path | None = None) -> int
         return 2
     watch, rows, interrupted, failed = Stopwatch(), list[dict[str, Any]](), False, False
     shown = Table(title="retrim bench", caption=CAPTION)
-    for heading in HEADINGS:
-        shown.add_column(heading, overflow="fold")
+    for heading in HEADINGS[:-1]:
+        shown.add_column(heading, overflow="fold", min_width=24 if heading == "work" else None)
     with tempfile.TemporaryDirectory() as cache:
         for name in works:
             try:
@@ -53,8 +53,8 @@ def bench(works: tuple[str, ...] = tuple(WORKS), out: Path | None = None) -> int
                 console.print(f"[bold red]{name}:[/] {error}")
                 continue
             rows.append(row)
-            shown.add_row(*_cells(row))
-            console.print(f"{row['work']}: compile {_seconds(row['compile_s'])} s, run {_seconds(row['run_s'])} s")
+            shown.add_row(*_cells(row)[:-1])
+            console.print(f"{row['work']}: run {_seconds(row['run_s'])} s ({row['remarks']})", soft_wrap=True)
     console.print(shown)
     folder = run_folder(out, "bench")
     path = write_results(folder, seeds=[0], watch=watch, rows=rows, interrupted=interrupted)
