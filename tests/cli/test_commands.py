@@ -179,8 +179,12 @@ def test_demo_and_reproduce_at_reduced_size(folder):
 
 def interrupted(words, cwd, after):
     """Run, send Ctrl-C once the output shows ``after``, return exit code and output."""
+    listening = (
+        "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "  # whoever runs the tests
+    )
+    code = f"{listening} from retrim.cli import main; sys.argv = ['retrim', *{words!r}]; main()"
     process = subprocess.Popen(
-        [sys.executable, "-u", "-m", "retrim.cli", *words],
+        [sys.executable, "-u", "-c", code],
         cwd=cwd,
         env={**ENVIRONMENT, "FORCE_COLOR": "1", "TERM": "xterm"},
         stdout=subprocess.PIPE,
