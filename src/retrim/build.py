@@ -1,4 +1,4 @@
-"""From a preset's numbers to objects: task, models, learners, plant, starts."""
+"""From a preset's numbers to objects: task, models, learners, starts."""
 
 import dataclasses
 import functools
@@ -15,16 +15,14 @@ from .adapt.adapter import Adapter
 from .adapt.lockstep import Schedule
 from .control.policy import Policy
 from .learn.residual import EnsembleResidual
-from .physics.disturbance import Constant, Disturbance, Reversing
 from .physics.dynamics import PointMass
-from .physics.rotors import Rotors
 from .physics.state import State
-from .physics.vehicle import Vehicle, large, small
-from .presets import DISTURBANCES, DT, Preset, PresetError
+from .physics.vehicle import Vehicle
+from .presets import DT, Preset
 from .tasks.hover import TILT, Hover
 from .tasks.observation import StateObs
+from .testbed import VEHICLES
 
-VEHICLES = {"small": small, "large": large}
 STARTS = 1  # folded into a seed for the starts of flights, so that they share no key with training
 
 
@@ -94,21 +92,6 @@ def schedule(preset: Preset, *, measured: bool = False) -> Schedule:
         None if measured else a.refine_charge,
         None if measured else a.improve_charge,
     )
-
-
-def plant_model(name: str) -> Rotors:
-    """The rotor-level model of the simulated plant, for the vehicle ``name``."""
-    return Rotors.of(VEHICLES[name](), DT)
-
-
-def disturbance(name: str) -> Disturbance:
-    """The paper's disturbances: 0, 0.5 and 2 m/s^2 on each axis (Sec. IV-B), and +-0.5 reversed every 15 s."""
-    if name == "reversing":
-        return Reversing(jnp.full(3, 0.5), jnp.array(15.0))
-    level = {"none": 0.0, "small": 0.5, "large": 2.0}
-    if name not in level:
-        raise PresetError(f"no disturbance {name!r}; there are {', '.join(DISTURBANCES)}")
-    return Constant(jnp.full(3, level[name]))
 
 
 def flight_starts(preset: Preset, n: int, seed: int = 0) -> list[State]:

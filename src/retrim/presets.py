@@ -86,7 +86,7 @@ class Preset:
 
     name: str = "paper"
     task: Literal["hover"] = "hover"
-    vehicle: Literal["small", "large"] = "small"
+    vehicle: Literal["small", "large", "kingfisher"] = "small"
     """The vehicle that the policy is trained for."""
     goal: tuple[FiniteFloat, FiniteFloat, FiniteFloat] = (0.0, 0.0, 1.0)
     """Where to hover, world [m]."""
@@ -116,8 +116,6 @@ PRESETS: dict[str, Preset] = {
         adapt=Adapt(clip=1.0),
     ),
 }
-
-DISTURBANCES = ("none", "small", "large", "reversing")
 
 
 class PresetError(ValueError):

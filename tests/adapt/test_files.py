@@ -14,7 +14,7 @@ from jax import random
 from safetensors.numpy import load_file, save_file
 
 from helpers import tiny_preset
-from retrim import PolicyError, PresetError, build, load_policy, presets, save_policy
+from retrim import PolicyError, PresetError, build, load_policy, presets, save_policy, testbed
 from retrim.adapt import wire
 
 
@@ -220,7 +220,7 @@ def test_unknown_names():
     with pytest.raises(PresetError, match="no preset 'quick'; there are paper, released, fast"):
         presets.load("quick")
     with pytest.raises(PresetError, match="no disturbance 'huge'; there are none, small, large, reversing"):
-        build.disturbance("huge")
+        testbed.disturbance("huge")
 
 
 def test_header_is_plain_json(file):

@@ -9,13 +9,14 @@ from jax import random
 
 from helpers import hover_task, tiny_preset
 from retrim import build, presets
-from retrim.adapt import AdaptivePilot, ControllerPilot, Sample, Schedule, SimPlant, fly
+from retrim.adapt import AdaptivePilot, ControllerPilot, Sample, Schedule, fly
 from retrim.adapt.adapter import Adapter
 from retrim.adapt.buffer import RollingBuffer
 from retrim.adapt.gate import judge
 from retrim.control import Policy, PolicyController
 from retrim.learn import PolicyState, pretrain
 from retrim.physics import Command, State, small
+from retrim.testbed import Setting
 
 pytestmark = pytest.mark.usefixtures("optax_promotion")
 
@@ -135,7 +136,7 @@ def pilot(preset, policy, *, schedule=None, sinks=()):
 
 def adaptive_flight(preset, policy, seconds, **options):
     flying = pilot(preset, policy, **options)
-    plant = SimPlant(build.plant_model("small"), build.disturbance("large"))
+    plant = Setting("simple").make("large")
     log = fly(plant, flying, build.flight_starts(preset, 1)[0], ticks=round(seconds / presets.DT))
     return log, flying
 
@@ -167,7 +168,7 @@ def test_commands_are_the_old_policys_until_the_swap(trained):
     """The flight equals an unadapted one up to the tick at which the first policy appears, and differs after it."""
     preset, _, policy = trained
     log, flown = adaptive_flight(preset, policy, 2.4, schedule=BRISK)
-    plant = SimPlant(build.plant_model("small"), build.disturbance("large"))
+    plant = Setting("simple").make("large")
     base = ControllerPilot(PolicyController(build.task(preset).observation, policy))
     plain = fly(plant, base, build.flight_starts(preset, 1)[0], ticks=120)
     swap = next(round(e.t / presets.DT) for e in flown.events if e.kind == "policy")
@@ -205,7 +206,7 @@ def test_one_trace_over_many_cycles(trained):
     adapter = eqx.tree_at(lambda a: a.task, build.adapter(preset), Counting(**fields))
     state = adapter.init(policy, build.residual(preset, random.key(2)))
     flying = AdaptivePilot(adapter, state, BRISK, random.key(3), dt=presets.DT, window=preset.adapt.window)
-    plant = SimPlant(build.plant_model("small"), build.disturbance("large"))
+    plant = Setting("simple").make("large")
     x0 = build.flight_starts(preset, 1)[0]
     fly(plant, flying, x0, ticks=60)
     compiled = len(traces)
@@ -235,7 +236,7 @@ def test_adaptation_cuts_the_error_under_the_large_disturbance():
     )
     *_, (state, _) = run
     x0 = build.flight_starts(preset, 1)[0]
-    plant = SimPlant(build.plant_model("small"), build.disturbance("large"))
+    plant = Setting("simple").make("large")
     base = fly(plant, ControllerPilot(PolicyController(build.task(preset).observation, state.policy)), x0, ticks=500)
     adapted = fly(plant, pilot(preset, state.policy), x0, ticks=500)
     before, after = (np.linalg.norm(log.p[-50:] - preset.goal, axis=1).mean() for log in (base, adapted))
@@ -266,7 +267,7 @@ def test_a_refused_policy_is_logged_and_never_flies(trained, monkeypatch):
     preset, _, policy = trained
     monkeypatch.setattr(Adapter, "improve", broken_improve)
     log, flown = adaptive_flight(preset, policy, 3.0, schedule=BRISK)
-    plant = SimPlant(build.plant_model("small"), build.disturbance("large"))
+    plant = Setting("simple").make("large")
     base = ControllerPilot(PolicyController(build.task(preset).observation, policy))
     plain = fly(plant, base, build.flight_starts(preset, 1)[0], ticks=150)
     np.testing.assert_array_equal(log.u, plain.u)
@@ -280,7 +281,7 @@ def test_a_second_flight_keeps_what_was_learnt_and_forgets_what_was_seen(trained
     preset, _, policy = trained
     _, flying = adaptive_flight(preset, policy, 1.5, schedule=BRISK)
     learnt = flying.state
-    plant = SimPlant(build.plant_model("small"), build.disturbance("large"))
+    plant = Setting("simple").make("large")
     fly(plant, flying, build.flight_starts(preset, 1)[0], ticks=10)
     assert len(flying._buffer) == 10
     jax.tree.map(np.testing.assert_array_equal, flying.state, learnt)

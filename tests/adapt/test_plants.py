@@ -9,15 +9,16 @@ from helpers import random_state
 from retrim import build, presets
 from retrim.adapt import ControllerPilot, Plant, PlantError, SimPlant, fly
 from retrim.control import AbstractController
-from retrim.physics import Command, Constant, Rotors, State, small
+from retrim.physics import Command, Constant, Push, Rotors, State, small
+from retrim.testbed import Setting
 
-PLANTS = {"simple": lambda: SimPlant(build.plant_model("small"), Constant(jnp.zeros(3)))}
+PLANTS = {name: Setting(name).make for name in ("bem", "simple")}
 START = State.at(jnp.array([0.3, -0.2, 1.5]))
 
 
 @pytest.fixture(params=list(PLANTS))
 def plant(request):
-    return PLANTS[request.param]()
+    return PLANTS[request.param]("none")
 
 
 def test_is_a_plant(plant):
@@ -164,7 +165,7 @@ def test_disturbance_accelerates():
 
 
 def test_any_function_of_time_and_state_is_a_disturbance():
-    plant = SimPlant(Rotors.of(small(), 0.02), lambda t, x: -10.0 * x.v + jnp.where(t < 0.1, 1.0, 0.0))
+    plant = SimPlant(Rotors.of(small(), 0.02), Push(lambda t, x: -10.0 * x.v + jnp.where(t < 0.1, 1.0, 0.0)))
     plant.reset(START)
     for _ in range(100):
         sample = plant.exchange(Command.hover())
@@ -172,9 +173,9 @@ def test_any_function_of_time_and_state_is_a_disturbance():
 
 
 def test_flights_are_in_the_dtype_of_their_start():
-    plant = PLANTS["simple"]()
+    plant = PLANTS["bem"]("none")
     with jax.enable_x64(False):
-        plant32 = PLANTS["simple"]()
+        plant32 = PLANTS["bem"]("none")
         x0 = build.flight_starts(presets.load("fast"), 1)[0]
         assert plant32.reset(x0).x.p.dtype == jnp.float32
         assert plant32.exchange(Command.hover()).x.p.dtype == jnp.float32

@@ -15,8 +15,9 @@ import pytest
 from retrim import presets
 from retrim.adapt import Log
 from retrim.cli.flights import Flight, Plan
-from retrim.cli.pictures import picture, pushes
+from retrim.cli.pictures import picture, spans
 from retrim.cli.scores import cell, rows
+from retrim.testbed import Setting
 
 SMALL = "[pretrain]\nhidden = [64, 64]\nepochs = 150\n[adapt]\nepochs = 4\nenvs = 4\niters = 20\nrefine_every = 1.0\nimprove_every = 1.5\nrefine_charge = 0.1\nimprove_charge = 0.3\n"  # noqa: E501
 ENVIRONMENT = {**os.environ, "COLUMNS": "160", "NO_COLOR": "1"}
@@ -66,7 +67,7 @@ def test_fly_writes_rows_events_and_pictures(folder):
     results = json.loads((folder / "f" / "results.json").read_text())
     assert [row["method"] for row in results["rows"]] == ["base", "full"]
     for row in results["rows"]:
-        keys = {"task", "plant", "vehicle", "disturbance", "method", "metric", "mean", "std", "n", "crashes"}
+        keys = {"task", "plant", "vehicle", "sensing", "disturbance", "method", "metric", "mean", "std", "n", "crashes"}
         assert row.keys() == keys
         assert row["n"] == 2
         assert row["crashes"] == 0
@@ -102,7 +103,7 @@ def test_default_folder(folder):
     ("words", "code", "message"),
     [
         (("fly", "--policy", "nothing"), 1, "nothing: no such file; `retrim pretrain hover --out DIR` makes one"),
-        (("fly", "--policy", "p", "--disturbance", "huge"), 2, "invalid choice 'huge'"),
+        (("fly", "--policy", "p", "--disturbance", "huge"), 1, "no disturbance 'huge'; there are none, small"),
         (("fly", "--policy", "p", "--seconds", "1"), 1, "at least 3 s and 1 start are needed"),
         (("fly", "--policy", "p", "--config", "small.toml", "--vehicle", "x"), 2, "invalid choice 'x'"),
         (("pretrain", "hover", "--preset", "nope"), 1, "no preset 'nope'; there are paper, released, fast"),
@@ -134,18 +135,18 @@ def test_crashes_are_counted_and_left_out_of_the_mean():
         flight(1, crashed=False, error=0.3),
         flight(2, crashed=True, error=9.0),
     ]
-    (row,) = rows(found, task="hover", plant="simple", vehicle="small")
+    (row,) = rows(found, task="hover", setting=Setting())
     assert (row["n"], row["crashes"]) == (3, 1)
     assert row["mean"] == pytest.approx(0.2)
     assert row["std"] == pytest.approx(np.std([0.1, 0.3], ddof=1))
     assert cell(row) == "0.200 ± 0.141, 1 of 3 crashed"
-    (row,) = rows(found[2:], task="hover", plant="simple", vehicle="small")
+    (row,) = rows(found[2:], task="hover", setting=Setting())
     assert (row["mean"], row["std"], cell(row)) == (None, None, "crashed, 1 of 1")
 
 
 def test_a_picture_with_crashes_and_without_adapted_flights(tmp_path):
     found = [flight(0, crashed=False, error=0.1), flight(1, crashed=True, error=3.0)]
-    assert all(path.exists() for path in picture(found, presets.load("fast"), "large", "small", tmp_path))
+    assert all(path.exists() for path in picture(found, presets.load("fast"), "large", Setting(), tmp_path))
 
 
 @pytest.mark.usefixtures("optax_promotion")
@@ -222,11 +223,15 @@ def test_ctrl_c_keeps_what_was_flown(folder):
 
 
 @pytest.mark.usefixtures("optax_promotion")
-def test_pushes_of_disturbances():
-    assert pushes("none", 30.0) == []
-    (large,) = pushes("large", 30.0)
-    assert (large.start, large.end, large.a) == (0.0, 30.0, (2.0, 2.0, 2.0))
-    spans = pushes("reversing", 40.0)
-    assert [s.a[0] for s in spans] == [0.5, -0.5, 0.5]
-    assert [s.start for s in spans] == pytest.approx([0.0, 15.0, 30.0], abs=0.1)
-    assert spans[-1].end == 40.0
+def test_spans_of_disturbances():
+    def found(name, seconds=30.0):
+        return [(s.start, s.end, s.label) for s in spans(name, (0.0, 0.0, 1.0), seconds)]
+
+    assert found("none") == []
+    assert found("large") == [(0.0, 30.0, "pushed by +2 m/s² per axis")]
+    first, second, third = found("reversing", 40.0)
+    assert (first[2], second[2]) == ("pushed by +0.5 m/s² per axis", "pushed by -0.5 m/s² per axis")
+    assert (second[0], third[0], third[1]) == (pytest.approx(15.0, abs=0.1), pytest.approx(30.0, abs=0.1), 40.0)
+    assert found("pickup") == [(8.0, 20.0, "70 g of load")]
+    assert found("wind+weak-rotor") == [(0.0, 30.0, "wind of 4.0 m/s; rotors at 90, 100, 100, 100 %")]
+    assert found("gusts") == [(0.0, 30.0, "gusts")]

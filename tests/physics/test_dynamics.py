@@ -204,9 +204,9 @@ def test_new_values_do_not_retrace(key):
 
 def test_disturbances():
     x, a = State.at(jnp.zeros(3)), jnp.array([0.5, 0.5, 0.5])
-    np.testing.assert_array_equal(Constant(a)(jnp.array(7.0), x), a)
+    np.testing.assert_array_equal(Constant(a)(jnp.array(7.0), x).push, a)
     reversing = Reversing(a, jnp.array(15.0))
-    signs = [float(reversing(jnp.array(t), x)[0]) for t in (0.0, 14.99, 15.01, 29.9, 30.1)]
+    signs = [float(reversing(jnp.array(t), x).push[0]) for t in (0.0, 14.99, 15.01, 29.9, 30.1)]
     assert signs == [0.5, 0.5, -0.5, -0.5, 0.5]
     with pytest.raises(ValueError, match=r"Reversing\.period"):
         Reversing(a, jnp.array(0.0))

@@ -7,8 +7,8 @@ import pytest
 from jax import random
 
 from helpers import random_command, random_state, replaced
-from retrim.physics import Command, Rotors, State, large, small, so3
-from retrim.physics.rotors import RotorState
+from retrim.physics import Command, Conditions, Rotors, State, large, small, so3
+from retrim.physics.highrate import RotorState
 
 VEHICLES = {"small": small, "large": large}
 
@@ -31,7 +31,7 @@ def test_hover_balance(exact):
     s = flown(exact, exact.init(State.at(jnp.zeros(3))), Command.hover(), 2.0)
     np.testing.assert_allclose(s.x.p, 0.0, atol=1e-10)
     np.testing.assert_allclose(s.x.R, np.eye(3), atol=1e-12)
-    force, torque = exact.wrench(s, s.motors, exact.vehicle.thrust_coefficient * s.motors**2)
+    force, torque = exact.wrench(s, s.motors, exact.vehicle.thrust_coefficient * s.motors**2, jnp.zeros(3))
     np.testing.assert_allclose(force, [0, 0, float(exact.vehicle.mass) * 9.81], rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(torque, 0.0, atol=1e-12)
 
@@ -45,7 +45,7 @@ def test_thrust_error_is_the_stated_acceleration():
 def test_mixer_and_wrench_are_inverse(exact, key):
     force, torque = jnp.array(5.0), 1e-3 * random.normal(key, (3,))
     thrusts = exact.mixed(force, torque)
-    found_force, found_torque = exact.wrench(exact.init(State.at(jnp.zeros(3))), jnp.zeros(4), thrusts)
+    found_force, found_torque = exact.wrench(exact.init(State.at(jnp.zeros(3))), jnp.zeros(4), thrusts, jnp.zeros(3))
     np.testing.assert_allclose(found_force[2], force, rtol=1e-12)
     np.testing.assert_allclose(found_torque, torque, atol=1e-14)
 
@@ -55,7 +55,7 @@ def test_each_rotor_turns_the_body_as_its_place_says(exact):
     ax, ay = (float(a) for a in exact.vehicle.arm)
     places = [(ax, -ay), (-ax, ay), (-ax, -ay), (ax, ay)]
     for i, (x, y) in enumerate(places):
-        _, torque = exact.wrench(exact.init(State.at(jnp.zeros(3))), jnp.zeros(4), jnp.eye(4)[i])
+        _, torque = exact.wrench(exact.init(State.at(jnp.zeros(3))), jnp.zeros(4), jnp.eye(4)[i], jnp.zeros(3))
         np.testing.assert_allclose(torque[:2], np.cross([x, y, 0], [0, 0, 1])[:2], atol=1e-12)
         assert np.sign(torque[2]) == (-1 if i < 2 else 1)
 
@@ -65,7 +65,7 @@ def test_rate_step_response(exact, axis):
     """Reaches 63 % within 150 ms (yaw 300 ms), overshoots by less than 25 %, settles on the command."""
     u = Command(jnp.array(9.81), 1.0 * jnp.eye(3)[axis])
     s, rates = exact.init(State.at(jnp.zeros(3))), []
-    step = jax.jit(lambda s: exact.substep(s, u, jnp.zeros(3)))
+    step = jax.jit(lambda s: exact.substep(s, u, Conditions.calm(jnp.dtype(float))))
     for _ in range(1500):
         s = step(s)
         rates.append(float(s.omega[axis]))
@@ -90,7 +90,7 @@ def test_drag_takes_energy_and_thrustless_flight_creates_none():
     v = jnp.array([3.0, -2.0, 1.0])
     x, zero = State(jnp.zeros(3), so3.exp(jnp.array([0.3, 0.2, 0.1])), v), jnp.zeros(3)
     s = RotorState(x, zero, jnp.zeros(4), zero, zero)
-    force, _ = model.wrench(s, model.vehicle.hover_speed * jnp.ones(4), jnp.zeros(4))
+    force, _ = model.wrench(s, model.vehicle.hover_speed * jnp.ones(4), jnp.zeros(4), jnp.zeros(3))
     power = (s.x.R @ force) @ v
     assert power < 0.0
     assert power == pytest.approx(-float(model.vehicle.mass) * float(model.drag @ (s.x.R.T @ v) ** 2), rel=1e-12)

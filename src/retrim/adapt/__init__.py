@@ -12,3 +12,4 @@ from .plant import PlantError as PlantError
 from .plant import Sample as Sample
 from .plant import fly as fly
 from .plants import SimPlant as SimPlant
+from .sensing import Sensing as Sensing

@@ -28,6 +28,13 @@ class Sample(NamedTuple):
     """Command issued for the tick that ended in ``x``; hover at the reset."""
     a: Float[Array, "3"] | None = None
     """Measured acceleration, world [m/s^2], if the plant has one."""
+    truth: State | None = None
+    """What the state really was, where the plant knows better than its sensors. For scores, never for pilots."""
+
+    @property
+    def really(self) -> State:
+        """``truth``, or the measured state where that is all there is."""
+        return self.x if self.truth is None else self.truth
 
 
 @runtime_checkable
@@ -87,7 +94,7 @@ def _decide(controller: AbstractController[Any], memory: Any, t: Float[Array, ""
 
 
 class Log(NamedTuple):
-    """A flight as it was measured: NumPy arrays, ticks in front."""
+    """A flight as it was: NumPy arrays, ticks in front. States are the true ones, where the plant tells them."""
 
     t: np.ndarray
     """[s]"""
@@ -130,9 +137,9 @@ def fly(
         plant.stop()
     return Log(
         np.array([s.t for s in samples]),
-        np.stack([np.asarray(s.x.p) for s in samples]),
-        np.stack([np.asarray(s.x.R) for s in samples]),
-        np.stack([np.asarray(s.x.v) for s in samples]),
+        np.stack([np.asarray(s.really.p) for s in samples]),
+        np.stack([np.asarray(s.really.R) for s in samples]),
+        np.stack([np.asarray(s.really.v) for s in samples]),
         np.stack([np.asarray(s.u.vector()) for s in samples]),
         crashed,
     )

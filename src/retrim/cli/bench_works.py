@@ -21,13 +21,13 @@ from ..adapt.adapter import Adapter, AdaptState
 from ..adapt.buffer import RollingBuffer
 from ..adapt.gate import Verdict
 from ..adapt.plant import ControllerPilot, fly
-from ..adapt.plants.sim import SimPlant
 from ..control.controller import PolicyController
 from ..learn.bptt import PolicyState
 from ..learn.pretrain import train_chunk
 from ..learn.residual import Window
 from ..physics.state import Command
 from ..presets import Preset
+from ..testbed import Setting
 from .training import nominal_error
 
 
@@ -93,7 +93,7 @@ def _learner() -> tuple[Adapter, AdaptState, Window]:
     preset = presets.load("paper")
     policy = build.policy(preset, random.key(0))
     adapter = build.adapter(preset)
-    plant = SimPlant(build.plant_model("small"), build.disturbance("large"))
+    plant = Setting().make("large")
     log_buffer = RollingBuffer(preset.adapt.window)
     sample = plant.reset(build.flight_starts(preset, 1)[0])
     for _ in range(preset.adapt.window):
@@ -125,7 +125,7 @@ def _programs() -> dict[str, Any]:
 
     watch = Stopwatch()
     preset = presets.load("fast")
-    campaign = Campaign(preset, build.policy(preset, random.key(0)), vehicle="small", seconds=3.0, starts=1, seed=0)
+    campaign = Campaign(preset, build.policy(preset, random.key(0)), setting=Setting(), seconds=3.0, starts=1, seed=0)
     campaign.warm_up(["large"])
     return {"compile_s": watch.compile_s, "run_s": watch.total_s - watch.compile_s, "remarks": "preset fast"}
 
@@ -134,7 +134,7 @@ def _tick() -> dict[str, Any]:
     """One flight without adaptation: plant, observation, policy, checks."""
     preset = presets.load("fast")
     controller = PolicyController(build.task(preset).observation, build.policy(preset, random.key(0)))
-    plant = SimPlant(build.plant_model("small"), build.disturbance("none"))
+    plant = Setting().make("none")
     x0 = build.flight_starts(preset, 1)[0]
     began = time.perf_counter()
     fly(plant, ControllerPilot(controller), x0, ticks=2)

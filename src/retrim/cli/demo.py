@@ -7,7 +7,8 @@ from typing import Literal
 
 from .. import presets
 from ..checkpoint import save_policy
-from .fly import write_events
+from ..testbed import ABOUT, PlantName
+from .fly import setting_for, write_events
 from .hover_table import fly_table, hover_table
 from .pictures import picture
 from .session import Stopwatch, console, run_folder, write_results
@@ -22,6 +23,7 @@ WHY = {
 
 def demo(
     preset: Literal["fast", "released", "paper"] = "fast",
+    plant: PlantName = "bem",
     seconds: float = 30.0,
     starts: int = 8,
     seed: int = 0,
@@ -31,6 +33,7 @@ def demo(
 
     Args:
         preset: fast trains in seconds and has the plant's delay in its model; paper and released take about a minute.
+        plant: bem: blade-element rotors; simple: rotors with linear drag; the others are extras to install.
         seconds: Length of a flight.
         starts: Flights per disturbance and method, each from another start.
         seed: Seed of everything.
@@ -42,7 +45,8 @@ def demo(
     folder = run_folder(out, "demo")
     settings = presets.load(preset)
     console.print(f"preset [bold]{preset}[/]: {WHY[preset]}")
-    console.print("small quadrotor (0.19 kg) on the simulated plant: rotor level at 1 kHz, 20 ms of command delay")
+    setting = setting_for(settings, plant)
+    console.print(f"{setting.flown} quadrotor on plant [bold]{plant}[/]: {ABOUT[plant]}")
     policy, losses, interrupted = train(settings, seed)
     if losses:
         save_policy(folder / "policy.safetensors", policy, settings)
@@ -50,8 +54,8 @@ def demo(
         console.print(f"interrupted while pretraining, after {len(losses)} epochs; what there is lies in {folder}")
         return 130
     console.print(f"hover error in its own model: {1000 * nominal_error(settings, policy):.1f} mm")
-    flights, interrupted = fly_table(settings, policy, seconds=seconds, starts=starts, seed=seed)
-    table = hover_table(flights, settings)
+    flights, interrupted = fly_table(settings, policy, setting, seconds=seconds, starts=starts, seed=seed)
+    table = hover_table(flights, settings, setting)
     write_results(
         folder,
         seeds=[seed],
@@ -65,7 +69,7 @@ def demo(
     console.print(table.shown)
     console.print(f"compiling {watch.compile_s:.0f} s, all else {watch.total_s - watch.compile_s:.0f} s")
     flown = dict.fromkeys(f.plan.disturbance for f in flights)
-    pictures = [path for name in flown for path in picture(flights, settings, name, settings.vehicle, folder)]
+    pictures = [path for name in flown for path in picture(flights, settings, name, setting, folder)]
     for path in pictures:
         if path.suffix == ".png":
             console.print(f"[bold]{path}[/]", soft_wrap=True)

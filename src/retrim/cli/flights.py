@@ -20,13 +20,13 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from .. import build, presets
 from ..adapt.buffer import RollingBuffer
 from ..adapt.lockstep import AdaptivePilot, Event
-from ..adapt.plant import ControllerPilot, Log, Pilot, Sample, fly
-from ..adapt.plants.sim import SimPlant
+from ..adapt.plant import ControllerPilot, Log, Pilot, Plant, Sample, fly
 from ..control.controller import PolicyController
 from ..control.policy import Policy
 from ..physics.state import State
 from ..presets import Preset
 from ..tasks.task import AbstractTask
+from ..testbed import Setting
 from .session import console
 
 Method = Literal["base", "full"]
@@ -74,7 +74,7 @@ class Campaign:
         preset: Preset,
         policy: Policy,
         *,
-        vehicle: str,
+        setting: Setting,
         seconds: float,
         starts: int,
         seed: int,
@@ -84,7 +84,7 @@ class Campaign:
         self._ticks, self._seed, self._workers = round(seconds / presets.DT), seed, 1 if measured else _cores()
         self._adapter = build.adapter(preset)
         self._schedule = build.schedule(preset, measured=measured)
-        self._model = build.plant_model(vehicle)
+        self.setting = setting
         self._starts = build.flight_starts(preset, starts, seed)
         self.stop = threading.Event()
 
@@ -94,7 +94,7 @@ class Campaign:
         with console.status("compiling the programs of a flight (kept in a cache for the next time) ..."):
             pilot = self._pilot(0)
             for disturbance in dict.fromkeys(disturbances):
-                plant = SimPlant(self._model, build.disturbance(disturbance))
+                plant = self._plant(disturbance, 0)
                 fly(plant, pilot, x0, ticks=2, alive=self._alive)
             buffer = RollingBuffer(self.preset.adapt.window)
             buffer.push(x0, self.policy.u_hover)
@@ -148,10 +148,14 @@ class Campaign:
             window=self.preset.adapt.window,
         )
 
+    def _plant(self, disturbance: str, start: int) -> Plant:
+        """The same gusts and sensor noise for every method that flies from a start."""
+        return self.setting.make(disturbance, seed=1000 * self._seed + start)
+
     def _fly(self, plan: Plan, ticker: "_Ticker") -> Flight:
         adaptive = self._pilot(plan.start) if plan.method == "full" else None
         pilot: Pilot = adaptive or ControllerPilot(PolicyController(self._adapter.task.observation, self.policy))
-        plant = SimPlant(self._model, build.disturbance(plan.disturbance))
+        plant = self._plant(plan.disturbance, plan.start)
         log = fly(plant, pilot, self._starts[plan.start], ticks=self._ticks, alive=self._alive, sinks=(ticker,))
         error = np.asarray(_errors(self._adapter.task, log.t, State(*map(jnp.asarray, (log.p, log.R, log.v)))))
         return Flight(plan, log, error, tuple(adaptive.events) if adaptive else ())
@@ -159,7 +163,7 @@ class Campaign:
     def _alive(self, sample: Sample) -> bool:
         if self.stop.is_set():
             raise _Stopped
-        return bool(_still_alive(self._adapter.task, np.float64(sample.t), sample.x))
+        return bool(_still_alive(self._adapter.task, np.float64(sample.t), sample.really))
 
 
 class _Stopped(Exception):

@@ -5,10 +5,11 @@ from typing import Literal
 
 from rich.table import Table
 
-from .. import presets
+from .. import presets, testbed
 from ..adapt.sink import JsonlSink
 from ..checkpoint import load_policy
 from ..presets import Preset
+from ..testbed import PlantName, SensingName, Setting, VehicleName
 from .flights import Campaign, Flight, Plan
 from .pictures import picture
 from .scores import cell, rows
@@ -17,9 +18,11 @@ from .session import Stopwatch, console, run_folder, write_results
 
 def fly(
     policy: Path,
-    disturbance: Literal["none", "small", "large", "reversing"] = "large",
+    disturbance: str = "large",
+    plant: PlantName = "bem",
     adapt: Literal["none", "full"] = "full",
-    vehicle: Literal["small", "large"] | None = None,
+    vehicle: VehicleName | None = None,
+    sensing: SensingName = "ideal",
     config: Path | None = None,
     charge: Literal["fixed", "measured"] = "fixed",
     seconds: float = 30.0,
@@ -27,13 +30,19 @@ def fly(
     seed: int = 0,
     out: Path | None = None,
 ) -> int:
-    """Fly a policy on the simulated plant, as it is and, with --adapt full, adapting as it flies.
+    """Fly a policy on a plant, as it is and, with --adapt full, adapting as it flies.
 
     Args:
         policy: A policy.safetensors, or the folder that holds one.
-        disturbance: What pushes the vehicle.
+        disturbance: What disturbs the flight: none, small, large, reversing, walk, wind, gusts, fan, payload, pickup,
+            battery, weak-rotor, or several at once, as wind+payload.
+        plant: bem: blade-element rotors; simple: rotors with linear drag; rotorpy, mujoco, crazyflow: independent
+            simulators, each an extra to install.
         adapt: full: also fly it while residual and policy are re-trained; none: only as it is.
-        vehicle: Quadrotor that the plant simulates; that which the policy was trained for by default.
+        vehicle: Quadrotor that the plant simulates; that which the policy was trained for by default. rotorpy and
+            crazyflow fly their own.
+        sensing: What the policy sees of the state: ideal, mocap (0.3 mm, 3 mm/s, 1 mrad) or rough (1 mm, 10 mm/s,
+            3 mrad, 10 ms late, 5 % of the samples lost).
         config: TOML file that overlays the policy's own preset, for example with a table [adapt].
         charge: fixed: learning costs the preset's flight time, so that a run repeats bit for bit; measured: what the
             clock says.
@@ -48,10 +57,11 @@ def fly(
         preset = _same_policy(preset, presets.overlaid(preset, config), config)
     if seconds < 3.0 or starts < 1:
         raise presets.PresetError(f"--seconds {seconds:g} --starts {starts}: at least 3 s and 1 start are needed")
-    flown_on = vehicle or preset.vehicle
+    setting = setting_for(preset, plant, vehicle, sensing)
+    testbed.disturbance(disturbance)  # a wrong name is refused before anything else happens
     folder = run_folder(out, "fly")
     campaign = Campaign(
-        preset, weights, vehicle=flown_on, seconds=seconds, starts=starts, seed=seed, measured=charge == "measured"
+        preset, weights, setting=setting, seconds=seconds, starts=starts, seed=seed, measured=charge == "measured"
     )
     methods: tuple[Literal["base", "full"], ...] = ("base", "full") if adapt == "full" else ("base",)
     campaign.warm_up([disturbance])
@@ -61,7 +71,7 @@ def fly(
         console.print("interrupted before the first flight was over; nothing was saved")
         return 130
     write_events(flights, folder)
-    table = rows(flights, task=preset.task, plant="simple", vehicle=flown_on)
+    table = rows(flights, task=preset.task, setting=setting)
     write_results(folder, seeds=[seed], watch=watch, rows=table, interrupted=interrupted, preset=presets.values(preset))
     shown = Table(
         title=f"steady-state hover error \\[m], last 2 s of {seconds:g} s, {starts} start{'s' * (starts > 1)}"
@@ -71,9 +81,17 @@ def fly(
     for row in table:
         shown.add_row(row["disturbance"], row["method"], cell(row))
     console.print(shown)
-    for path in picture(flights, preset, disturbance, flown_on, folder):
+    for path in picture(flights, preset, disturbance, setting, folder):
         console.print(f"[bold]{path}[/]", soft_wrap=True)
     return 130 if interrupted else 0
+
+
+def setting_for(
+    preset: Preset, plant: PlantName, vehicle: VehicleName | None = None, sensing: SensingName = "ideal"
+) -> Setting:
+    """Where a policy flies: on the vehicle of its training, unless another is asked for or the plant has its own."""
+    own = plant in testbed.OWN_VEHICLE
+    return Setting(plant, vehicle if own else vehicle or preset.vehicle, sensing)
 
 
 def _same_policy(trained: Preset, overlaid: Preset, config: Path) -> Preset:

@@ -8,6 +8,7 @@ from rich.table import Table
 
 from ..control.policy import Policy
 from ..presets import Preset
+from ..testbed import Setting
 from .flights import Campaign, Flight, Method, Plan
 from .scores import cell, rows
 
@@ -20,9 +21,11 @@ PAPER = {  # Table I [m]
 }
 
 
-def fly_table(preset: Preset, policy: Policy, *, seconds: float, starts: int, seed: int) -> tuple[list[Flight], bool]:
+def fly_table(
+    preset: Preset, policy: Policy, setting: Setting, *, seconds: float, starts: int, seed: int
+) -> tuple[list[Flight], bool]:
     """Every flight of the table, and whether Ctrl-C cut them short."""
-    campaign = Campaign(preset, policy, vehicle=preset.vehicle, seconds=seconds, starts=starts, seed=seed)
+    campaign = Campaign(preset, policy, setting=setting, seconds=seconds, starts=starts, seed=seed)
     campaign.warm_up(LEVELS)
     return campaign.fly([Plan(level, method, i) for level in LEVELS for method in METHODS for i in range(starts)])
 
@@ -37,9 +40,9 @@ class HoverTable:
     """The same as Markdown."""
 
 
-def hover_table(flights: Sequence[Flight], preset: Preset) -> HoverTable:
+def hover_table(flights: Sequence[Flight], preset: Preset, setting: Setting) -> HoverTable:
     """From flights to rows; the paper's figures stand beside ours, from its own plant."""
-    found = rows(flights, task=preset.task, plant="simple", vehicle=preset.vehicle)
+    found = rows(flights, task=preset.task, setting=setting)
     by = {(row["disturbance"], row["method"]): cell(row) for row in found}
     starts = max((row["n"] for row in found), default=0)
     seconds = max((float(f.log.t[-1]) for f in flights), default=0.0)

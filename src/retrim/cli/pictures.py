@@ -4,43 +4,63 @@ import itertools
 from collections.abc import Sequence
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .. import build, presets
+from .. import testbed
+from ..physics.conditions import Conditions
 from ..physics.state import State
 from ..presets import Preset
+from ..testbed import Setting
 from ..viz import plots
 from .flights import Flight
 
 
-def picture(flights: Sequence[Flight], preset: Preset, disturbance: str, vehicle: str, folder: Path) -> list[Path]:
+def picture(flights: Sequence[Flight], preset: Preset, disturbance: str, setting: Setting, folder: Path) -> list[Path]:
     """``hover_<disturbance>.png`` and ``.svg`` of the flights under one disturbance; returns their paths."""
     base, adapted = (
         [_track(f) for f in flights if f.plan.disturbance == disturbance and f.plan.method == method]
         for method in ("base", "full")
     )
     seconds = max(float(track.t[-1]) for track in (*base, *adapted))
-    title = f"Hover of the {vehicle} quadrotor, {disturbance} disturbance, preset {preset.name!r}"
-    figure = plots.flight_figure(title, base, adapted, pushes(disturbance, seconds), preset.goal)
-    return plots.save(figure, folder, f"hover_{disturbance}")
+    title = f"Hover: {setting.flown} on plant {setting.plant!r}, disturbance {disturbance!r}, preset {preset.name!r}"
+    figure = plots.flight_figure(title, base, adapted, spans(disturbance, preset.goal, seconds), preset.goal)
+    return plots.save(figure, folder, f"hover_{disturbance.replace('+', '_')}")
 
 
-def pushes(disturbance: str, seconds: float) -> list[plots.Push]:
-    """The spans of constant push of a disturbance that depends on time alone."""
-    t = np.arange(round(seconds / presets.DT)) * presets.DT
-    push, nowhere = build.disturbance(disturbance), State.at(jnp.zeros(3))
-    a = np.stack([np.asarray(push(jnp.asarray(float(t_i)), nowhere)) for t_i in t[::5]])
-    times = t[::5]
-    edges = [0, *(np.flatnonzero(np.any(np.diff(a, axis=0) != 0, axis=1)) + 1), len(times)]
-    spans = []
+def spans(disturbance: str, goal: tuple[float, float, float], seconds: float) -> list[plots.Span]:
+    """When something disturbs the flight, and what; one span for all that changes all the time."""
+    times = np.linspace(0.0, seconds, round(10 * seconds), endpoint=False)
+    around, x = testbed.disturbance(disturbance), State.at(jnp.array(goal))
+    found = jax.vmap(lambda t: around(t, x))(jnp.asarray(times, dtype=x.p.dtype))
+    values = np.concatenate([np.asarray(leaf).reshape(len(times), -1) for leaf in jax.tree.leaves(found)], axis=1)
+    edges = [0, *(np.flatnonzero(np.any(np.diff(values, axis=0) != 0, axis=1)) + 1), len(times)]
+    if len(edges) > 12:
+        return [plots.Span(0.0, seconds, disturbance, strong=False)]
+    marked = []
     for first, after in itertools.pairwise(edges):
         end = float(times[after]) if after < len(times) else seconds
-        if np.any(a[first]):
-            spans.append(
-                plots.Push(float(times[first]), end, (float(a[first][0]), float(a[first][1]), float(a[first][2])))
-            )
-    return spans
+        here: Conditions = jax.tree.map(lambda leaf, i=first: np.asarray(leaf)[i], found)
+        if label := _label(here):
+            marked.append(plots.Span(float(times[first]), end, label, strong=bool(here.push[0] < 0)))
+    return marked
+
+
+def _label(here: Conditions) -> str:
+    """Conditions in words; empty when calm."""
+    words = list[str]()
+    if np.any(here.push):
+        same = len(set(here.push.tolist())) == 1
+        vector = ", ".join(f"{a:+g}" for a in here.push)
+        words.append(f"pushed by {here.push[0]:+g} m/s² per axis" if same else f"pushed by ({vector}) m/s²")
+    if np.any(here.wind):
+        words.append(f"wind of {np.linalg.norm(here.wind):.1f} m/s")
+    if here.mass > 0:
+        words.append(f"{1000 * here.mass:.0f} g of load")
+    if np.any(here.gain != 1):
+        words.append("rotors at " + ", ".join(f"{100 * g:.0f}" for g in here.gain) + " %")
+    return "; ".join(words)
 
 
 def _track(flight: Flight) -> plots.Track:

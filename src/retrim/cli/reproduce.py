@@ -7,7 +7,9 @@ import tyro
 
 from .. import presets
 from ..presets import Preset
+from ..testbed import PlantName, Setting
 from .flights import Flight
+from .fly import setting_for
 from .hover_table import fly_table, hover_table
 from .pictures import picture
 from .session import Stopwatch, commit, console, machine, run_folder, write_results
@@ -20,6 +22,7 @@ def reproduce(
     seeds: tuple[int, ...] = (0, 1, 2),
     seconds: float = 30.0,
     starts: int = 8,
+    plant: PlantName = "bem",
     out: Path | None = None,
 ) -> int:
     """Table I: hover under three disturbances, for each preset, over several training seeds.
@@ -30,6 +33,7 @@ def reproduce(
         seeds: Training seeds; each also seeds the starts and the learners of its flights.
         seconds: Length of a flight.
         starts: Flights per disturbance, method and seed.
+        plant: Where the policies fly.
         out: Folder for hover.md, hover.json and a picture; a new one under runs/ by default.
     """
     watch = Stopwatch()
@@ -37,18 +41,19 @@ def reproduce(
     sections, rows, interrupted = list[str](), list[dict[str, Any]](), False
     for name in preset:
         settings = presets.load(name)
-        flights, errors, interrupted = _flown(settings, seeds, seconds, starts)
+        setting = setting_for(settings, plant)
+        flights, errors, interrupted = _flown(settings, setting, seeds, seconds, starts)
         if flights:
-            found = hover_table(flights, settings)
+            found = hover_table(flights, settings, setting)
             console.print(found.shown)
             rows += [{**row, "preset": name} for row in found.rows]
             sections += _section(name, found.lines, flights, errors)
         pictured = [f for f in flights if f.plan.disturbance == "large"][: 2 * starts]  # those of the first seed
         if name == preset[0] and pictured:
-            path, _ = picture(pictured, settings, "large", settings.vehicle, folder)
+            path, _ = picture(pictured, settings, "large", setting, folder)
             sections += [f"![{name}, large disturbance, seed {seeds[0]}]({path.name})", ""]
         # after each preset, so that an interruption loses nothing
-        text = [*_head(seeds, seconds, starts), *sections, *_foot(watch, interrupted)]
+        text = [*_head(plant, seeds, seconds, starts), *sections, *_foot(watch, interrupted)]
         (folder / "hover.md").write_text("\n".join(text))
         write_results(folder, name=table, seeds=seeds, watch=watch, rows=rows, interrupted=interrupted)
         if interrupted:
@@ -58,7 +63,7 @@ def reproduce(
 
 
 def _flown(
-    settings: Preset, seeds: tuple[int, ...], seconds: float, starts: int
+    settings: Preset, setting: Setting, seeds: tuple[int, ...], seconds: float, starts: int
 ) -> tuple[list[Flight], list[float], bool]:
     """All flights of one preset, the policies' errors in their own model, and whether Ctrl-C cut them short."""
     flights, errors, interrupted = list[Flight](), list[float](), False
@@ -69,7 +74,7 @@ def _flown(
             if interrupted:
                 break
             errors.append(nominal_error(settings, policy))
-            flown, interrupted = fly_table(settings, policy, seconds=seconds, starts=starts, seed=seed)
+            flown, interrupted = fly_table(settings, policy, setting, seconds=seconds, starts=starts, seed=seed)
             flights += flown
             if interrupted:
                 break
@@ -78,13 +83,13 @@ def _flown(
     return flights, errors, interrupted
 
 
-def _head(seeds: tuple[int, ...], seconds: float, starts: int) -> list[str]:
+def _head(plant: str, seeds: tuple[int, ...], seconds: float, starts: int) -> list[str]:
     many = f"{len(seeds)} training seeds ({', '.join(map(str, seeds))}) x {starts} starts"
     return [
         "# Hover (Table I of the paper, base policy and full adaptation)",
         "",
         f"Made by `retrim reproduce hover`. Steady-state error [m], over the last 2 s of {seconds:g} s: mean ±",
-        f"standard deviation over {many}. Plant `simple`, small quadrotor. Learning",
+        f"standard deviation over {many}. Plant `{plant}`, small quadrotor. Learning",
         "is charged to flight time, by the preset's fixed figures. The paper's rows are from its own plant.",
         "",
         f"Commit {commit()}; {machine()}.",

@@ -5,10 +5,11 @@ from typing import Any
 
 import numpy as np
 
+from ..testbed import Setting
 from .flights import Flight
 
 
-def rows(flights: Sequence[Flight], *, task: str, plant: str, vehicle: str) -> list[dict[str, Any]]:
+def rows(flights: Sequence[Flight], *, task: str, setting: Setting) -> list[dict[str, Any]]:
     """One row of results per disturbance and method: mean and standard deviation over the starts that survived."""
     table = []
     for disturbance, method in dict.fromkeys((f.plan.disturbance, f.plan.method) for f in flights):
@@ -17,8 +18,9 @@ def rows(flights: Sequence[Flight], *, task: str, plant: str, vehicle: str) -> l
         table.append(
             {
                 "task": task,
-                "plant": plant,
-                "vehicle": vehicle,
+                "plant": setting.plant,
+                "vehicle": setting.flown,
+                "sensing": setting.sensing,
                 "disturbance": disturbance,
                 "method": method,
                 "metric": "steady_error_m",

@@ -1,19 +1,40 @@
-"""What the world does: pure, differentiable, unbatched; no networks, no randomness, no input or output."""
+"""What the world does: pure, differentiable, unbatched; no networks, no input or output, keys only at construction."""
 
+from .bem import Bem as Bem
+from .betaflight import Betaflight as Betaflight
+from .conditions import Conditions as Conditions
 from .disturbance import Constant as Constant
 from .disturbance import Disturbance as Disturbance
+from .disturbance import Push as Push
+from .disturbance import RandomWalk as RandomWalk
 from .disturbance import Reversing as Reversing
+from .disturbance import Together as Together
 from .dynamics import AbstractDynamics as AbstractDynamics
 from .dynamics import Hybrid as Hybrid
 from .dynamics import PointMass as PointMass
 from .dynamics import Residual as Residual
 from .dynamics import StraightThrough as StraightThrough
 from .dynamics import f_a as f_a
+from .highrate import AbstractHighRate as AbstractHighRate
+from .highrate import RotorState as RotorState
+from .propeller import Propeller as Propeller
+from .propeller import five_inch as five_inch
+from .propeller import three_inch as three_inch
 from .rotors import Rotors as Rotors
 from .state import STANDARD_GRAVITY as STANDARD_GRAVITY
 from .state import Command as Command
 from .state import State as State
 from .state import StateDot as StateDot
+from .trouble import BatterySag as BatterySag
+from .trouble import Payload as Payload
+from .trouble import WeakRotor as WeakRotor
+from .vehicle import Esc as Esc
 from .vehicle import Vehicle as Vehicle
+from .vehicle import kingfisher as kingfisher
 from .vehicle import large as large
 from .vehicle import small as small
+from .vehicle import with_payload as with_payload
+from .wind import Dryden as Dryden
+from .wind import Fan as Fan
+from .wind import SteadyWind as SteadyWind
+from .wind import Turbulence as Turbulence

@@ -1,15 +1,19 @@
-"""What pushes the vehicle: functions (t, x) -> external acceleration, world frame [m/s^2].
+"""What disturbs a flight: functions (t, x) -> :class:`Conditions`. Pushes stand here; see also wind and trouble.
 
-Disturbances belong to the plant. The nominal model never hears of them.
+Disturbances belong to the plant; the nominal model never hears of them. What is random about one is drawn when it is
+made, so that it is a function of time and repeats.
 """
 
+from collections.abc import Callable
 from typing import Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jax import random
+from jaxtyping import Array, Float, Key
 
+from .conditions import Conditions
 from .state import State
 
 
@@ -17,9 +21,29 @@ from .state import State
 class Disturbance(Protocol):
     """Any function of time [s] and state will do."""
 
-    def __call__(self, t: Float[Array, ""], x: State, /) -> Float[Array, "3"]:
-        """External acceleration at time ``t`` in the state ``x``, world [m/s^2]."""
+    def __call__(self, t: Float[Array, ""], x: State, /) -> Conditions:
+        """What surrounds the vehicle at time ``t`` in the state ``x``."""
         ...
+
+
+class Push(eqx.Module):
+    """Any function (t, x) -> external acceleration, world [m/s^2], as a disturbance."""
+
+    a_ext: Callable[[Float[Array, ""], State], Float[Array, "3"]]
+
+    def __call__(self, t: Float[Array, ""], x: State) -> Conditions:
+        """Pushed by ``a_ext(t, x)``."""
+        return Conditions.of(x.p.dtype, push=self.a_ext(t, x))
+
+
+class Together(eqx.Module):
+    """Several disturbances at once."""
+
+    parts: tuple[Disturbance, ...]
+
+    def __call__(self, t: Float[Array, ""], x: State) -> Conditions:
+        """The sum of the parts; calm without any."""
+        return sum((part(t, x) for part in self.parts), start=Conditions.calm(x.p.dtype))
 
 
 class Constant(eqx.Module):
@@ -27,9 +51,9 @@ class Constant(eqx.Module):
 
     a: Float[Array, "3"]
 
-    def __call__(self, t: Float[Array, ""], x: State) -> Float[Array, "3"]:
-        """``a``."""
-        return self.a
+    def __call__(self, t: Float[Array, ""], x: State) -> Conditions:
+        """Pushed by ``a`` [m/s^2]."""
+        return Conditions.of(x.p.dtype, push=self.a)
 
 
 class Reversing(eqx.Module):
@@ -43,6 +67,35 @@ class Reversing(eqx.Module):
         if not isinstance(self.period, jax.core.Tracer) and not self.period > 0:
             raise ValueError(f"Reversing.period = {float(self.period)} s must be positive")
 
-    def __call__(self, t: Float[Array, ""], x: State) -> Float[Array, "3"]:
+    def __call__(self, t: Float[Array, ""], x: State) -> Conditions:
         """``a`` in the first period, ``-a`` in the second, and so on."""
-        return jnp.where(jnp.floor(t / self.period) % 2.0 == 0.0, self.a, -self.a)
+        first = jnp.floor(t / self.period) % 2.0 == 0.0
+        return Conditions.of(x.p.dtype, push=jnp.where(first, self.a, -self.a))
+
+
+class RandomWalk(eqx.Module):
+    """An acceleration that wanders within ``+-bound`` per axis, linearly between points ``every`` seconds apart.
+
+    The walk is a Brownian path folded back at the bounds; after its last point it is retraced backwards.
+    """
+
+    points: Float[Array, "n 3"]
+    """[m/s^2]"""
+    every: Float[Array, ""]
+
+    @classmethod
+    def of(cls, rate: float, bound: float, *, key: Key[Array, ""], every: float = 0.1, n: int = 1200) -> "RandomWalk":
+        """From zero, with a standard deviation of ``rate`` [m/s^2] after one second (far from the bounds)."""
+        if not (bound > 0 and rate >= 0 and every > 0 and n >= 2):
+            raise ValueError(f"RandomWalk: rate = {rate}, bound = {bound}, every = {every}, n = {n} cannot be")
+        path = jnp.cumsum(rate * every**0.5 * random.normal(key, (n, 3)), axis=0)
+        path = path - path[0]
+        return cls(bound - jnp.abs((path + bound) % (4.0 * bound) - 2.0 * bound), jnp.array(every))
+
+    def __call__(self, t: Float[Array, ""], x: State) -> Conditions:
+        """Pushed by the walk's acceleration at ``t``."""
+        last = self.points.shape[0] - 1
+        where = last - jnp.abs((t / self.every) % (2.0 * last) - last)  # there and back again
+        i = jnp.clip(jnp.floor(where), 0, last - 1).astype(jnp.int32)
+        part = where - i.astype(where.dtype)
+        return Conditions.of(x.p.dtype, push=(1.0 - part) * self.points[i] + part * self.points[i + 1])

@@ -6,29 +6,12 @@ back-left, back-right, front-left; the first two turn so that their drag torque 
 
 import equinox as eqx
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Float
 
-from . import so3
-from .dynamics import AbstractDynamics
-from .state import STANDARD_GRAVITY, Command, State
+from .conditions import Conditions
+from .highrate import SUBSTEP, AbstractHighRate, RotorState, check_tick, rigid_body, signs
+from .state import Command, State
 from .vehicle import Vehicle
-
-SUBSTEP = 1e-3  # [s]
-
-
-class RotorState(eqx.Module):
-    """State of the rotor-level model."""
-
-    x: State
-    omega: Float[Array, "3"]
-    """Body rates [rad/s]."""
-    motors: Float[Array, "4"]
-    """Rotor speeds [rad/s]."""
-    integral: Float[Array, "3"]
-    """Integral of the rate error [rad]."""
-    omega_dot: Float[Array, "3"]
-    """Body angular acceleration over the last millisecond [rad/s^2], for the D term."""
 
 
 class RateLoop(eqx.Module):
@@ -54,7 +37,7 @@ def default_rate_loop() -> RateLoop:
     )
 
 
-class Rotors(AbstractDynamics[RotorState]):
+class Rotors(AbstractHighRate[RotorState]):
     """Rotor-level quadrotor under a CTBR command.
 
     ``thrust_gain`` multiplies the true thrust: the error of the thrust map. ``drag`` [1/s] is the linear rotor drag
@@ -69,8 +52,7 @@ class Rotors(AbstractDynamics[RotorState]):
 
     def __check_init__(self) -> None:
         """Raise ``ValueError`` if the tick is not a whole number of milliseconds."""
-        if abs(self.dt / SUBSTEP - round(self.dt / SUBSTEP)) > 1e-6 or self.dt < SUBSTEP:
-            raise ValueError(f"Rotors.dt = {self.dt} s must be a whole number of milliseconds")
+        check_tick(self.dt, "Rotors")
 
     @classmethod
     def of(cls, vehicle: Vehicle, dt: float, *, thrust_error: float = 0.035) -> "Rotors":
@@ -90,24 +72,15 @@ class Rotors(AbstractDynamics[RotorState]):
         """Replace (p, R, v)."""
         return RotorState(x, s.omega, s.motors, s.integral, s.omega_dot)
 
-    def step(self, s: RotorState, u: Command, a_ext: Float[Array, "3"]) -> RotorState:
-        """One control tick of 1 ms substeps."""
-        after, _ = lax.scan(lambda s, _: (self.substep(s, u, a_ext), None), s, length=round(self.dt / SUBSTEP))
-        return after
-
-    def substep(self, s: RotorState, u: Command, a_ext: Float[Array, "3"]) -> RotorState:
-        """One millisecond: rate loop, motors, forces, rigid body (semi-implicit, attitude on SO(3))."""
-        car, h = self.vehicle, SUBSTEP
+    def substep(self, s: RotorState, u: Command, around: Conditions) -> RotorState:
+        """One millisecond: rate loop, motors, forces, rigid body."""
+        car = self.vehicle
         speeds, integral = self.rate_loop(s, u)
-        motors = speeds + (s.motors - speeds) * jnp.exp(-h / car.motor_tau)
-        thrusts = car.thrust_coefficient * self.thrust_gain * motors**2
-        force, torque = self.wrench(s, motors, thrusts)
-        omega_dot = (torque - jnp.cross(s.omega, car.inertia * s.omega)) / car.inertia
-        omega = s.omega + h * omega_dot
-        gravity = jnp.array([0.0, 0.0, -STANDARD_GRAVITY], dtype=s.x.p.dtype)
-        a = s.x.R @ force / car.mass + gravity + a_ext
-        x = State(s.x.p + h * s.x.v + 0.5 * h**2 * a, s.x.R @ so3.exp(h * omega), s.x.v + h * a)
-        return RotorState(x, omega, motors, integral, omega_dot)
+        motors = speeds + (s.motors - speeds) * jnp.exp(-SUBSTEP / car.motor_tau)
+        thrusts = around.gain * car.thrust_coefficient * self.thrust_gain * motors**2
+        force, torque = self.wrench(s, motors, thrusts, around.wind)
+        mass, inertia = car.mass + around.mass, car.inertia + around.inertia
+        return rigid_body(s, motors, integral, force, torque, mass, inertia, around.push)
 
     def rate_loop(self, s: RotorState, u: Command) -> tuple[Float[Array, "4"], Float[Array, "3"]]:
         """Rotor speeds [rad/s] to command, and the integral of the rate error [rad]."""
@@ -125,20 +98,15 @@ class Rotors(AbstractDynamics[RotorState]):
         """Thrust of each rotor [N] that gives the collective ``thrust`` [N] and the ``torque`` [Nm]."""
         arm, kappa = self.vehicle.arm, self.vehicle.torque_ratio
         levers = jnp.stack([arm[1], arm[0], kappa])
-        return thrust / 4.0 + _signs(thrust.dtype).T @ (torque / levers) / 4.0
+        return thrust / 4.0 + signs(thrust.dtype).T @ (torque / levers) / 4.0
 
     def wrench(
-        self, s: RotorState, motors: Float[Array, "4"], thrusts: Float[Array, "4"]
+        self, s: RotorState, motors: Float[Array, "4"], thrusts: Float[Array, "4"], wind: Float[Array, "3"]
     ) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
         """Force [N] and torque [Nm] of all rotors in the body frame; the inverse of the mixer, plus rotor drag."""
         car = self.vehicle
         levers = jnp.stack([car.arm[1], car.arm[0], car.torque_ratio])
-        torque = levers * (_signs(thrusts.dtype) @ thrusts)
-        drag = car.mass * self.drag * (jnp.mean(motors) / car.hover_speed) * (s.x.R.T @ s.x.v)
+        torque = levers * (signs(thrusts.dtype) @ thrusts)
+        drag = car.mass * self.drag * (jnp.mean(motors) / car.hover_speed) * (s.x.R.T @ (s.x.v - wind))
         up = jnp.array([0.0, 0.0, 1.0], dtype=thrusts.dtype)
         return jnp.sum(thrusts) * up - drag, torque
-
-
-def _signs(dtype: jnp.dtype) -> Float[Array, "3 4"]:
-    """How each rotor's thrust turns the body about x, y and z."""
-    return jnp.array([[-1.0, 1.0, -1.0, 1.0], [-1.0, 1.0, 1.0, -1.0], [-1.0, -1.0, 1.0, 1.0]], dtype=dtype)

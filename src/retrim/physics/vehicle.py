@@ -10,7 +10,36 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .propeller import Propeller, five_inch, three_inch
 from .state import STANDARD_GRAVITY, Command
+
+
+class Esc(eqx.Module):
+    """How speed controllers turn throttle into rotor speed: Omega = base + linear d + root sqrt(d).
+
+    d = throttle (2048 - d_min) + d_min is what the firmware sends.
+    """
+
+    base: Float[Array, ""]
+    """[rad/s], at the battery's nominal voltage"""
+    linear: Float[Array, ""]
+    """[rad/s]"""
+    root: Float[Array, ""]
+    """[rad/s]"""
+    d_min: Float[Array, ""]
+    idle: Float[Array, ""]
+    """Smallest throttle."""
+
+    def speed(self, throttle: Float[Array, "*rotors"]) -> Float[Array, "*rotors"]:
+        """Rotor speed [rad/s]."""
+        d = throttle * (2048.0 - self.d_min) + self.d_min
+        return self.base + self.linear * d + self.root * jnp.sqrt(d)
+
+    def throttle(self, speed: Float[Array, "*rotors"]) -> Float[Array, "*rotors"]:
+        """Inverse of :meth:`speed`."""
+        rise = jnp.maximum(speed - self.base, 0.0)
+        root_d = 2.0 * rise / (self.root + jnp.sqrt(self.root**2 + 4.0 * self.linear * rise))
+        return (root_d**2 - self.d_min) / (2048.0 - self.d_min)
 
 
 class Vehicle(eqx.Module):
@@ -30,17 +59,27 @@ class Vehicle(eqx.Module):
     """Time constant of a motor [s]."""
     motor_min: Float[Array, ""]
     """Idle speed of a rotor [rad/s]."""
+    motor_max: Float[Array, ""]
+    """Largest speed of a rotor [rad/s]."""
+    rotor_inertia: Float[Array, ""]
+    """Of one motor and propeller about its axis [kg m^2]."""
     thrust_coefficient: Float[Array, ""]
     """c_T in T = c_T Omega^2 of one rotor [N s^2]."""
     torque_ratio: Float[Array, ""]
     """kappa in Q = kappa T of one rotor [m]."""
+    drag_area: Float[Array, "3"]
+    """c A of the body along its axes [m^2]."""
+    propeller: Propeller
+    esc: Esc
 
     def __check_init__(self) -> None:
         """Raise ``ValueError``, naming the field, where no such vehicle can exist; traced values are not checked."""
         if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(self)):
             return
         for field in dataclasses.fields(self):
-            value = jnp.asarray(getattr(self, field.name))
+            value = getattr(self, field.name)
+            if isinstance(value, eqx.Module):
+                continue
             if not bool(jnp.all(jnp.isfinite(value) & (value > 0))):
                 raise ValueError(f"Vehicle.{field.name} = {value} must be positive and finite")
         if self.thrust_max <= self.mass * STANDARD_GRAVITY:
@@ -70,7 +109,8 @@ def small() -> Vehicle:
     """The paper's small quadrotor.
 
     Mass, inertia, arm length 0.06 m, thrust and motor time constant: Table IV of the paper (inertia to three digits:
-    the description published with it). Rate limits, c_T, kappa and idle speed: the same description.
+    the description published with it). Rate limits, c_T, kappa, speeds, rotor inertia and the speed controllers'
+    curve at 17 V: the same description. Propeller: :func:`three_inch`. Drag area: the kingfisher's, by arm squared.
     """
     return Vehicle(
         mass=jnp.array(0.19),
@@ -80,25 +120,80 @@ def small() -> Vehicle:
         omega_max=jnp.array([6.0, 6.0, 4.0]),
         motor_tau=jnp.array(0.025),
         motor_min=jnp.array(150.0),
+        motor_max=jnp.array(4400.0),
+        rotor_inertia=jnp.array(2.65376e-7),
         thrust_coefficient=jnp.array(2.05e-7),
         torque_ratio=jnp.array(0.00804),
+        drag_area=1.04 * jnp.array([0.0035, 0.0035, 0.0069]),
+        propeller=three_inch(),
+        esc=Esc(
+            base=jnp.array(-1658.0 + 78.325 * 17.0),
+            linear=jnp.array(0.7595),
+            root=jnp.array(59.673),
+            d_min=jnp.array(110.0),
+            idle=jnp.array(0.025),
+        ),
+    )
+
+
+def kingfisher() -> Vehicle:
+    """The Agilicious platform's research quadrotor: every constant as published with that platform.
+
+    kappa alone is blade-element theory's for these 5.1 in rotors (the description lists 0.022 m).
+    """
+    return Vehicle(
+        mass=jnp.array(0.752),
+        inertia=jnp.array([2.5e-3, 2.1e-3, 4.3e-3]),
+        arm=jnp.array([0.075, 0.10]),
+        thrust_max=jnp.array(34.0),
+        omega_max=jnp.array([10.0, 10.0, 4.0]),
+        motor_tau=jnp.array(0.033),
+        motor_min=jnp.array(150.0),
+        motor_max=jnp.array(2800.0),
+        rotor_inertia=jnp.array(9.3575e-6),
+        thrust_coefficient=jnp.array(1.562522e-6),
+        torque_ratio=jnp.array(0.0117),
+        drag_area=1.04 * jnp.array([0.015, 0.015, 0.030]),
+        propeller=five_inch(),
+        esc=Esc(
+            base=jnp.array(-1933.2 + 61.31 * 15.0),
+            linear=jnp.array(0.04071),
+            root=jnp.array(79.79),
+            d_min=jnp.array(158.0),
+            idle=jnp.array(0.07),
+        ),
     )
 
 
 def large() -> Vehicle:
     """The paper's large quadrotor.
 
-    Mass, inertia, arm length 0.13 m, thrust and motor time constant: Table IV of the paper. Rate limits, c_T and idle
-    speed: those of the Agilicious platform from which it was built; kappa: blade-element theory for its 5.1 in rotors.
+    Mass, inertia, arm length 0.13 m (with the kingfisher's aspect), thrust and motor time constant: Table IV of the
+    paper. All else is the kingfisher's, from which it was built.
     """
-    return Vehicle(
+    return dataclasses.replace(
+        kingfisher(),
         mass=jnp.array(0.60),
         inertia=jnp.array([2.41e-3, 1.80e-3, 3.76e-3]),
         arm=jnp.array([0.078, 0.104]),
         thrust_max=jnp.array(34.0),
-        omega_max=jnp.array([10.0, 10.0, 4.0]),
         motor_tau=jnp.array(0.033),
-        motor_min=jnp.array(150.0),
-        thrust_coefficient=jnp.array(1.5625e-6),
-        torque_ratio=jnp.array(0.0117),
     )
+
+
+def payload_inertia(mass: float, *, side: float = 0.05, below: float = 0.03) -> Float[Array, "3"]:
+    """Inertia [kg m^2] that a cube of ``mass`` [kg] and ``side`` [m] adds, its centre ``below`` the vehicle's [m].
+
+    The shift of the centre of mass is left out.
+    """
+    own = mass * side**2 / 6.0
+    return jnp.array([own + mass * below**2, own + mass * below**2, own])
+
+
+def with_payload(vehicle: Vehicle, mass: float) -> Vehicle:
+    """A vehicle that knows that it carries a load: 0.07 kg make the paper's small quadrotor 0.26 kg.
+
+    Its thrust command is normalised by the mass of both. For a load that the vehicle does not know of, see
+    :class:`retrim.physics.Payload`.
+    """
+    return dataclasses.replace(vehicle, mass=vehicle.mass + mass, inertia=vehicle.inertia + payload_inertia(mass))

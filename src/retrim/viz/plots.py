@@ -32,18 +32,19 @@ class Track:
 
 
 @dataclass(frozen=True)
-class Push:
+class Span:
     """A disturbance while it lasts."""
 
     start: float
     """[s]"""
     end: float
-    a: tuple[float, float, float]
-    """World [m/s^2]."""
+    label: str
+    strong: bool
+    """Drawn darker: to tell a push from its reverse."""
 
 
 def flight_figure(
-    title: str, base: list[Track], adapted: list[Track], pushes: list[Push], goal: tuple[float, float, float]
+    title: str, base: list[Track], adapted: list[Track], spans: list[Span], goal: tuple[float, float, float]
 ) -> Figure:
     """Error over time beside the path from above; base against adapted, one thin line a flight, the mean thick."""
     with plt.rc_context(
@@ -53,7 +54,7 @@ def flight_figure(
             1, 2, figsize=(13, 5.4), width_ratios=(1.9, 1), layout="constrained", facecolor="white"
         )
         figure.suptitle(title, fontsize=14, fontweight="bold", color=INK)
-        _errors(left, base, adapted, pushes)
+        _errors(left, base, adapted, spans)
         _paths(right, base, adapted, goal)
         figure.legend(loc="outside lower center", ncols=4, frameon=False)
     return figure
@@ -69,15 +70,13 @@ def save(figure: Figure, folder: Path, name: str) -> list[Path]:
     return paths
 
 
-def _errors(axes: Axes, base: list[Track], adapted: list[Track], pushes: list[Push]) -> None:
+def _errors(axes: Axes, base: list[Track], adapted: list[Track], spans: list[Span]) -> None:
     top = 1.15 * max((float(np.nanmax(track.error)) for track in (*base, *adapted)), default=1.0)
-    for push in pushes:
-        axes.axvspan(push.start, push.end, color=PUSH, alpha=0.13 if push.a[0] >= 0 else 0.28, linewidth=0)
-        same = len(set(push.a)) == 1
-        strength = f"{push.a[0]:+g} m/s² per axis" if same else "({:+g}, {:+g}, {:+g}) m/s²".format(*push.a)
+    for span in spans:
+        axes.axvspan(span.start, span.end, color=PUSH, alpha=0.28 if span.strong else 0.13, linewidth=0)
         axes.text(
-            (push.start + push.end) / 2, 0.985 * top, strength if len(pushes) > 1 else f"pushed by {strength}",
-            ha="center", va="top", color="#8a5a00", fontsize=9 if len(pushes) > 1 else 11, zorder=5,
+            (span.start + span.end) / 2, 0.985 * top, span.label,
+            ha="center", va="top", color="#8a5a00", fontsize=9 if len(spans) > 1 else 11, zorder=5,
             bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 2},
         )  # fmt: skip
     swaps = sorted({round(t, 2) for track in adapted for t in track.swaps})

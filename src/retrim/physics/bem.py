@@ -1,0 +1,137 @@
+"""The realistic plant: blade-element rotors, body drag, firmware's rate controller and motors, at 1 kHz."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .betaflight import Betaflight
+from .conditions import Conditions
+from .highrate import SUBSTEP, AbstractHighRate, RotorState, check_tick, rigid_body, signs
+from .propeller import AIR_DENSITY, BladeForces, Inflow, hover_coefficient, rotor
+from .state import STANDARD_GRAVITY, Command, State
+from .vehicle import Vehicle
+
+IN_PLANE_GAIN = 3.0  # identified in flight: blade elements alone underestimate the drag of the whole vehicle
+FRAME_FACTOR = 0.9575  # of the collective thrust passes the frame
+
+
+class BemState(eqx.Module):
+    """State of the blade-element model."""
+
+    body: RotorState
+    inflow: Inflow
+    """Of the four rotors: every leaf has 4 numbers."""
+
+
+class Loads(NamedTuple):
+    """What acts on the body, in its frame."""
+
+    force: Float[Array, "3"]
+    """[N]"""
+    torque: Float[Array, "3"]
+    """[Nm]"""
+
+
+class Bem(AbstractHighRate[BemState]):
+    """Quadrotor with blade-element rotors under a CTBR command."""
+
+    vehicle: Vehicle
+    loop: Betaflight
+    dt: float = eqx.field(static=True)
+
+    def __check_init__(self) -> None:
+        """Raise ``ValueError`` if the tick is not a whole number of milliseconds."""
+        check_tick(self.dt, "Bem")
+
+    @classmethod
+    def of(cls, vehicle: Vehicle, dt: float, *, thrust_error: float = 0.035) -> "Bem":
+        """With a thrust map that is wrong by ``thrust_error``: u_hover in still air gives (1 + thrust_error) m g.
+
+        T / Omega^2 of a propeller in still air is constant, so one number calibrates the whole range.
+        """
+        true = FRAME_FACTOR * hover_coefficient(vehicle.propeller, vehicle.hover_speed)
+        return cls(vehicle, Betaflight.of(true / (1.0 + thrust_error)), dt)
+
+    def init(self, x: State) -> BemState:
+        """Rotors at the speed of u_hover, their inflow settled in the air that ``x`` meets, no rotation."""
+        car, zero = self.vehicle, jnp.zeros_like(x.p)
+        speed = jnp.sqrt(car.mass * STANDARD_GRAVITY / (4.0 * self.loop.thrust_map))
+        body = RotorState(x, zero, jnp.ones(4, dtype=x.p.dtype) * speed, zero, zero)
+        above = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (4,)), Inflow.above(x.p.dtype))
+        _, inflow = self.rotors(body, body.motors, above, zero, steps=16)
+        return BemState(body, inflow)
+
+    def state(self, s: BemState) -> State:
+        """(p, R, v)."""
+        return s.body.x
+
+    def with_state(self, s: BemState, x: State) -> BemState:
+        """Replace (p, R, v)."""
+        b = s.body
+        return BemState(RotorState(x, b.omega, b.motors, b.integral, b.omega_dot), s.inflow)
+
+    def substep(self, s: BemState, u: Command, around: Conditions) -> BemState:
+        """One millisecond; loads are held over it."""
+        car, b = self.vehicle, s.body
+        commanded, integral = self.loop(car, b, u)
+        motors = commanded + (b.motors - commanded) * jnp.exp(-SUBSTEP / car.motor_tau)
+        blades, inflow = self.rotors(b, motors, s.inflow, around.wind)
+        loads = self.loads(b, motors, blades, around)
+        mass, inertia = car.mass + around.mass, car.inertia + around.inertia
+        moved = rigid_body(b, motors, integral, loads.force, loads.torque, mass, inertia, around.push)
+        return BemState(moved, inflow)
+
+    def rotors(
+        self,
+        b: RotorState,
+        motors: Float[Array, "4"],
+        inflow: Inflow,
+        wind: Float[Array, "3"],
+        *,
+        steps: int = 2,
+    ) -> tuple[BladeForces, Inflow]:
+        """Forces of the four rotors, each in the air that meets its own hub."""
+        air = self.hub_velocities(b, wind)
+        v_hor = jnp.sqrt(air[:, 0] ** 2 + air[:, 1] ** 2 + 1e-12)
+
+        def one(
+            omega: Float[Array, ""], v_hor: Float[Array, ""], v_ver: Float[Array, ""], inflow: Inflow
+        ) -> tuple[BladeForces, Inflow]:
+            return rotor(self.vehicle.propeller, omega, v_hor, v_ver, inflow, steps=steps)
+
+        return jax.vmap(one)(motors, v_hor, -air[:, 2], inflow)
+
+    def hub_velocities(self, b: RotorState, wind: Float[Array, "3"]) -> Float[Array, "4 3"]:
+        """Velocity of each hub through the air, body frame [m/s]."""
+        return b.x.R.T @ (b.x.v - wind) + jnp.cross(b.omega, self.places())
+
+    def places(self) -> Float[Array, "4 3"]:
+        """Of the hubs, body frame [m]."""
+        arm = self.vehicle.arm
+        turn = signs(arm.dtype)  # a rotor at (x, y) turns the body about x by its y, about y by -x
+        return jnp.stack([-arm[0] * turn[1], arm[1] * turn[0], jnp.zeros(4, dtype=arm.dtype)], axis=1)
+
+    def loads(self, b: RotorState, motors: Float[Array, "4"], blades: BladeForces, around: Conditions) -> Loads:
+        """Rotors, body drag, yaw reaction of the motors and gyroscopic torque."""
+        car = self.vehicle
+        air = self.hub_velocities(b, around.wind)
+        along = air[:, :2] / jnp.sqrt(air[:, :1] ** 2 + air[:, 1:2] ** 2 + 1e-12)
+        in_plane = -IN_PLANE_GAIN * (around.gain * blades.in_plane)[:, None] * along
+        forces = jnp.concatenate([in_plane, (around.gain * blades.thrust)[:, None]], axis=1)
+        yaw = signs(motors.dtype)[2]  # against the spin
+        up = jnp.array([0.0, 0.0, 1.0], dtype=motors.dtype)
+        spin_up = car.rotor_inertia * jnp.sum(yaw * (motors - b.motors)) / SUBSTEP
+        torque = jnp.sum(jnp.cross(self.places(), forces), axis=0)
+        torque = torque + (jnp.sum(yaw * around.gain * blades.torque) + spin_up) * up
+        spin = -car.rotor_inertia * jnp.sum(yaw * motors) * up  # angular momentum of the rotors
+        torque = torque - jnp.cross(b.omega, spin)
+        obstruction = jnp.array([1.0, 1.0, FRAME_FACTOR], dtype=motors.dtype)
+        return Loads(obstruction * jnp.sum(forces, axis=0) + self.body_drag(b, around.wind), torque)
+
+    def body_drag(self, b: RotorState, wind: Float[Array, "3"]) -> Float[Array, "3"]:
+        """F_k = -1/2 rho (c A)_k u_k |u_k|, body frame [N]."""
+        through = b.x.R.T @ (b.x.v - wind)
+        return -0.5 * AIR_DENSITY * self.vehicle.drag_area * through * jnp.abs(through)

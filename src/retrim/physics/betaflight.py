@@ -1,0 +1,46 @@
+"""A rate controller as flight firmware runs it: PID in throttle units, mixer, speed controllers, at 1 kHz."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .highrate import SUBSTEP, RotorState, signs
+from .state import Command
+from .vehicle import Vehicle
+
+# Throttle per unit of gain, and per rad/s, rad and rad/s^2: the firmware's scaling of its P, I and D settings.
+P_SCALE, I_SCALE, D_SCALE = 1.818e-3, 16.67e-6, 31.25e-6
+
+
+class Betaflight(eqx.Module):
+    """Gains in the units of the firmware's settings, and the thrust map that turns newtons into rotor speed."""
+
+    kp: Float[Array, "3"]
+    ki: Float[Array, "3"]
+    kd: Float[Array, "3"]
+    integral_max: Float[Array, ""]
+    """Clamp of the integral [rad]."""
+    thrust_map: Float[Array, ""]
+    """c in Omega = sqrt(F / 4 c): what the controller believes of its propellers [N s^2]."""
+
+    @classmethod
+    def of(cls, thrust_map: Float[Array, ""]) -> "Betaflight":
+        """P 40, 40, 30, I 80, 80, 60, D 20, 20, 0: the settings of the Agilicious platform."""
+        return cls(
+            kp=jnp.array([40.0, 40.0, 30.0]),
+            ki=jnp.array([80.0, 80.0, 60.0]),
+            kd=jnp.array([20.0, 20.0, 0.0]),
+            integral_max=jnp.array(0.1),
+            thrust_map=thrust_map,
+        )
+
+    def __call__(self, car: Vehicle, s: RotorState, u: Command) -> tuple[Float[Array, "4"], Float[Array, "3"]]:
+        """Rotor speeds [rad/s] to command, and the integral of the rate error [rad]."""
+        low, high = car.command_min, car.command_max
+        error = jnp.clip(u.omega, low.omega, high.omega) - s.omega
+        integral = jnp.clip(s.integral + SUBSTEP * error, -self.integral_max, self.integral_max)
+        turn = P_SCALE * self.kp * error + I_SCALE * self.ki * integral - D_SCALE * self.kd * s.omega_dot
+        thrust = car.mass * jnp.clip(u.c, low.c, high.c)
+        throttle = car.esc.throttle(jnp.sqrt(thrust / (4.0 * self.thrust_map)))
+        mixed = jnp.clip(throttle + signs(turn.dtype).T @ turn, car.esc.idle, 1.0)
+        return jnp.clip(car.esc.speed(mixed), car.motor_min, car.motor_max), integral

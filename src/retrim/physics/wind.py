@@ -1,0 +1,159 @@
+"""Air that moves: steady wind, gusts, a fan. Wind acts through the relative air velocity at rotors and body."""
+
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import random
+from jaxtyping import Array, Float, Key
+
+from .conditions import Conditions
+from .state import State
+
+FEET = 0.3048  # [m]
+
+
+class SteadyWind(eqx.Module):
+    """The same wind at all times and places."""
+
+    wind: Float[Array, "3"]
+    """World [m/s]."""
+
+    def __call__(self, t: Float[Array, ""], x: State) -> Conditions:
+        """Blown at by ``wind``."""
+        return Conditions.of(x.p.dtype, wind=self.wind)
+
+
+class Turbulence(eqx.Module):
+    """Gusts with Dryden's spectra as a sum of sinusoids of equal energy (spectral representation).
+
+    The first axis is along the mean wind and has the longitudinal spectrum, the others have the transverse one.
+    """
+
+    rate: Float[Array, "n 3"]
+    """[rad/s]"""
+    phase: Float[Array, "n 3"]
+    sigma: Float[Array, "3"]
+    """Standard deviation per axis [m/s]."""
+
+    @classmethod
+    def of(
+        cls,
+        speed: Float[Array, ""],
+        length: Float[Array, "3"],
+        sigma: Float[Array, "3"],
+        *,
+        key: Key[Array, ""],
+        n: int = 64,
+    ) -> "Turbulence":
+        """Frozen eddies of scale ``length`` [m] carried past at ``speed`` [m/s].
+
+        Sinusoid k has a frequency from the k-th n-quantile of the spectrum, so that each carries the same energy:
+        with s = L omega / V, the energy below s is 2 atan(s) / pi along the wind, and (2 atan(s) - s / (1 + s^2)) / pi
+        across it (MIL-F-8785C).
+        """
+        k_quantile, k_phase = random.split(key)
+        share = (jnp.arange(n)[:, None] + random.uniform(k_quantile, (n, 3))) / n
+        grid = jnp.tan(jnp.linspace(0.0, 1.0, 2001)[:-1] * jnp.pi / 2)
+        across = (2.0 * jnp.arctan(grid) - grid / (1.0 + grid**2)) / jnp.pi
+        s = jnp.stack(
+            [jnp.tan(share[:, 0] * jnp.pi / 2), *(jnp.interp(share[:, i], across, grid) for i in (1, 2))], axis=1
+        )
+        fastest = 200.0  # [rad/s]: a millisecond step resolves no more
+        rate = jnp.minimum(s * speed / length, fastest)
+        return cls(rate, 2.0 * jnp.pi * random.uniform(k_phase, (n, 3)), sigma)
+
+    def __call__(self, t: Float[Array, ""]) -> Float[Array, "3"]:
+        """Gust at ``t``: along, across and up [m/s]."""
+        n = self.rate.shape[0]
+        amplitude = self.sigma * math.sqrt(2.0 / n)
+        return amplitude * jnp.sum(jnp.cos(self.rate * t + self.phase), axis=0)
+
+
+def axes_along(direction: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    """Rows: along ``direction`` (not vertical), across it in the horizontal plane, and up."""
+    along = direction / jnp.linalg.norm(direction)
+    across = jnp.cross(jnp.array([0.0, 0.0, 1.0], dtype=along.dtype), along)
+    across = across / jnp.linalg.norm(across)
+    return jnp.stack([along, across, jnp.cross(along, across)])
+
+
+class Dryden(eqx.Module):
+    """A mean wind with Dryden gusts, low-altitude model (MIL-F-8785C)."""
+
+    mean: Float[Array, "3"]
+    """World [m/s]."""
+    turbulence: Turbulence
+
+    @classmethod
+    def of(cls, mean: Float[Array, "3"], *, key: Key[Array, ""], altitude: float = 10.0 * FEET) -> "Dryden":
+        """Gusts as strong as they are in a wind of that speed; the mean is horizontal, ``altitude`` >= 3.048 m.
+
+        sigma_w = 0.1 of the wind at 20 ft, here ``mean``; lengths and the other sigmas by the altitude in feet.
+        """
+        speed = float(jnp.linalg.norm(mean))
+        if not speed > 0 or float(mean[2]) != 0.0 or altitude < 10.0 * FEET - 1e-9:
+            raise ValueError(
+                f"Dryden: mean = {mean} must be horizontal and not zero, altitude = {altitude} m at least {10 * FEET}"
+            )
+        h = altitude / FEET
+        shape = 0.177 + 0.000823 * h
+        up, level = 0.1 * speed, 0.1 * speed / shape**0.4
+        scale = FEET * h / shape**1.2
+        length, sigma = jnp.array([scale, scale, FEET * h]), jnp.array([level, level, up])
+        return cls(mean, Turbulence.of(jnp.array(speed), length, sigma, key=key))
+
+    def __call__(self, t: Float[Array, ""], x: State) -> Conditions:
+        """Blown at by mean and gust."""
+        return Conditions.of(x.p.dtype, wind=self.mean + self.turbulence(t) @ axes_along(self.mean))
+
+
+class Fan(eqx.Module):
+    """A round jet in space with a turbulent part: the force depends on position, attitude and velocity.
+
+    Far from the outlet a jet widens in proportion to the distance, and its momentum flux stays: speed times width is
+    constant. The profile across is a Gaussian.
+    """
+
+    outlet: Float[Array, "3"]
+    """World [m]."""
+    direction: Float[Array, "3"]
+    """Where it blows; not vertical."""
+    speed: Float[Array, ""]
+    """At the outlet, on the axis [m/s]."""
+    width: Float[Array, ""]
+    """Standard deviation of the profile at the outlet [m]."""
+    turbulence: Turbulence
+    """Relative to the jet's speed where the vehicle is [-]."""
+
+    SPREAD = 0.1  # growth of the width per metre, free round jets
+
+    @classmethod
+    def of(
+        cls,
+        outlet: Float[Array, "3"],
+        direction: Float[Array, "3"],
+        *,
+        speed: float,
+        width: float,
+        key: Key[Array, ""],
+        intensity: float = 0.15,
+    ) -> "Fan":
+        """With gusts of ``intensity`` times the speed, eddies as large as the outlet is wide."""
+        if not (speed > 0 and width > 0 and 0 <= intensity < 1) or float(jnp.linalg.norm(direction[:2])) == 0.0:
+            raise ValueError(
+                f"Fan: speed = {speed}, width = {width}, intensity = {intensity}, direction = {direction} cannot be"
+            )
+        eddies = Turbulence.of(jnp.array(speed), jnp.full(3, 2.0 * width), jnp.full(3, intensity), key=key)
+        return cls(outlet, direction, jnp.array(speed), jnp.array(width), eddies)
+
+    def __call__(self, t: Float[Array, ""], x: State) -> Conditions:
+        """Blown at by the jet where the vehicle is."""
+        axes = axes_along(self.direction)
+        along, *off = axes @ (x.p - self.outlet)
+        width = self.width + self.SPREAD * jnp.maximum(along, 0.0)
+        inside = jax.nn.sigmoid(along / (0.2 * self.width))  # no jet behind the fan
+        local = self.speed * self.width / width * jnp.exp(-0.5 * (off[0] ** 2 + off[1] ** 2) / width**2) * inside
+        still = jnp.array([1.0, 0.0, 0.0], dtype=x.p.dtype)
+        return Conditions.of(x.p.dtype, wind=local * (still + self.turbulence(t)) @ axes)
