@@ -5,17 +5,21 @@ BIN := $(VENV)/bin
 UV := $(shell command -v uv 2>/dev/null || echo .uv/bin/uv)
 STAMP := $(VENV)/.installed
 
-.PHONY: setup demo test check bench tables pins clean
+DEV := $(VENV)/.installed-dev
+
+.PHONY: setup dev demo test check bench tables pins clean
 
 setup: $(STAMP)
+
+dev: $(DEV)
 
 demo: setup
 	$(BIN)/retrim demo
 
-test: setup
+test: dev
 	$(BIN)/pytest
 
-check: setup
+check: dev
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
@@ -24,8 +28,10 @@ check: setup
 bench: setup
 	$(BIN)/retrim bench
 
-tables: setup
+tables: dev
 	$(BIN)/retrim reproduce hover --out docs/results
+	$(BIN)/retrim reproduce plants --out docs/results
+	$(BIN)/retrim reproduce model --out docs/results
 
 # uv, in a private folder where there is none.
 .uv/bin/uv:
@@ -35,7 +41,12 @@ tables: setup
 $(STAMP): pyproject.toml constraints.txt | $(UV)
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "retrim needs Python 3.11 or newer; set PYTHON=...")'
 	$(UV) venv --quiet --clear --python $(PYTHON) $(VENV)
-	$(UV) pip install --quiet --python $(VENV) --constraints constraints.txt --group dev --editable .
+	$(UV) pip install --quiet --python $(VENV) --constraints constraints.txt --editable .
+	@touch $@
+
+# The developers' tools, and the independent plants that the tests fly.
+$(DEV): $(STAMP)
+	$(UV) pip install --quiet --python $(VENV) --constraints constraints.txt --group dev --editable '.[plants]'
 	@touch $@
 
 # After a change of dependencies in pyproject.toml: names, versions and markers only.

@@ -92,6 +92,8 @@ class Setting:
     plant: PlantName = "bem"
     vehicle: VehicleName | None = None
     sensing: SensingName = "ideal"
+    thrust_error: float = 0.035
+    """By how much more than commanded the rotors give, as a share; bem and simple only."""
 
     def __post_init__(self) -> None:
         """Raise :class:`PresetError` for an unknown name, and for a choice that the plant does not have."""
@@ -106,6 +108,9 @@ class Setting:
         if self.plant not in ("bem", "simple") and self.sensing != "ideal":
             raise PresetError(f"plant {self.plant} shows its true state; sensing {self.sensing!r} needs bem or simple")
 
+        if not -0.5 <= self.thrust_error <= 0.5:
+            raise PresetError(f"thrust error {self.thrust_error} must be between -0.5 and 0.5")
+
     @property
     def flown(self) -> str:
         """Name of the vehicle that flies."""
@@ -116,7 +121,11 @@ class Setting:
         around = disturbance(disturbances, seed)
         car = VEHICLES[self.vehicle or "small"]()
         if self.plant == "bem":
-            return SimPlant(Bem.of(car, DT), around, sensing=SENSING[self.sensing](), seed=seed)
+            return SimPlant(
+                Bem.of(car, DT, thrust_error=self.thrust_error), around, sensing=SENSING[self.sensing](), seed=seed
+            )
         if self.plant == "simple":
-            return SimPlant(Rotors.of(car, DT), around, sensing=SENSING[self.sensing](), seed=seed)
+            return SimPlant(
+                Rotors.of(car, DT, thrust_error=self.thrust_error), around, sensing=SENSING[self.sensing](), seed=seed
+            )
         raise NotImplementedError(self.plant)

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from jax import lax, random
 from jaxtyping import Array, Key
 
@@ -21,13 +22,16 @@ from ..adapt.adapter import Adapter, AdaptState
 from ..adapt.buffer import RollingBuffer
 from ..adapt.gate import Verdict
 from ..adapt.plant import ControllerPilot, fly
+from ..adapt.plants.closed_loop import closed_loop
 from ..control.controller import PolicyController
 from ..learn.bptt import PolicyState
 from ..learn.pretrain import train_chunk
 from ..learn.residual import Window
-from ..physics.state import Command
+from ..physics.bem import Bem
+from ..physics.state import Command, State
+from ..physics.vehicle import small
 from ..presets import Preset
-from ..testbed import Setting
+from ..testbed import Setting, disturbance
 from .training import nominal_error
 
 
@@ -144,6 +148,40 @@ def _tick() -> dict[str, Any]:
     return row
 
 
+def _eight() -> dict[str, Any]:
+    """Eight flights of 30 s on bem, plant and policy as one program; four on each of two threads."""
+    preset = presets.load("fast")
+    controller = PolicyController(build.task(preset).observation, build.policy(preset, random.key(0)))
+    model, around, starts = Bem.of(small(), presets.DT), disturbance("none"), build.flight_starts(preset, 8)
+    halves = [jax.tree.map(lambda *leaves: jnp.stack(leaves), *starts[i : i + 4]) for i in (0, 4)]
+
+    @jax.jit
+    def four(controller: PolicyController, x0s: State) -> State:
+        return lax.map(lambda x0: closed_loop(model, around, controller, x0, ticks=1500)[0], x0s)  # type: ignore[no-any-return]
+
+    program, compile_s = _compiled(four, controller, halves[0])
+    with ThreadPoolExecutor(2) as pool:
+        fly_all = lambda: list(pool.map(lambda x0s: jax.block_until_ready(program(controller, x0s)), halves))  # noqa: E731
+        return _timed(compile_s, fly_all, 3)
+
+
+def _bem_tick() -> dict[str, Any]:
+    """One exchange with the blade-element plant."""
+    plant, u = Setting().make("none"), Command.hover()
+    began = time.perf_counter()
+    plant.reset(None)
+    plant.exchange(u)
+    compile_s = time.perf_counter() - began
+
+    def ticks() -> Any:
+        for _ in range(500):
+            sample = plant.exchange(u)
+        return sample.x.p
+
+    row = _timed(compile_s, ticks, 5)
+    return row | {"run_s": row["run_s"] / 500, "remarks": f"500 ticks: {row['remarks']}"}
+
+
 def _fleet(how: str) -> dict[str, Any]:
     """Eight bursts of eight vehicles."""
     adapter, state, window = _learner()
@@ -191,6 +229,8 @@ WORKS: dict[str, Work] = {
     "residual": Work("residual, 3 nets x 100 iterations x 100 samples", "0.1 s", _residual, "2 s", "0.53 s (1.1 s)"),
     "programs-cold": Work("all programs of a flight, empty cache", "compile 60 s", _programs, cached=True),
     "programs-warm": Work("all programs of a flight, from the cache", "compile 5 s", _programs, cached=True),
+    "bem-tick": Work("one tick of the plant bem", "0.002 s", _bem_tick),
+    "bem-eight": Work("8 flights of 30 s on bem, one program", "10 s (goal 3 s)", _eight),
     "flight": Work("30 s of flight, not adapting", "-", _tick),
     "fleet-map": Work("8 policy updates, lax.map", "-", lambda: _fleet("map")),
     "fleet-vmap": Work("8 policy updates, vmap", "-", lambda: _fleet("vmap")),

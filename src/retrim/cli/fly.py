@@ -23,6 +23,7 @@ def fly(
     adapt: Literal["none", "full"] = "full",
     vehicle: VehicleName | None = None,
     sensing: SensingName = "ideal",
+    thrust_error: float = 0.035,
     config: Path | None = None,
     charge: Literal["fixed", "measured"] = "fixed",
     seconds: float = 30.0,
@@ -43,6 +44,7 @@ def fly(
             crazyflow fly their own.
         sensing: What the policy sees of the state: ideal, mocap (0.3 mm, 3 mm/s, 1 mrad) or rough (1 mm, 10 mm/s,
             3 mrad, 10 ms late, 5 % of the samples lost).
+        thrust_error: By how much more than commanded the rotors give, as a share (bem and simple).
         config: TOML file that overlays the policy's own preset, for example with a table [adapt].
         charge: fixed: learning costs the preset's flight time, so that a run repeats bit for bit; measured: what the
             clock says.
@@ -57,7 +59,7 @@ def fly(
         preset = _same_policy(preset, presets.overlaid(preset, config), config)
     if seconds < 3.0 or starts < 1:
         raise presets.PresetError(f"--seconds {seconds:g} --starts {starts}: at least 3 s and 1 start are needed")
-    setting = setting_for(preset, plant, vehicle, sensing)
+    setting = setting_for(preset, plant, vehicle, sensing, thrust_error)
     testbed.disturbance(disturbance)  # a wrong name is refused before anything else happens
     folder = run_folder(out, "fly")
     campaign = Campaign(
@@ -87,11 +89,15 @@ def fly(
 
 
 def setting_for(
-    preset: Preset, plant: PlantName, vehicle: VehicleName | None = None, sensing: SensingName = "ideal"
+    preset: Preset,
+    plant: PlantName,
+    vehicle: VehicleName | None = None,
+    sensing: SensingName = "ideal",
+    thrust_error: float = 0.035,
 ) -> Setting:
     """Where a policy flies: on the vehicle of its training, unless another is asked for or the plant has its own."""
     own = plant in testbed.OWN_VEHICLE
-    return Setting(plant, vehicle if own else vehicle or preset.vehicle, sensing)
+    return Setting(plant, vehicle if own else vehicle or preset.vehicle, sensing, thrust_error)
 
 
 def _same_policy(trained: Preset, overlaid: Preset, config: Path) -> Preset:

@@ -29,9 +29,15 @@ def main() -> None:
     """
     enable_compile_cache()
     try:
-        code: int = tyro.extras.subcommand_cli_from_dict(
-            COMMANDS, prog="retrim", description="Re-train neural flight policies in seconds, in flight."
-        )
+        code: int
+        if sys.argv[1:2] == ["reproduce"]:
+            code = tyro.extras.subcommand_cli_from_dict(
+                reproduce.TABLES, prog="retrim reproduce", description="Make a table again.", args=sys.argv[2:]
+            )
+        else:
+            code = tyro.extras.subcommand_cli_from_dict(
+                COMMANDS, prog="retrim", description="Re-train neural flight policies in seconds, in flight."
+            )
     except (PolicyError, PresetError, PlantError, OSError) as error:
         console.print(f"[bold red]retrim:[/] {escape(str(error))}", soft_wrap=True)
         code = 1

@@ -199,6 +199,7 @@ def rotor(
     return blade_forces(prop, omega, v_hor, v_ver, vortex_ring(found, v_ver)), found
 
 
+@eqx.filter_jit
 def hover_coefficient(prop: Propeller, omega: Float[Array, ""]) -> Float[Array, ""]:
     """c_T = T / omega^2 of a rotor in still air [N s^2]; the same at every speed."""
     zero = jnp.zeros_like(omega)

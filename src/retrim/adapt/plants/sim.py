@@ -69,6 +69,11 @@ def advance(
     return SimState(inner, queue, seen, s.t + model.dt)
 
 
+def seen_by(s: SimState) -> State:
+    """What the sensors tell now."""
+    return jax.tree.map(lambda leaf: leaf[0], s.seen)  # type: ignore[no-any-return]
+
+
 _launch = eqx.filter_jit(launch)
 _advance = eqx.filter_jit(advance)
 
@@ -115,7 +120,7 @@ class SimPlant:
         self._state = _advance(self._model, self._disturbance, self._delay, self._sensing, self._state, u, key)
         self._ticks += 1
         truth = self._model.state(self._state.model)
-        seen = truth if self._sensing is None else jax.tree.map(lambda leaf: leaf[0], self._state.seen)
+        seen = truth if self._sensing is None else seen_by(self._state)
         return Sample(self._ticks * self.dt, seen, u, truth=truth)
 
     def stop(self) -> None:

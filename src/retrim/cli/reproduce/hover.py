@@ -1,23 +1,20 @@
-"""``retrim reproduce``: tables of the paper, written where the documentation keeps them."""
+"""``retrim reproduce hover``: Table I of the paper."""
 
 from pathlib import Path
 from typing import Any, Literal
 
-import tyro
-
-from .. import presets
-from ..presets import Preset
-from ..testbed import PlantName, Setting
-from .flights import Flight
-from .fly import setting_for
-from .hover_table import fly_table, hover_table
-from .pictures import picture
-from .session import Stopwatch, commit, console, machine, run_folder, write_results
-from .training import nominal_error, train
+from ... import presets
+from ...presets import Preset
+from ...testbed import PlantName, Setting
+from ..flights import Flight
+from ..fly import setting_for
+from ..hover_table import fly_table, hover_table
+from ..pictures import picture
+from ..session import Stopwatch, commit, console, machine, run_folder, write_results
+from ..training import nominal_error, train
 
 
-def reproduce(
-    table: tyro.conf.Positional[Literal["hover"]],
+def hover(
     preset: tuple[Literal["fast", "released", "paper"], ...] = ("fast", "released", "paper"),
     seeds: tuple[int, ...] = (0, 1, 2),
     seconds: float = 30.0,
@@ -28,7 +25,6 @@ def reproduce(
     """Table I: hover under three disturbances, for each preset, over several training seeds.
 
     Args:
-        table: Which table.
         preset: Presets to train and fly.
         seeds: Training seeds; each also seeds the starts and the learners of its flights.
         seconds: Length of a flight.
@@ -55,7 +51,7 @@ def reproduce(
         # after each preset, so that an interruption loses nothing
         text = [*_head(plant, seeds, seconds, starts), *sections, *_foot(watch, interrupted)]
         (folder / "hover.md").write_text("\n".join(text))
-        write_results(folder, name=table, seeds=seeds, watch=watch, rows=rows, interrupted=interrupted)
+        write_results(folder, name="hover", seeds=seeds, watch=watch, rows=rows, interrupted=interrupted)
         if interrupted:
             break
     console.print(f"[bold]{folder / 'hover.md'}[/]", soft_wrap=True)

@@ -1,0 +1,87 @@
+"""What plants of other simulators have in common: the tick, the command's delay, the surroundings, the samples."""
+
+import abc
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ...physics.conditions import Conditions
+from ...physics.disturbance import Disturbance
+from ...physics.state import STANDARD_GRAVITY, Command, State
+from ..plant import PlantError, Sample, refuse_unsound
+
+HOVER = np.array([STANDARD_GRAVITY, 0.0, 0.0, 0.0])
+
+
+class Pose(NamedTuple):
+    """A :class:`State` in NumPy, double precision."""
+
+    p: np.ndarray
+    """World [m]."""
+    R: np.ndarray
+    """Body to world."""
+    v: np.ndarray
+    """World [m/s]."""
+
+
+class ForeignPlant(abc.ABC):
+    """A simulator that steps on its own, one command late: the command of a tick acts in the next one.
+
+    A simulator gives :meth:`_launch` and :meth:`_advance`. The disturbance is heard at ``instants`` evenly spaced
+    times of each tick, for the state at its beginning.
+    """
+
+    def __init__(self, disturbance: Disturbance, dt: float, *, instants: int = 1) -> None:
+        self.dt = dt
+        self._disturbance = disturbance
+        self._instants = dt * np.arange(instants) / instants
+        self._x: State | None = None
+        self._held = HOVER
+        self._ticks = 0
+
+    @abc.abstractmethod
+    def _launch(self, x: Pose) -> None:
+        """Hovering at ``x``, as if it had done so for long; without rotation."""
+
+    @abc.abstractmethod
+    def _advance(self, u: np.ndarray, around: Conditions) -> Pose:
+        """One tick under ``u`` = [c [m/s^2], body rates [rad/s]]; leaves of ``around`` are NumPy, instants in front.
+
+        Raises ``PlantError``, before anything moves, for conditions that the simulator does not know.
+        """
+
+    def reset(self, x0: State | None) -> Sample:
+        """Hover at ``x0``; without one, 1 m above the ground."""
+        start = State.at(jnp.array([0.0, 0.0, 1.0])) if x0 is None else x0
+        self._launch(Pose(*(np.asarray(a, dtype=np.float64) for a in (start.p, start.R, start.v))))
+        self._x, self._held, self._ticks = start, HOVER, 0
+        return Sample(0.0, start, Command.hover(), truth=start)
+
+    def exchange(self, u: Command) -> Sample:
+        """One tick."""
+        name = type(self).__name__
+        refuse_unsound(u, name)
+        if self._x is None:
+            raise PlantError(f"{name}: not flying; call reset first")
+        times = self._ticks * self.dt + self._instants
+        around = jax.tree.map(np.asarray, _surroundings(self._disturbance, times, self._x))
+        after = self._advance(self._held, around)
+        dtype = self._x.p.dtype
+        self._x = State(*(jnp.asarray(a, dtype=dtype) for a in after))
+        self._held = np.asarray(u.vector(), dtype=np.float64)
+        self._ticks += 1
+        return Sample(self._ticks * self.dt, self._x, u, truth=self._x)
+
+    def stop(self) -> None:
+        """Forget the flight."""
+        self._x = None
+
+
+@eqx.filter_jit
+def _surroundings(disturbance: Disturbance, times: Float[Array, "n"], x: State) -> Conditions:
+    """Conditions at each of ``times`` [s], stacked."""
+    return jax.vmap(lambda t: disturbance(t, x))(jnp.asarray(times, dtype=x.p.dtype))

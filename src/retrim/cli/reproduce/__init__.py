@@ -1,0 +1,14 @@
+"""``retrim reproduce``: tables and figures, written where the documentation keeps them; one file each."""
+
+from collections.abc import Callable
+
+from .hover import hover
+from .model import model
+from .plants import plants
+
+TABLES: dict[str, Callable[..., int]] = {"hover": hover, "plants": plants, "model": model}
+
+
+def reproduce() -> int:
+    """Tables and figures, each a command of its own: hover, plants, model."""
+    raise AssertionError("reproduce has commands of its own")
