@@ -1,8 +1,9 @@
 """From a preset's numbers to objects: task, models, learners, starts."""
 
-import dataclasses
 import functools
 import math
+from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,14 +14,20 @@ from jaxtyping import Array, Key
 
 from .adapt.adapter import Adapter
 from .adapt.lockstep import Schedule
+from .control.lora import LoraPolicy
 from .control.policy import Policy
 from .learn.residual import EnsembleResidual
-from .physics.dynamics import PointMass
+from .physics.dynamics import AbstractDynamics, PointMass
+from .physics.lag import Lagged
 from .physics.state import State
 from .physics.vehicle import Vehicle
-from .presets import DT, Preset
+from .presets import DT, Preset, PresetError
 from .tasks.hover import TILT, Hover
-from .tasks.observation import StateObs
+from .tasks.observation import AbstractObservation, StateObs
+from .tasks.preview import Preview
+from .tasks.reference import REFERENCES, Reference, from_csv, joined
+from .tasks.task import AbstractTask
+from .tasks.track import AbstractTrack, SharpTrack, Track
 from .testbed import VEHICLES
 
 STARTS = 1  # folded into a seed for the starts of flights, so that they share no key with training
@@ -31,18 +38,46 @@ def vehicle(preset: Preset) -> Vehicle:
     return VEHICLES[preset.vehicle]()
 
 
-def task(preset: Preset) -> Hover:
-    """The task, with the observation that training and flight share."""
+def task(preset: Preset, flown: Reference | None = None) -> AbstractTask:
+    """The task, with the observation that training and flight share; ``flown`` is tracked instead of the preset's."""
     goal = jnp.array(preset.goal)
     observation = StateObs(goal, vehicle(preset).omega_max, preset.history)
+    if preset.task == "track":
+        return _track(preset, observation, flown or reference(preset.reference))
     return Hover(
         goal, observation, jnp.array(preset.box), jnp.array(preset.pretrain.heading), DT, preset.pretrain.horizon
     )
 
 
-def nominal(preset: Preset) -> PointMass:
+def _track(preset: Preset, state: StateObs, followed: Reference) -> AbstractTask:
+    preview = Preview(followed, state.omega_max, preset.history)
+    seen: AbstractObservation[Any] = preview if preset.observation == "preview" else state
+    reward = SharpTrack if preset.reward == "sharp" else Track
+    return reward(followed, seen, jnp.array(preset.spread), jnp.array(preset.box), DT, preset.pretrain.horizon)
+
+
+@functools.cache
+def reference(names: str) -> Reference:
+    """A reference by name or CSV file; several, joined by +, become a family. Raises :class:`PresetError`."""
+    with jax.ensure_compile_time_eval():  # may be called while something is traced; the tables are kept
+        found = [_reference(name) for name in names.split("+")]
+        return found[0] if len(found) == 1 else joined(found)
+
+
+def _reference(name: str) -> Reference:
+    if name in REFERENCES:
+        return REFERENCES[name]()
+    if not name.endswith(".csv"):
+        raise PresetError(f"no reference {name!r}; there are {', '.join(REFERENCES)}, and CSV files of t, x, y, z")
+    try:
+        return from_csv(Path(name))
+    except (OSError, UnicodeDecodeError, ValueError) as error:
+        raise PresetError(str(error)) from error
+
+
+def nominal(preset: Preset) -> AbstractDynamics[Any]:
     """The analytical model."""
-    return PointMass(DT)
+    return PointMass(DT) if preset.lag is None else Lagged(PointMass(DT), jnp.array(preset.lag))
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -59,11 +94,11 @@ def optimiser(preset: Preset) -> optax.GradientTransformation:
     return optax.chain(optax.clip_by_global_norm(p.clip or math.inf), optax.adam(schedule, b2=p.b2))
 
 
-def adapter(preset: Preset) -> Adapter:
-    """The learner beside the flight."""
+def adapter(preset: Preset, flown: Reference | None = None) -> Adapter:
+    """The learner beside the flight; it re-trains on what is ``flown``, or on what the policy was trained on."""
     a = preset.adapt
     return Adapter(
-        task(preset),
+        task(preset, flown),
         nominal(preset),
         residual_rate=jnp.array(a.residual_rate),
         beta=jnp.array(a.beta),
@@ -83,6 +118,12 @@ def residual(preset: Preset, key: Key[Array, ""]) -> EnsembleResidual:
     return EnsembleResidual.of(jnp.array(preset.goal), vehicle(preset).omega_max, key=key)
 
 
+@jax.jit
+def lora(policy: Policy, key: Key[Array, ""]) -> LoraPolicy:
+    """A fresh low-rank delta on ``policy``, ranks 4, 10, 1 and scale 4 as in the paper; the key is consumed."""
+    return LoraPolicy.of(policy, key=key)
+
+
 def schedule(preset: Preset, *, measured: bool = False) -> Schedule:
     """When to learn; ``measured`` charges the time that the clock shows instead of the preset's fixed figures."""
     a = preset.adapt
@@ -94,10 +135,15 @@ def schedule(preset: Preset, *, measured: bool = False) -> Schedule:
     )
 
 
-def flight_starts(preset: Preset, n: int, seed: int = 0) -> list[State]:
-    """``n`` starts, the same for every preset: goal +- 1 m per axis, 18 degrees about each axis, 0.1 m/s."""
-    here = dataclasses.replace(preset, pretrain=dataclasses.replace(preset.pretrain, heading=TILT))
-    batch = jax.jit(lambda key: jax.vmap(task(here).reset)(random.split(key, n)))(
+def flight_starts(preset: Preset, n: int, seed: int = 0, flown: Reference | None = None) -> list[State]:
+    """``n`` starts, the same for every preset: +- 1 m per axis, 18 degrees about each axis, 0.1 m/s.
+
+    Around the goal, or around where the reference starts.
+    """
+    task_flown = task(preset, flown)
+    here = task_flown.reference(jnp.array(0.0)).p if isinstance(task_flown, AbstractTrack) else jnp.array(preset.goal)
+    nearby = Hover(here, task_flown.observation, jnp.array(preset.box), jnp.array(TILT))
+    batch = jax.jit(lambda key: jax.vmap(nearby.reset)(random.split(key, n)).x)(
         random.fold_in(random.key(seed), STARTS)
     )
     return [jax.tree.map(lambda leaf, i=i: jnp.asarray(np.asarray(leaf)[i]), batch) for i in range(n)]

@@ -82,10 +82,21 @@ class Adapt:
 
 @dataclass(frozen=True, config=_STRICT)
 class Preset:
-    """A hover experiment."""
+    """An experiment."""
 
     name: str = "paper"
-    task: Literal["hover"] = "hover"
+    task: Literal["hover", "track"] = "hover"
+    reference: str = "circle"
+    """What a tracking policy is trained on: circle, figure8, star, a CSV file of t, x, y, z[, yaw], or several of these
+    joined by +."""
+    observation: Literal["state", "preview"] = "state"
+    """state: o = [p, R, v]; preview: the reference relative to the vehicle, now and soon."""
+    reward: Literal["paper", "sharp"] = "paper"
+    """Of a tracking task."""
+    spread: float = Field(default=1.0, gt=0, allow_inf_nan=False)
+    """Tracking starts lie within this of the reference, per axis [m]."""
+    lag: PositiveFloat | None = None
+    """Time constant of the actuators in the model [s]; none by default."""
     vehicle: Literal["small", "large", "kingfisher"] = "small"
     """The vehicle that the policy is trained for."""
     goal: tuple[FiniteFloat, FiniteFloat, FiniteFloat] = (0.0, 0.0, 1.0)
@@ -102,6 +113,18 @@ class Preset:
     adapt: Adapt = Field(default_factory=Adapt)
 
 
+TRACK = Preset(
+    name="track",
+    task="track",
+    observation="preview",
+    reward="sharp",
+    history=2,
+    delay=1,
+    lag=0.033,
+    pretrain=Pretrain(epochs=300, envs=32, horizon=100, rate=3e-3, clip=1.0),
+    adapt=Adapt(window=250, clip=1.0),
+)
+
 PRESETS: dict[str, Preset] = {
     # As printed: o = [p, R, v], no delay in the model, 300 x 100 x 150.
     "paper": Preset(),
@@ -115,6 +138,10 @@ PRESETS: dict[str, Preset] = {
         pretrain=Pretrain(epochs=150, envs=16, b2=0.95, clip=1.0, heading=TILT),
         adapt=Adapt(clip=1.0),
     ),
+    # Tracking as printed: the policy sees p, R, v and never its reference. Five seconds of flight are remembered.
+    "track-paper": Preset(name="track-paper", task="track", spread=0.3, adapt=Adapt(window=250)),
+    # Ours: the reference seen ahead, a sharp reward, one tick of delay and actuator lag in the model.
+    "track": TRACK,
 }
 
 

@@ -33,21 +33,22 @@ def test_window_has_a_fixed_shape_and_masks_what_is_missing():
     with pytest.raises(ValueError, match="no tick was pushed"):
         buffer.window()
     for i in range(6):
-        buffer.push(at(float(i), 0.0, 1.0), Command(jnp.array(float(i)), jnp.zeros(3)))
+        buffer.push(0.02 * i, at(float(i), 0.0, 1.0), Command(jnp.array(float(i)), jnp.zeros(3)))
         window = buffer.window()
         assert window.x.p.shape == (4, 3)
         assert int(window.valid.sum()) == min(i + 1, 4)
         newest = np.arange(max(0, i - 3), i + 1)
+        np.testing.assert_allclose(window.t[np.asarray(window.valid)], 0.02 * newest)
         np.testing.assert_array_equal(window.x.p[np.asarray(window.valid), 0], newest)
         np.testing.assert_array_equal(window.u.c[np.asarray(window.valid)], newest)
 
 
 def test_window_is_a_copy():
     buffer = RollingBuffer(2)
-    buffer.push(at(1.0, 0.0, 1.0), Command.hover())
+    buffer.push(0.0, at(1.0, 0.0, 1.0), Command.hover())
     before = buffer.window()
-    buffer.push(at(2.0, 0.0, 1.0), Command.hover())
-    buffer.push(at(3.0, 0.0, 1.0), Command.hover())
+    buffer.push(0.0, at(2.0, 0.0, 1.0), Command.hover())
+    buffer.push(0.0, at(3.0, 0.0, 1.0), Command.hover())
     assert float(before.x.p[-1, 0]) == 1.0
 
 
@@ -249,7 +250,7 @@ def test_a_fit_that_is_not_finite_is_dropped(trained):
     state = adapter.init(policy, build.residual(preset, random.key(2)))
     buffer = RollingBuffer(preset.adapt.window)
     for i in range(10):
-        buffer.push(at(0.0, 0.0, 1.0 + float("nan") * (i == 5)), Command.hover())
+        buffer.push(0.0, at(0.0, 0.0, 1.0 + float("nan") * (i == 5)), Command.hover())
     kept, _, sound = adapter.refine(state.residual, buffer.window())
     assert not sound
     jax.tree.map(np.testing.assert_array_equal, kept, state.residual)

@@ -13,6 +13,7 @@ from retrim.control import Policy
 from retrim.learn import EnsembleResidual, PolicyState, bptt, policy_gradient, policy_loss, pretrain, rollout
 from retrim.learn.pretrain import starts
 from retrim.physics import Hybrid, PointMass, Rotors, State, StraightThrough, small
+from retrim.tasks import Start
 
 
 def awake(key, size, hidden=(8, 8)):
@@ -92,7 +93,7 @@ def test_delay_holds_commands_back(key):
 
 def test_external_acceleration_reaches_the_rollout(key):
     task = hover_task(horizon=2)
-    policy, x0 = Policy.of(15, small(), key=key), State.at(jnp.array(GOAL))
+    policy, x0 = Policy.of(15, small(), key=key), Start(jnp.array(0.0), State.at(jnp.array(GOAL)))
     pushed = rollout(PointMass(0.02), task, policy, x0, a_ext=jnp.array([2.0, 0.0, 0.0]))
     assert pushed.x.v[1, 0] == pytest.approx(0.04, rel=1e-2)
 
@@ -101,7 +102,7 @@ def test_the_dead_are_frozen_charged_and_give_finite_gradients(key):
     """Pushed out of a small box: alive goes false for good, the state stays, the worst reward is charged."""
     task = hover_task(horizon=40, box=1.05)
     policy = awake(key, 15)
-    x0 = State(jnp.array([1.0, 0.0, 1.0]), jnp.eye(3), jnp.array([1.0, 0.0, 0.0]))
+    x0 = Start(jnp.array(0.0), State(jnp.array([1.0, 0.0, 1.0]), jnp.eye(3), jnp.array([1.0, 0.0, 0.0])))
     flown = rollout(PointMass(0.02), task, policy, x0)
     died = int(jnp.argmin(flown.alive))
     assert 1 <= died < 10
@@ -120,7 +121,7 @@ def test_a_gradient_that_is_not_finite_changes_nothing(key):
     policy, optimiser = awake(key, 15), optax.adam(1e-2)
     state = PolicyState(policy, optimiser.init(policy.layers))
     x0 = starts(task, key, 1, 2)
-    broken = eqx.tree_at(lambda x: x.v, x0, x0.v.at[0, 0, 0].set(jnp.nan))
+    broken = eqx.tree_at(lambda s: s.x.v, x0, x0.x.v.at[0, 0, 0].set(jnp.nan))
     after, losses = bptt(state, PointMass(0.02), task, broken, optimiser=optimiser)
     assert not np.isfinite(losses).all()
     jax.tree.map(np.testing.assert_array_equal, after, state)

@@ -27,7 +27,7 @@ def logged(field, key, *, n=100, delay=0):
         acting = commands[-1 - delay] if len(commands) > delay else Command.hover()
         x = states[-1]
         states.append(model.step(x, acting, field(x, acting)))
-    return Window(stacked(states[:n]), stacked(commands), jnp.ones(n, dtype=bool))
+    return Window(0.02 * jnp.arange(n), stacked(states[:n]), stacked(commands), jnp.ones(n, dtype=bool))
 
 
 def ensemble(key, members=3, hidden=(128, 128)):

@@ -49,7 +49,7 @@ def test_reward_is_differentiable_everywhere(key):
 @pytest.mark.parametrize("heading", [math.pi, 0.1 * math.pi])
 def test_starts_keep_to_their_bounds(heading):
     task = hover_task(heading=heading)
-    x = jax.vmap(task.reset)(random.split(random.key(3), 2000))
+    x = jax.vmap(task.reset)(random.split(random.key(3), 2000)).x
     away = np.asarray(x.p) - GOAL
     assert np.abs(away).max() <= 1.0
     assert np.abs(away).max(axis=0).min() > 0.95  # and use them

@@ -9,13 +9,14 @@ import optax
 from jax import random
 from jaxtyping import Array, Bool, Float, Key
 
+from ..control.lora import LoraPolicy
 from ..control.policy import Policy
 from ..learn.bptt import PolicyState, bptt
 from ..learn.pretrain import starts
 from ..learn.residual import EnsembleResidual, ResidualState, Window, fit_residual, residual_targets
 from ..physics.dynamics import AbstractDynamics, Hybrid
-from ..physics.state import State, where
-from ..tasks.task import AbstractTask
+from ..physics.state import where
+from ..tasks.task import AbstractTask, Start
 from .gate import Verdict, finite, judge
 
 
@@ -57,9 +58,9 @@ class Adapter(eqx.Module):
         if self.delay < 0 or self.plant_delay < 0:
             raise ValueError(f"Adapter.delay = {self.delay}, plant_delay = {self.plant_delay}: must not be negative")
 
-    def init(self, policy: Policy, residual: EnsembleResidual) -> AdaptState:
+    def init(self, policy: Policy | LoraPolicy, residual: EnsembleResidual) -> AdaptState:
         """Before the first fit. The residual should predict zero, so that the hybrid model starts as the nominal."""
-        fresh = PolicyState(policy, self._policy_optimiser().init(policy.layers))
+        fresh = PolicyState(policy, self._policy_optimiser().init(policy.trained))
         return AdaptState(fresh, ResidualState.of(residual, self._residual_optimiser()))
 
     @eqx.filter_jit
@@ -86,14 +87,14 @@ class Adapter(eqx.Module):
         k_train, k_gate, k_flown = random.split(key, 3)
         x0 = starts(self.task, k_train, self.epochs, self.envs)
         optimiser = self._policy_optimiser()
-        fresh = PolicyState(s.policy, optimiser.init(s.policy.layers))
+        fresh = PolicyState(s.policy, optimiser.init(s.policy.trained))
         trained, _ = bptt(fresh, hybrid, self.task, x0, optimiser=optimiser, delay=self.delay)
         held_out = jax.tree.map(
             lambda box, sky: jnp.concatenate([box, sky]),
             jax.vmap(self.task.reset)(random.split(k_gate, 4)),
             _drawn(window, k_flown, 4),
         )
-        return trained, judge(trained.policy, s.policy, hybrid, self.task, held_out, delay=self.delay)
+        return trained, judge(trained.policy.plain(), s.policy.plain(), hybrid, self.task, held_out, delay=self.delay)
 
     def _residual_optimiser(self) -> optax.GradientTransformation:
         return optax.adam(self.residual_rate)
@@ -107,9 +108,9 @@ class Adapter(eqx.Module):
         )
 
 
-def _drawn(window: Window, key: Key[Array, ""], n: int) -> State:
-    """``n`` states drawn from the valid part of the window."""
+def _drawn(window: Window, key: Key[Array, ""], n: int) -> Start:
+    """``n`` states, with their times, drawn from the valid part of the window."""
     weight = window.valid.astype(window.x.p.dtype)
     row = random.choice(key, window.valid.shape[0], (n,), p=weight / jnp.sum(weight))
-    drawn: State = jax.tree.map(lambda leaf: leaf[row], window.x)
+    drawn: Start = jax.tree.map(lambda leaf: leaf[row], Start(window.t, window.x))
     return drawn

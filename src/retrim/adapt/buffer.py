@@ -16,15 +16,15 @@ class RollingBuffer:
     def __init__(self, size: int) -> None:
         if size < 2:
             raise ValueError(f"RollingBuffer: size = {size} must be at least 2, for one difference of velocity")
-        self._rows: deque[tuple[State, Command]] = deque(maxlen=size)
+        self._rows: deque[tuple[float, State, Command]] = deque(maxlen=size)
         self._size = size
 
     def __len__(self) -> int:
         return len(self._rows)
 
-    def push(self, x: State, u: Command) -> None:
-        """Append the state at a tick and the command issued at it."""
-        self._rows.append((x, u))
+    def push(self, t: float, x: State, u: Command) -> None:
+        """Append the state at the tick of time ``t`` [s] and the command issued at it."""
+        self._rows.append((t, x, u))
 
     def clear(self) -> None:
         """Forget everything."""
@@ -39,5 +39,7 @@ class RollingBuffer:
             raise ValueError("RollingBuffer: no tick was pushed yet")
         missing = self._size - len(self._rows)
         rows = [self._rows[0]] * missing + list(self._rows)
-        x, u = jax.tree.map(lambda *leaves: jnp.asarray(np.stack([np.asarray(leaf) for leaf in leaves])), *rows)
-        return Window(x, u, jnp.arange(self._size) >= missing)
+        pairs = [(x, u) for _, x, u in rows]
+        x, u = jax.tree.map(lambda *leaves: jnp.asarray(np.stack([np.asarray(leaf) for leaf in leaves])), *pairs)
+        t = jnp.asarray(np.array([t for t, _, _ in rows]), dtype=x.p.dtype)
+        return Window(t, x, u, jnp.arange(self._size) >= missing)

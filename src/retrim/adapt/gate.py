@@ -10,8 +10,7 @@ from jaxtyping import Array, Bool, Float
 from ..control.policy import Policy
 from ..learn.bptt import policy_loss
 from ..physics.dynamics import AbstractDynamics
-from ..physics.state import State
-from ..tasks.task import AbstractTask
+from ..tasks.task import AbstractTask, Start
 
 
 class Verdict(eqx.Module):
@@ -42,7 +41,7 @@ def judge(
     incumbent: Policy,
     dynamics: AbstractDynamics[Any],
     task: AbstractTask,
-    x0: State,
+    x0: Start,
     *,
     delay: int = 0,
 ) -> Verdict:

@@ -97,7 +97,7 @@ class AdaptivePilot:
         self._buffer = RollingBuffer(window)
         self._refiner = _Learner(schedule.refine_every, schedule.refine_charge, dt)
         self._improver = _Learner(schedule.improve_every, schedule.improve_charge, dt)
-        self._pilot = ControllerPilot(PolicyController(adapter.task.observation, state.policy.policy))
+        self._pilot = ControllerPilot(PolicyController(adapter.task.observation, state.policy.policy.plain()))
         self._tick = 0
         self._now = 0.0
         self.state = state
@@ -114,7 +114,7 @@ class AdaptivePilot:
         for learner in (self._refiner, self._improver):
             learner.deliver(self._tick)
         u = self._pilot(sample)
-        self._buffer.push(sample.x, u)
+        self._buffer.push(sample.t, sample.x, u)
         self._start(self._refiner, "residual", self._refine)
         self._start(self._improver, "policy", self._improve)
         self._tick += 1
@@ -149,7 +149,7 @@ class AdaptivePilot:
         def publish() -> None:
             if verdict.admitted:
                 self.state = AdaptState(trained, self.state.residual)
-                self._pilot.controller = PolicyController(self._adapter.task.observation, trained.policy)
+                self._pilot.controller = PolicyController(self._adapter.task.observation, trained.policy.plain())
             self._tell("policy" if verdict.admitted else "rejected", verdict.reason())
 
         return publish

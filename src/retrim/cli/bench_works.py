@@ -84,9 +84,9 @@ def _pretrain(preset: Preset, runs: int) -> dict[str, Any]:
 
     row = _timed(compile_s, run, runs)
     errors = (
-        [nominal_error(preset, run(seed).policy) for seed in range(1, 4)]
+        [nominal_error(preset, run(seed).policy.plain()) for seed in range(1, 4)]
         if runs > 1
-        else [nominal_error(preset, run().policy)]
+        else [nominal_error(preset, run().policy.plain())]
     )
     row["remarks"] += "; hover error " + ", ".join(f"{1000 * e:.1f}" for e in errors) + " mm"
     return row
@@ -101,7 +101,7 @@ def _learner() -> tuple[Adapter, AdaptState, Window]:
     log_buffer = RollingBuffer(preset.adapt.window)
     sample = plant.reset(build.flight_starts(preset, 1)[0])
     for _ in range(preset.adapt.window):
-        log_buffer.push(sample.x, Command.hover())
+        log_buffer.push(sample.t, sample.x, Command.hover())
         sample = plant.exchange(Command.hover())
     window = log_buffer.window()
     state = adapter.init(policy, build.residual(preset, random.key(1)))

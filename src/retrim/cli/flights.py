@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import random
+from jax import lax, random
 from jaxtyping import Array
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -25,13 +25,15 @@ from ..control.controller import PolicyController
 from ..control.policy import Policy
 from ..physics.state import State
 from ..presets import Preset
+from ..tasks.reference import Reference
 from ..tasks.task import AbstractTask
+from ..tasks.track import AbstractTrack
 from ..testbed import Setting
 from .session import console
 
-Method = Literal["base", "full"]
+Method = Literal["base", "full", "lora"]
 LEARNERS = 2  # folded into a seed for the learners of flights
-STEADY = 2.0  # [s]: the steady-state error is the mean over this long at the end of a flight
+STEADY = {"hover": 2.0, "track": 10.0}  # [s]: the error of a flight is the mean over this long at its end
 
 
 @dataclass(frozen=True)
@@ -53,12 +55,23 @@ class Flight:
     error: np.ndarray
     """The task's error at each tick [m]."""
     events: tuple[Event, ...]
+    task: str = "hover"
+    cross: np.ndarray | None = None
+    """Tracking: distance from the nearest point of the lap at each tick [m]."""
 
     @property
     def steady(self) -> float:
-        """Mean error over the last two seconds [m]; NaN after a crash."""
-        ticks = round(STEADY / presets.DT)
-        return float("nan") if self.log.crashed else float(self.error[-ticks:].mean())
+        """Mean error over the last seconds, as the task has it [m]; NaN after a crash."""
+        return self._last(self.error)
+
+    @property
+    def cross_track(self) -> float | None:
+        """The same of the cross-track error; None for other tasks."""
+        return None if self.cross is None else self._last(self.cross)
+
+    def _last(self, error: np.ndarray) -> float:
+        ticks = round(STEADY[self.task] / presets.DT)
+        return float("nan") if self.log.crashed else float(error[-ticks:].mean())
 
     @property
     def swaps(self) -> tuple[float, ...]:
@@ -79,29 +92,33 @@ class Campaign:
         starts: int,
         seed: int,
         measured: bool = False,
+        flown: Reference | None = None,
     ) -> None:
         self.preset, self.policy = preset, policy
         self._ticks, self._seed, self._workers = round(seconds / presets.DT), seed, 1 if measured else _cores()
-        self._adapter = build.adapter(preset)
+        self._adapter = build.adapter(preset, flown)
         self._schedule = build.schedule(preset, measured=measured)
         self.setting = setting
-        self._starts = build.flight_starts(preset, starts, seed)
+        self._starts = build.flight_starts(preset, starts, seed, flown)
         self.stop = threading.Event()
 
-    def warm_up(self, disturbances: Iterable[str]) -> None:
+    def warm_up(self, disturbances: Iterable[str], methods: Iterable[Method] = ("base", "full")) -> None:
         """Compile every program of the flights before the first take-off."""
         x0 = self._starts[0]
         with console.status("compiling the programs of a flight (kept in a cache for the next time) ..."):
-            pilot = self._pilot(0)
+            pilot = self._pilot(0, "full")
             for disturbance in dict.fromkeys(disturbances):
                 plant = self._plant(disturbance, 0)
                 fly(plant, pilot, x0, ticks=2, alive=self._alive)
             buffer = RollingBuffer(self.preset.adapt.window)
-            buffer.push(x0, self.policy.u_hover)
-            state, window = pilot.state, buffer.window()
-            jax.block_until_ready(self._adapter.refine(state.residual, window))
-            residual = state.residual.residual
-            jax.block_until_ready(self._adapter.improve(state.policy, residual, window, random.key(0)))
+            buffer.push(0.0, x0, self.policy.u_hover)
+            window, residual = buffer.window(), pilot.state.residual
+            jax.block_until_ready(self._adapter.refine(residual, window))
+            for method in dict.fromkeys(methods):
+                if method != "base":
+                    policy = self._pilot(0, method).state.policy
+                    key = random.key(0)
+                    jax.block_until_ready(self._adapter.improve(policy, residual.residual, window, key))
 
     def fly(self, plans: Sequence[Plan]) -> tuple[list[Flight], bool]:
         """The flights in the order of ``plans``, and whether Ctrl-C cut them short (then some are missing).
@@ -136,9 +153,10 @@ class Campaign:
         done = (futures[plan] for plan in plans if plan in futures)
         return [f.result() for f in done if not f.cancelled() and f.exception() is None], interrupted
 
-    def _pilot(self, start: int) -> AdaptivePilot:
+    def _pilot(self, start: int, method: Method) -> AdaptivePilot:
         k_residual, k_learn = random.split(random.fold_in(random.fold_in(random.key(self._seed), LEARNERS), start))
-        state = self._adapter.init(self.policy, build.residual(self.preset, k_residual))
+        policy = self.policy if method == "full" else build.lora(self.policy, random.fold_in(k_residual, 0))
+        state = self._adapter.init(policy, build.residual(self.preset, k_residual))
         return AdaptivePilot(
             self._adapter,
             state,
@@ -153,12 +171,14 @@ class Campaign:
         return self.setting.make(disturbance, seed=1000 * self._seed + start)
 
     def _fly(self, plan: Plan, ticker: "_Ticker") -> Flight:
-        adaptive = self._pilot(plan.start) if plan.method == "full" else None
+        adaptive = None if plan.method == "base" else self._pilot(plan.start, plan.method)
         pilot: Pilot = adaptive or ControllerPilot(PolicyController(self._adapter.task.observation, self.policy))
         plant = self._plant(plan.disturbance, plan.start)
         log = fly(plant, pilot, self._starts[plan.start], ticks=self._ticks, alive=self._alive, sinks=(ticker,))
-        error = np.asarray(_errors(self._adapter.task, log.t, State(*map(jnp.asarray, (log.p, log.R, log.v)))))
-        return Flight(plan, log, error, tuple(adaptive.events) if adaptive else ())
+        error, cross = _errors(self._adapter.task, log.t, State(*map(jnp.asarray, (log.p, log.R, log.v))))
+        events = tuple(adaptive.events) if adaptive else ()
+        off_lap = None if cross is None else np.asarray(cross)
+        return Flight(plan, log, np.asarray(error), events, self.preset.task, off_lap)
 
     def _alive(self, sample: Sample) -> bool:
         if self.stop.is_set():
@@ -176,8 +196,9 @@ def _still_alive(task: AbstractTask, t: Any, x: State) -> Array:
 
 
 @eqx.filter_jit
-def _errors(task: AbstractTask, t: Any, x: State) -> Array:
-    return jax.vmap(task.error)(jnp.asarray(t, dtype=x.p.dtype), x)
+def _errors(task: AbstractTask, t: Any, x: State) -> tuple[Array, Array | None]:
+    error = jax.vmap(task.error)(jnp.asarray(t, dtype=x.p.dtype), x)
+    return error, lax.map(task.cross_track, x) if isinstance(task, AbstractTrack) else None
 
 
 @contextlib.contextmanager

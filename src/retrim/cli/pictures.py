@@ -12,21 +12,31 @@ from .. import testbed
 from ..physics.conditions import Conditions
 from ..physics.state import State
 from ..presets import Preset
+from ..tasks.reference import Reference
 from ..testbed import Setting
 from ..viz import plots
 from .flights import Flight
 
 
-def picture(flights: Sequence[Flight], preset: Preset, disturbance: str, setting: Setting, folder: Path) -> list[Path]:
+def picture(
+    flights: Sequence[Flight],
+    preset: Preset,
+    disturbance: str,
+    setting: Setting,
+    folder: Path,
+    flown: Reference | None = None,
+) -> list[Path]:
     """``hover_<disturbance>.png`` and ``.svg`` of the flights under one disturbance; returns their paths."""
     base, adapted = (
-        [_track(f) for f in flights if f.plan.disturbance == disturbance and f.plan.method == method]
-        for method in ("base", "full")
+        [_track(f) for f in flights if f.plan.disturbance == disturbance and f.plan.method in method]
+        for method in (("base",), ("full", "lora"))
     )
     seconds = max(float(track.t[-1]) for track in (*base, *adapted))
-    title = f"Hover: {setting.flown} on plant {setting.plant!r}, disturbance {disturbance!r}, preset {preset.name!r}"
-    figure = plots.flight_figure(title, base, adapted, spans(disturbance, preset.goal, seconds), preset.goal)
-    return plots.save(figure, folder, f"hover_{disturbance.replace('+', '_')}")
+    where = f"{setting.flown} on plant {setting.plant!r}"
+    title = f"{preset.task.capitalize()}: {where}, disturbance {disturbance!r}, preset {preset.name!r}"
+    lap = None if flown is None else np.asarray(flown.rows)[:, :3]
+    figure = plots.flight_figure(title, base, adapted, spans(disturbance, preset.goal, seconds), preset.goal, lap)
+    return plots.save(figure, folder, f"{preset.task}_{disturbance.replace('+', '_')}")
 
 
 def spans(disturbance: str, goal: tuple[float, float, float], seconds: float) -> list[plots.Span]:

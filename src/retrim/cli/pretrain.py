@@ -5,15 +5,18 @@ from typing import Literal
 
 import tyro
 
-from .. import presets
+from .. import build, presets
 from ..checkpoint import save_policy
 from .session import Stopwatch, console, run_folder, write_results
 from .training import nominal_error, train
 
+DEFAULT = {"hover": "fast", "track": "track"}
+
 
 def pretrain(
-    task: tyro.conf.Positional[Literal["hover"]],
-    preset: str = "fast",
+    task: tyro.conf.Positional[Literal["hover", "track"]],
+    preset: str | None = None,
+    reference: str | None = None,
     config: Path | None = None,
     epochs: int | None = None,
     envs: int | None = None,
@@ -24,7 +27,8 @@ def pretrain(
 
     Args:
         task: What the policy learns.
-        preset: paper, released or fast.
+        preset: hover: fast (by default), released or paper; track: track (by default) or track-paper.
+        reference: What to track: circle, figure8, star, a CSV file of t, x, y, z[, yaw], or a family, as circle+star.
         config: TOML file that overlays the preset, for example with a table [pretrain].
         epochs: Optimiser steps, instead of the preset's.
         envs: Starts per epoch, instead of the preset's.
@@ -32,7 +36,13 @@ def pretrain(
         out: Folder for policy.safetensors and results.json; a new one under runs/ by default.
     """
     watch = Stopwatch()
-    settings = presets.load(preset, config)
+    settings = presets.load(preset or DEFAULT[task], config)
+    if settings.task != task:
+        raise presets.PresetError(f"preset {settings.name!r} is for {settings.task}, not for {task}")
+    if reference is not None:
+        settings = presets.changed(settings, reference=reference)
+    if task == "track":
+        build.reference(settings.reference)  # a wrong name is refused before anything else happens
     changes = {name: value for name, value in (("epochs", epochs), ("envs", envs)) if value is not None}
     settings = presets.changed(settings, pretrain=changes)
     policy, losses, interrupted = train(settings, seed)
@@ -51,7 +61,7 @@ def pretrain(
         "nominal_error_m": error,
     }
     write_results(folder, seeds=[seed], watch=watch, rows=[row], interrupted=interrupted, losses=losses)
-    console.print(f"hover error in its own model: {1000 * error:.1f} mm after {len(losses)} epochs")
+    console.print(f"{task} error in its own model: {1000 * error:.1f} mm after {len(losses)} epochs")
     console.print(f"compiling {watch.compile_s:.1f} s, all else {watch.total_s - watch.compile_s:.1f} s")
     console.print(f"[bold]{folder / 'policy.safetensors'}[/]", soft_wrap=True)
     return 130 if interrupted else 0

@@ -1,6 +1,6 @@
 """Pretraining with a progress bar."""
 
-import dataclasses
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -9,14 +9,13 @@ from jax import random
 from jaxtyping import Array
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from .. import build
+from .. import build, presets
 from ..control.policy import Policy
 from ..learn.pretrain import pretrain
 from ..learn.rollout import rollout
-from ..physics.dynamics import PointMass
-from ..physics.state import State
+from ..physics.dynamics import AbstractDynamics
 from ..presets import Preset
-from ..tasks.hover import Hover
+from ..tasks.task import AbstractTask, Start
 from .session import console
 
 CHUNK = 10
@@ -46,7 +45,7 @@ def train(preset: Preset, seed: int) -> tuple[Policy, list[float], bool]:
                 chunk=chunk,
             ):
                 losses += [float(loss) for loss in chunk_losses]
-                policy = state.policy
+                policy = state.policy.plain()
                 progress.update(bar, completed=len(losses), loss=f"loss {losses[-1]:.3f}")
         except KeyboardInterrupt:
             interrupted = True
@@ -55,17 +54,17 @@ def train(preset: Preset, seed: int) -> tuple[Policy, list[float], bool]:
 
 def nominal_error(preset: Preset, policy: Policy, *, n: int = 64, seed: int = 1) -> float:
     """Mean error in the policy's own model over the last half second of 6 s, from ``n`` starts of its training [m]."""
-    task = build.task(preset)
-    long = dataclasses.replace(task, horizon=round(6.0 / task.dt))
+    long = build.task(presets.changed(preset, pretrain={"horizon": round(6.0 / presets.DT)}))
     x0 = jax.vmap(long.reset)(random.split(random.key(seed), n))
     return float(_settled(policy, build.nominal(preset), long, x0, preset.delay))
 
 
 @eqx.filter_jit
-def _settled(policy: Policy, dynamics: PointMass, task: Hover, x0: State, delay: int) -> Array:
-    def error(x: State) -> Array:
-        flown = rollout(dynamics, task, policy, x, delay=delay)
+def _settled(policy: Policy, dynamics: AbstractDynamics[Any], task: AbstractTask, x0: Start, delay: int) -> Array:
+    def error(start: Start) -> Array:
+        flown = rollout(dynamics, task, policy, start, delay=delay)
         last = jax.tree.map(lambda leaf: leaf[-25:], flown.x)
-        return jnp.mean(jax.vmap(task.error)(jnp.zeros(25, dtype=x.p.dtype), last))
+        times = start.t + task.dt * jnp.arange(task.horizon - 25, task.horizon, dtype=start.t.dtype)
+        return jnp.mean(jax.vmap(task.error)(times, last))
 
     return jnp.mean(jax.vmap(error)(x0))

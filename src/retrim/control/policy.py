@@ -11,6 +11,8 @@ from ..physics.vehicle import Vehicle
 
 Taps = tuple[Float[Array, "... _"], ...]
 """One vector per layer (in :mod:`retrim.learn` with rows in front), added to the pre-activation."""
+Layers = tuple[eqx.nn.Linear, ...]
+"""The layers of a policy, or a gradient with respect to them."""
 Inputs = tuple[Float[Array, "... _"], ...]
 """What each layer was given."""
 
@@ -45,6 +47,19 @@ class Policy(eqx.Module):
                 )
             )
         return cls(tuple(layers), Command.hover(), vehicle.command_min, vehicle.command_max)
+
+    @property
+    def trained(self) -> Layers:
+        """What an optimiser may move."""
+        return self.layers
+
+    def retrained(self, layers: Layers) -> "Policy":
+        """The same policy with other layers."""
+        return Policy(layers, self.u_hover, self.u_min, self.u_max)
+
+    def plain(self) -> "Policy":
+        """Itself: what flies. A low-rank policy merges its delta here."""
+        return self
 
     def __call__(self, observation: Float[Array, " o"]) -> Command:
         """The command for one observation."""

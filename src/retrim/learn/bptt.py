@@ -9,54 +9,54 @@ import optax
 from jax import lax
 from jaxtyping import Array, Float
 
+from ..control.lora import LoraPolicy
 from ..control.policy import Inputs, Policy, Taps
 from ..physics.dynamics import AbstractDynamics
-from ..physics.state import State
-from ..tasks.task import AbstractTask
+from ..tasks.task import AbstractTask, Start
 from . import taps
 from .rollout import Trajectory, rollout, tapped_rollout
 
 
 class PolicyState(eqx.Module):
-    """A policy and the state of its optimiser, which knows ``policy.layers`` only."""
+    """A policy, plain or low-rank, and the state of its optimiser, which knows ``policy.trained`` only."""
 
-    policy: Policy
+    policy: Policy | LoraPolicy
     optimiser: optax.OptState
 
 
 def policy_loss(
-    policy: Policy, dynamics: AbstractDynamics[Any], task: AbstractTask, x0: State, *, delay: int = 0
+    policy: Policy, dynamics: AbstractDynamics[Any], task: AbstractTask, x0: Start, *, delay: int = 0
 ) -> Float[Array, ""]:
     """Minus the reward, averaged over ticks and over the batch of starts ``x0``. The plain form of the objective."""
 
-    def fly(x: State) -> Trajectory:
-        return rollout(dynamics, task, policy, x, delay=delay)
+    def fly(start: Start) -> Trajectory:
+        return rollout(dynamics, task, policy, start, delay=delay)
 
     flown = jax.vmap(fly)(x0)
     return -jnp.mean(flown.reward)
 
 
 def policy_gradient(
-    policy: Policy, dynamics: AbstractDynamics[Any], task: AbstractTask, x0: State, *, delay: int = 0
+    policy: Policy, dynamics: AbstractDynamics[Any], task: AbstractTask, x0: Start, *, delay: int = 0
 ) -> tuple[Float[Array, ""], tuple[eqx.nn.Linear, ...]]:
     """:func:`policy_loss` and its gradient with respect to ``policy.layers``, by taps."""
 
     def loss(zeros: Taps) -> tuple[Float[Array, ""], Inputs]:
-        def fly(x: State, z: Taps) -> tuple[Trajectory, Inputs]:
-            return tapped_rollout(dynamics, task, policy, x, z, delay=delay)
+        def fly(start: Start, z: Taps) -> tuple[Trajectory, Inputs]:
+            return tapped_rollout(dynamics, task, policy, start, z, delay=delay)
 
         # Ticks in front, as the scan lays them out: no transposition of what is as large as all activations.
         flown, inputs = jax.vmap(fly, in_axes=(0, 1), out_axes=(0, 1))(x0, zeros)
         return -jnp.mean(flown.reward), inputs
 
-    return taps.value_and_grad(loss, policy, (task.horizon, x0.p.shape[0]))
+    return taps.value_and_grad(loss, policy, (task.horizon, x0.t.shape[0]))
 
 
 def bptt(
     state: PolicyState,
     dynamics: AbstractDynamics[Any],
     task: AbstractTask,
-    x0: State,
+    x0: Start,
     *,
     optimiser: optax.GradientTransformation,
     delay: int = 0,
@@ -67,15 +67,18 @@ def bptt(
     start must not destroy a policy.
     """
 
-    def epoch(state: PolicyState, starts: State) -> tuple[PolicyState, Float[Array, ""]]:
-        loss, gradient = policy_gradient(state.policy, dynamics, task, starts, delay=delay)
-        update, memory = optimiser.update(gradient, state.optimiser, state.policy.layers)
-        layers = optax.apply_updates(state.policy.layers, update)
+    def epoch(state: PolicyState, starts: Start) -> tuple[PolicyState, Float[Array, ""]]:
+        # From what is trained to plain layers and, with the gradient, back; for a plain policy both are the identity.
+        layers, pull = jax.vjp(lambda trained: state.policy.retrained(trained).plain().layers, state.policy.trained)
+        plain = state.policy.plain().retrained(layers)
+        loss, by_layers = policy_gradient(plain, dynamics, task, starts, delay=delay)
+        (gradient,) = pull(by_layers)
+        update, memory = optimiser.update(gradient, state.optimiser, state.policy.trained)
+        trained = optax.apply_updates(state.policy.trained, update)
         fine = jnp.isfinite(optax.tree.norm(gradient))
-        layers, memory = jax.tree.map(
-            lambda new, old: jnp.where(fine, new, old), (layers, memory), (state.policy.layers, state.optimiser)
+        trained, memory = jax.tree.map(
+            lambda new, old: jnp.where(fine, new, old), (trained, memory), (state.policy.trained, state.optimiser)
         )
-        policy = eqx.tree_at(lambda p: p.layers, state.policy, layers)
-        return PolicyState(policy, memory), loss
+        return PolicyState(state.policy.retrained(trained), memory), loss
 
     return lax.scan(epoch, state, x0)

@@ -11,12 +11,11 @@ from jaxtyping import Array, Float, Key
 
 from ..control.policy import Policy
 from ..physics.dynamics import AbstractDynamics
-from ..physics.state import State
-from ..tasks.task import AbstractTask
+from ..tasks.task import AbstractTask, Start
 from .bptt import PolicyState, bptt
 
 
-def starts(task: AbstractTask, key: Key[Array, ""], epochs: int, envs: int) -> State:
+def starts(task: AbstractTask, key: Key[Array, ""], epochs: int, envs: int) -> Start:
     """Random starts, epochs x environments; the key is consumed."""
     return jax.vmap(jax.vmap(task.reset))(random.split(key, (epochs, envs)))
 
@@ -57,7 +56,7 @@ def pretrain(
     """
     if epochs % chunk or epochs <= 0:
         raise ValueError(f"epochs = {epochs} must be a positive multiple of {chunk}")
-    state = PolicyState(policy, optimiser.init(policy.layers))
+    state = PolicyState(policy, optimiser.init(policy.trained))
     for k in random.split(key, epochs // chunk):
         state, losses = train_chunk(state, dynamics, task, k, optimiser, chunk, envs, delay)
         yield state, losses

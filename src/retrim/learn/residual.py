@@ -17,6 +17,8 @@ from ..tasks.observation import POSITION_SCALE, VELOCITY_SCALE
 class Window(eqx.Module):
     """The last ``n`` ticks of a flight, oldest first. While it fills, ``valid`` is false in front."""
 
+    t: Float[Array, " n"]
+    """Time of each tick since take-off [s]."""
     x: State
     """State at each tick (leading axis n)."""
     u: Command
@@ -134,11 +136,14 @@ def residual_targets(window: Window, nominal: AbstractDynamics[Any], *, delay: i
     v_next = window.x.v[delay + 1 :]
     u = jax.tree.map(lambda leaf: leaf[:rows], window.u)
 
-    def missed(x: State, u: Command, v_next: Float[Array, "3"]) -> Float[Array, "3"]:
-        predicted = nominal.state(nominal.step(nominal.init(x), u, jnp.zeros_like(x.p)))
-        return (v_next - predicted.v) / nominal.dt
+    def tick(s: Any, row: tuple[State, Command, Float[Array, "3"]]) -> tuple[Any, Float[Array, "3"]]:
+        x, u, v_next = row
+        after = nominal.step(nominal.with_state(s, x), u, jnp.zeros_like(x.p))  # what is hidden in s, as lag, goes on
+        return after, (v_next - nominal.state(after).v) / nominal.dt
 
-    return Targets(x, u, jax.vmap(missed)(x, u, v_next), window.valid[:rows])
+    first = nominal.init(jax.tree.map(lambda leaf: leaf[0], x))
+    _, a_res = lax.scan(tick, first, (x, u, v_next))
+    return Targets(x, u, a_res, window.valid[:rows])
 
 
 def fit_residual(

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 from ..control.policy import Inputs, Policy, Taps
 from ..physics.dynamics import AbstractDynamics
 from ..physics.state import Command, State, where
-from ..tasks.task import AbstractTask
+from ..tasks.task import AbstractTask, Start
 
 
 class Trajectory(eqx.Module):
@@ -30,49 +30,49 @@ def rollout(
     dynamics: AbstractDynamics[Any],
     task: AbstractTask,
     policy: Policy,
-    x0: State,
+    start: Start,
     *,
     delay: int = 0,
     a_ext: Float[Array, "3"] | None = None,
 ) -> Trajectory:
-    """Fly ``task.horizon`` ticks from ``x0``.
+    """Fly ``task.horizon`` ticks from ``start``.
 
     A command issued at a tick acts ``delay`` ticks later; until the first one does, the vehicle is told to hover.
     ``a_ext`` is a constant external acceleration (world [m/s^2]).
     """
-    return _scan(dynamics, task, policy, x0, None, delay, a_ext)[0]
+    return _scan(dynamics, task, policy, start, None, delay, a_ext)[0]
 
 
 def tapped_rollout(
     dynamics: AbstractDynamics[Any],
     task: AbstractTask,
     policy: Policy,
-    x0: State,
+    start: Start,
     taps: Taps,
     *,
     delay: int = 0,
     a_ext: Float[Array, "3"] | None = None,
 ) -> tuple[Trajectory, Inputs]:
     """The same with the layers' inputs; differentiable in ``taps`` (per layer: horizon x width), not in the policy."""
-    return _scan(dynamics, task, policy, x0, taps, delay, a_ext)
+    return _scan(dynamics, task, policy, start, taps, delay, a_ext)
 
 
 def _scan(
     dynamics: AbstractDynamics[Any],
     task: AbstractTask,
     policy: Policy,
-    x0: State,
+    start: Start,
     taps: Taps | None,
     delay: int,
     a_ext: Float[Array, "3"] | None,
 ) -> tuple[Trajectory, Inputs]:
-    push = a_ext if a_ext is not None else jnp.zeros_like(x0.p)
+    push = a_ext if a_ext is not None else jnp.zeros_like(start.x.p)
     hover = policy.u_hover
 
     def tick(carry: Any, xs: Any) -> Any:
         s, memory, last, pending, alive, worst = carry
         k, tap = xs
-        t = k * task.dt
+        t = start.t + k * task.dt
         x = dynamics.state(s)
         o, memory = task.observation(memory, t, x, last)
         u, inputs = (policy(o), ()) if tap is None else policy.tapped(o, tap)
@@ -86,14 +86,14 @@ def _scan(
         worst = jnp.minimum(worst, lax.stop_gradient(reward))
         return (s, memory, u, waiting, survived, worst), ((x, acting, reward, alive), inputs)
 
-    start = (
-        dynamics.init(x0),
-        task.observation.init(x0),
+    carry = (
+        dynamics.init(start.x),
+        task.observation.init(start.x),
         hover,
         (hover,) * delay,
         jnp.array(True),
-        jnp.zeros_like(x0.p[0]),
+        jnp.zeros_like(start.t),
     )
-    ticks = jnp.arange(task.horizon, dtype=x0.p.dtype)
-    _, (flown, inputs) = lax.scan(tick, start, (ticks, taps))
+    ticks = jnp.arange(task.horizon, dtype=start.t.dtype)
+    _, (flown, inputs) = lax.scan(tick, carry, (ticks, taps))
     return Trajectory(*flown), inputs

@@ -10,15 +10,12 @@ and every weight gradient is formed afterwards, from all rows (environments x ti
 
 from collections.abc import Callable
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..control.policy import Inputs, Policy, Taps
+from ..control.policy import Inputs, Layers, Policy, Taps
 
-Layers = tuple[eqx.nn.Linear, ...]
-"""The layers of a policy, or a gradient with respect to them."""
 TappedLoss = Callable[[Taps], tuple[Float[Array, ""], Inputs]]
 """From taps (per layer: rows... x width) to the loss and each layer's inputs (per layer: rows... x fan-in)."""
 

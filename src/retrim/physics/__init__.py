@@ -17,6 +17,7 @@ from .dynamics import StraightThrough as StraightThrough
 from .dynamics import f_a as f_a
 from .highrate import AbstractHighRate as AbstractHighRate
 from .highrate import RotorState as RotorState
+from .lag import Lagged as Lagged
 from .propeller import Propeller as Propeller
 from .propeller import five_inch as five_inch
 from .propeller import three_inch as three_inch

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Key
 from ..physics import so3
 from ..physics.state import Command, State
 from .observation import AbstractObservation
-from .task import AbstractTask, huber
+from .task import AbstractTask, Start, huber
 
 TILT = 0.1 * math.pi  # [rad], 18 degrees
 
@@ -32,13 +32,13 @@ class Hover(AbstractTask):
     dt: float = eqx.field(static=True, default=0.02)
     horizon: int = eqx.field(static=True, default=150)
 
-    def reset(self, key: Key[Array, ""]) -> State:
+    def reset(self, key: Key[Array, ""]) -> Start:
         """Goal +- 1 m per axis, yaw within ``heading``, pitch and roll within 18 degrees, 0.1 m/s of velocity noise."""
         kp, ka, kv = random.split(key, 3)
         p = self.goal + random.uniform(kp, (3,), minval=-1.0, maxval=1.0)
         roll, pitch, turn = random.uniform(ka, (3,), minval=-1.0, maxval=1.0)
         R = so3.rotx(TILT * roll) @ so3.roty(TILT * pitch) @ so3.rotz(self.heading * turn)
-        return State(p, R, 0.1 * random.normal(kv, (3,)))
+        return Start(jnp.zeros_like(p[0]), State(p, R, 0.1 * random.normal(kv, (3,))))
 
     def reward(self, t: Float[Array, ""], x: State, u: Command) -> Float[Array, ""]:
         """r_pos + r_vel + r_act of the paper. The rate term acts on the commanded body rates, which Eq. (1) obeys."""

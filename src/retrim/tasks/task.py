@@ -11,6 +11,14 @@ from ..physics.state import Command, State
 from .observation import AbstractObservation
 
 
+class Start(eqx.Module):
+    """Where and when a roll-out starts."""
+
+    t: Float[Array, ""]
+    """Time of the task [s]: a reference may be joined anywhere."""
+    x: State
+
+
 class AbstractTask(eqx.Module):
     """One drone, one task. Times are seconds since the start; positions are world coordinates [m]."""
 
@@ -33,7 +41,7 @@ class AbstractTask(eqx.Module):
         observation: eqx.AbstractVar[AbstractObservation]
 
     @abc.abstractmethod
-    def reset(self, key: Key[Array, ""]) -> State:
+    def reset(self, key: Key[Array, ""]) -> Start:
         """A random start; the key is consumed."""
 
     @abc.abstractmethod

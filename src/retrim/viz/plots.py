@@ -44,9 +44,17 @@ class Span:
 
 
 def flight_figure(
-    title: str, base: list[Track], adapted: list[Track], spans: list[Span], goal: tuple[float, float, float]
+    title: str,
+    base: list[Track],
+    adapted: list[Track],
+    spans: list[Span],
+    goal: tuple[float, float, float],
+    lap: np.ndarray | None = None,
 ) -> Figure:
-    """Error over time beside the path from above; base against adapted, one thin line a flight, the mean thick."""
+    """Error over time beside the path from above; base against adapted, one thin line a flight, the mean thick.
+
+    With a ``lap`` (points x 3), the path is that over it in the last ten seconds.
+    """
     with plt.rc_context(
         {"font.size": 11, "axes.spines.top": False, "axes.spines.right": False, "svg.fonttype": "none"}
     ):
@@ -55,7 +63,10 @@ def flight_figure(
         )
         figure.suptitle(title, fontsize=14, fontweight="bold", color=INK)
         _errors(left, base, adapted, spans)
-        _paths(right, base, adapted, goal)
+        if lap is None:
+            _paths(right, base, adapted, goal)
+        else:
+            _laps(right, base, adapted, lap)
         figure.legend(loc="outside lower center", ncols=4, frameon=False)
     return figure
 
@@ -92,7 +103,7 @@ def _errors(axes: Axes, base: list[Track], adapted: list[Track], spans: list[Spa
             mean = np.mean(whole, axis=0)
             final = f"{100 * mean[-100:].mean():.1f} cm off at the end"
             axes.plot(tracks[0].t[: len(mean)], mean, color=color, linewidth=2.4, label=f"{name}: {final}")
-    axes.set(xlabel="time [s]", ylabel="distance from the target [m]", ylim=(0, top))
+    axes.set(xlabel="time [s]", ylabel="distance from where it should be [m]", ylim=(0, top))
     axes.margins(x=0)
 
 
@@ -114,4 +125,17 @@ def _paths(axes: Axes, base: list[Track], adapted: list[Track], goal: tuple[floa
             )  # fmt: skip
     axes.plot(goal[0], goal[1], "+", color=INK, markersize=18, markeredgewidth=2, label="target")
     axes.set(xlabel="x [m]", ylabel="y [m]", title="the same flights from above")
+    axes.set_aspect("equal", adjustable="datalim")
+
+
+def _laps(axes: Axes, base: list[Track], adapted: list[Track], lap: np.ndarray) -> None:
+    axes.plot(lap[:, 0], lap[:, 1], color="#BBBBBB", linewidth=5, label="reference", zorder=1)
+    for tracks, color, name in ((base, BASE, "base"), (adapted, ADAPTED, "adapted")):
+        for i, track in enumerate(track for track in tracks if not track.crashed):
+            last = track.t >= track.t[-1] - 10.0
+            axes.plot(
+                track.p[last, 0], track.p[last, 1], color=color, alpha=0.8, linewidth=0.9, zorder=2,
+                label=None if i else f"{name}, last 10 s",
+            )  # fmt: skip
+    axes.set(xlabel="x [m]", ylabel="y [m]", title="the last laps from above")
     axes.set_aspect("equal", adjustable="datalim")

@@ -112,7 +112,9 @@ class MujocoPlant(ForeignPlant):
         if not np.array_equal(load, self._load):
             self._model.body_mass[1] = self._mass + load[0]
             self._model.body_inertia[1] = self._inertia + load[1:]
-            self._mujoco.mj_setConst(self._model, self._mujoco.MjData(self._model))  # a spare: it moves what it is given
+            self._mujoco.mj_setConst(
+                self._model, self._mujoco.MjData(self._model)
+            )  # a spare: it moves what it is given
             self._load = load
 
 

@@ -1,0 +1,52 @@
+"""What a control engineer would show a tracking policy: where it should be, now and soon."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..physics.state import STANDARD_GRAVITY, Command, State
+from .observation import VELOCITY_SCALE, AbstractObservation
+from .reference import Reference
+
+POSITIONS = (0.0, 0.08, 0.16, 0.28, 0.4)  # [s] ahead
+VELOCITIES = (0.0, 0.2)
+
+
+class Preview(AbstractObservation[Float[Array, "history 4"]]):
+    """o = [p_ref(t + 0 ... 0.4 s) - p, v_ref(t, t + 0.2 s) - v, R, v, heading, last commands].
+
+    No absolute position: one policy can fly the same shape anywhere. Every entry is scaled to order one.
+    """
+
+    reference: Reference
+    omega_max: Float[Array, "3"]
+    history: int = eqx.field(static=True, default=2)
+
+    @property
+    def size(self) -> int:
+        """35 + 4 ``history``."""
+        return 3 * len(POSITIONS) + 3 * len(VELOCITIES) + 9 + 3 + 2 + 4 * self.history
+
+    def init(self, x: State) -> Float[Array, "history 4"]:
+        """As if the vehicle had hovered until now."""
+        return jnp.zeros((self.history, 4), dtype=x.p.dtype)
+
+    def __call__(
+        self, memory: Float[Array, "history 4"], t: Float[Array, ""], x: State, last: Command
+    ) -> tuple[Float[Array, " o"], Float[Array, "history 4"]]:
+        """Relative to the vehicle, in world axes."""
+        scaled = jnp.concatenate([(last.c / STANDARD_GRAVITY - 1.0)[None], last.omega / self.omega_max])
+        memory = jnp.concatenate([memory, scaled[None]])[1:]
+        soon = jax.vmap(self.reference)(t + jnp.array(POSITIONS, dtype=t.dtype))
+        later = jax.vmap(self.reference)(t + jnp.array(VELOCITIES, dtype=t.dtype))
+        heading = soon.heading[0]
+        seen = [
+            (soon.p - x.p[None]).reshape(-1),
+            (later.v - x.v[None]).reshape(-1) / VELOCITY_SCALE,
+            x.R.reshape(9),
+            x.v / VELOCITY_SCALE,
+            jnp.stack([jnp.cos(heading), jnp.sin(heading)]),
+            memory.reshape(-1),
+        ]
+        return jnp.concatenate(seen), memory
