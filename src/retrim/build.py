@@ -22,7 +22,8 @@ from .physics.lag import Lagged
 from .physics.state import State
 from .physics.vehicle import Vehicle
 from .presets import DT, Preset, PresetError
-from .tasks.hover import TILT, Hover
+from .tasks.hover import TILT, Hover, SharpHover
+from .tasks.keypoints import Keypoints
 from .tasks.observation import AbstractObservation, StateObs
 from .tasks.preview import Preview
 from .tasks.reference import REFERENCES, Reference, from_csv, joined
@@ -44,9 +45,23 @@ def task(preset: Preset, flown: Reference | None = None) -> AbstractTask:
     observation = StateObs(goal, vehicle(preset).omega_max, preset.history)
     if preset.task == "track":
         return _track(preset, observation, flown or reference(preset.reference))
-    return Hover(
-        goal, observation, jnp.array(preset.box), jnp.array(preset.pretrain.heading), DT, preset.pretrain.horizon
-    )
+    seen = keypoints(preset) if preset.task == "vision" else observation
+    reward = SharpHover if preset.reward == "sharp" else Hover
+    return reward(goal, seen, jnp.array(preset.box), jnp.array(preset.pretrain.heading), DT, preset.pretrain.horizon)
+
+
+@functools.cache
+def keypoints(preset: Preset) -> Keypoints:
+    """What a vision policy sees; its whitening is computed once."""
+    with jax.ensure_compile_time_eval():
+        return Keypoints.of(
+            jnp.array(preset.goal),
+            vehicle(preset).omega_max,
+            honest=preset.honest,
+            noise=preset.pixel_noise,
+            dropout=preset.dropout,
+            whitened=preset.whitened,
+        )
 
 
 def _track(preset: Preset, state: StateObs, followed: Reference) -> AbstractTask:

@@ -85,16 +85,26 @@ class Preset:
     """An experiment."""
 
     name: str = "paper"
-    task: Literal["hover", "track"] = "hover"
+    task: Literal["hover", "track", "vision"] = "hover"
     reference: str = "circle"
     """What a tracking policy is trained on: circle, figure8, star, a CSV file of t, x, y, z[, yaw], or several of these
     joined by +."""
     observation: Literal["state", "preview"] = "state"
     """state: o = [p, R, v]; preview: the reference relative to the vehicle, now and soon."""
     reward: Literal["paper", "sharp"] = "paper"
-    """Of a tracking task."""
+    """paper: as printed; sharp: ours, for every task."""
     spread: float = Field(default=1.0, gt=0, allow_inf_nan=False)
     """Tracking starts lie within this of the reference, per axis [m]."""
+    honest: bool = False
+    """Vision: a point that the camera does not see is not observed; else every point is fed, as in the paper."""
+    pixel_noise: float = Field(default=0.0, ge=0, allow_inf_nan=False)
+    """Vision, in training and flight [px]."""
+    dropout: float = Field(default=0.0, ge=0, lt=1)
+    """Vision: probability that a visible point is missed in a frame, in training and flight."""
+    whitened: bool = False
+    """Vision: pixels whitened over random short motions; else as they are."""
+    represent: NonNegativeInt = 0
+    """Vision: steps of learning to see, before learning to fly."""
     lag: PositiveFloat | None = None
     """Time constant of the actuators in the model [s]; none by default."""
     vehicle: Literal["small", "large", "kingfisher"] = "small"
@@ -125,6 +135,18 @@ TRACK = Preset(
     adapt=Adapt(window=250, clip=1.0),
 )
 
+VISION = Preset(
+    name="vision",
+    task="vision",
+    reward="sharp",
+    delay=1,
+    lag=0.033,
+    whitened=True,
+    represent=3000,
+    pretrain=Pretrain(epochs=300, envs=16, rate=3e-3, b2=0.95, clip=1.0, hidden=(256, 256), heading=TILT),
+    adapt=Adapt(clip=1.0),
+)
+
 PRESETS: dict[str, Preset] = {
     # As printed: o = [p, R, v], no delay in the model, 300 x 100 x 150.
     "paper": Preset(),
@@ -142,6 +164,19 @@ PRESETS: dict[str, Preset] = {
     "track-paper": Preset(name="track-paper", task="track", spread=0.3, adapt=Adapt(window=250)),
     # Ours: the reference seen ahead, a sharp reward, one tick of delay and actuator lag in the model.
     "track": TRACK,
+    # Seven points on the ground, five frames, three commands, no state; every point fed, as in the paper.
+    "vision": VISION,
+    # The same, but what the camera does not see is not observed; pixels are noisy and some are missed.
+    "vision-honest": dataclasses.replace(VISION, name="vision-honest", honest=True, pixel_noise=1.0, dropout=0.05),
+    # The paper's sizes: raw pixels, 500 x 300, updates of 50 epochs x 30 environments.
+    "vision-paper": Preset(
+        name="vision-paper",
+        task="vision",
+        delay=1,
+        represent=3000,
+        pretrain=Pretrain(epochs=500, envs=300, rate=1e-3, heading=TILT),
+        adapt=Adapt(epochs=50, envs=30, improve_charge=4.0),
+    ),
 }
 
 

@@ -33,7 +33,11 @@ from .session import console
 
 Method = Literal["base", "full", "lora"]
 LEARNERS = 2  # folded into a seed for the learners of flights
-STEADY = {"hover": 2.0, "track": 10.0}  # [s]: the error of a flight is the mean over this long at its end
+STEADY = {
+    "hover": 2.0,
+    "vision": 2.0,
+    "track": 10.0,
+}  # [s]: the error of a flight is the mean over this long at its end
 
 
 @dataclass(frozen=True)

@@ -10,11 +10,11 @@ from ..checkpoint import save_policy
 from .session import Stopwatch, console, run_folder, write_results
 from .training import nominal_error, train
 
-DEFAULT = {"hover": "fast", "track": "track"}
+DEFAULT = {"hover": "fast", "track": "track", "vision": "vision"}
 
 
 def pretrain(
-    task: tyro.conf.Positional[Literal["hover", "track"]],
+    task: tyro.conf.Positional[Literal["hover", "track", "vision"]],
     preset: str | None = None,
     reference: str | None = None,
     config: Path | None = None,

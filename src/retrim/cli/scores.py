@@ -8,7 +8,7 @@ import numpy as np
 from ..testbed import Setting
 from .flights import Flight
 
-METRICS = {"hover": "steady_error_m", "track": "tracking_error_m"}
+METRICS = {"hover": "steady_error_m", "vision": "steady_error_m", "track": "tracking_error_m"}
 
 
 def rows(flights: Sequence[Flight], *, task: str, setting: Setting) -> list[dict[str, Any]]:

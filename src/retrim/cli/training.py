@@ -12,6 +12,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from .. import build, presets
 from ..control.policy import Policy
 from ..learn.pretrain import pretrain
+from ..learn.represent import represent
 from ..learn.rollout import rollout
 from ..physics.dynamics import AbstractDynamics
 from ..presets import Preset
@@ -26,6 +27,11 @@ def train(preset: Preset, seed: int) -> tuple[Policy, list[float], bool]:
     k_init, k_train = random.split(random.key(seed))
     policy, losses, interrupted = build.policy(preset, k_init), list[float](), False
     p = preset.pretrain
+    if preset.represent and preset.task == "vision":
+        with console.status(f"learning to see, {preset.represent} steps ..."):
+            k_init, k_see = random.split(k_init)
+            policy, errors = represent(policy, build.keypoints(preset), k_see, steps=preset.represent)
+            console.print(f"learnt to see: mean error of the state {float(errors[-50:].mean()):.3f} (scaled)")
     columns = TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[loss]}"), TimeRemainingColumn()
     chunk = CHUNK if p.epochs % CHUNK == 0 else 1
     with Progress(*columns, console=console) as progress:

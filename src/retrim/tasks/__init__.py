@@ -1,6 +1,10 @@
 """What we want: starts, rewards, observations, errors."""
 
+from .camera import Camera as Camera
+from .hover import AbstractHover as AbstractHover
 from .hover import Hover as Hover
+from .hover import SharpHover as SharpHover
+from .keypoints import Keypoints as Keypoints
 from .observation import AbstractObservation as AbstractObservation
 from .observation import StateObs as StateObs
 from .preview import Preview as Preview

@@ -1,7 +1,7 @@
 """Stabilising hover at a goal (paper, Sec. IV-A.1)."""
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -17,20 +17,30 @@ from .task import AbstractTask, Start, huber
 TILT = 0.1 * math.pi  # [rad], 18 degrees
 
 
-class Hover(AbstractTask):
-    """Fly to ``goal`` and stay.
+class AbstractHover(AbstractTask):
+    """Fly to ``goal`` and stay; what differs is the reward.
 
     A vehicle farther than ``box`` [m] from the goal along any axis is lost. The box is wide, since in a tight one a
     strong disturbance ends every flight and leaves nothing to learn from.
     """
 
-    goal: Float[Array, "3"]
-    observation: AbstractObservation[Any]
-    box: Float[Array, ""]
-    heading: Float[Array, ""]
-    """Starts head within +- this angle of the x axis [rad]; pi for anywhere."""
-    dt: float = eqx.field(static=True, default=0.02)
-    horizon: int = eqx.field(static=True, default=150)
+    if TYPE_CHECKING:  # as in AbstractTask
+
+        @property
+        def goal(self) -> Float[Array, "3"]:
+            """Where to hover, world [m]."""
+
+        @property
+        def box(self) -> Float[Array, ""]:
+            """Half its side [m]."""
+
+        @property
+        def heading(self) -> Float[Array, ""]:
+            """Starts head within +- this angle of the x axis [rad]; pi for anywhere."""
+    else:
+        goal: eqx.AbstractVar[Float[Array, "3"]]
+        box: eqx.AbstractVar[Float[Array, ""]]
+        heading: eqx.AbstractVar[Float[Array, ""]]
 
     def reset(self, key: Key[Array, ""]) -> Start:
         """Goal +- 1 m per axis, yaw within ``heading``, pitch and roll within 18 degrees, 0.1 m/s of velocity noise."""
@@ -39,13 +49,6 @@ class Hover(AbstractTask):
         roll, pitch, turn = random.uniform(ka, (3,), minval=-1.0, maxval=1.0)
         R = so3.rotx(TILT * roll) @ so3.roty(TILT * pitch) @ so3.rotz(self.heading * turn)
         return Start(jnp.zeros_like(p[0]), State(p, R, 0.1 * random.normal(kv, (3,))))
-
-    def reward(self, t: Float[Array, ""], x: State, u: Command) -> Float[Array, ""]:
-        """r_pos + r_vel + r_act of the paper. The rate term acts on the commanded body rates, which Eq. (1) obeys."""
-        r_pos = -1.0 * huber(5.0 * (x.p - self.goal))
-        r_vel = -0.1 * huber(x.v) - 0.1 * huber(u.omega)
-        r_act = -0.5 * huber(u.vector() - Command.hover().vector())
-        return r_pos + r_vel + r_act
 
     def alive(self, t: Float[Array, ""], x: State) -> Bool[Array, ""]:
         """Inside the box, and finite."""
@@ -56,3 +59,42 @@ class Hover(AbstractTask):
     def error(self, t: Float[Array, ""], x: State) -> Float[Array, ""]:
         """Distance from the goal [m]."""
         return jnp.sqrt(jnp.sum((x.p - self.goal) ** 2))
+
+
+class Hover(AbstractHover):
+    """With the paper's reward."""
+
+    goal: Float[Array, "3"]
+    observation: AbstractObservation[Any]
+    box: Float[Array, ""]
+    heading: Float[Array, ""]
+    """Starts head within +- this angle of the x axis [rad]; pi for anywhere."""
+    dt: float = eqx.field(static=True, default=0.02)
+    horizon: int = eqx.field(static=True, default=150)
+
+    def reward(self, t: Float[Array, ""], x: State, u: Command) -> Float[Array, ""]:
+        """r_pos + r_vel + r_act of the paper. The rate term acts on the commanded body rates, which Eq. (1) obeys."""
+        r_pos = -1.0 * huber(5.0 * (x.p - self.goal))
+        r_vel = -0.1 * huber(x.v) - 0.1 * huber(u.omega)
+        r_act = -0.5 * huber(u.vector() - Command.hover().vector())
+        return r_pos + r_vel + r_act
+
+
+class SharpHover(AbstractHover):
+    """With a reward that has a tip at the goal: the paper's is flat there, and a policy stays centimetres off."""
+
+    goal: Float[Array, "3"]
+    observation: AbstractObservation[Any]
+    box: Float[Array, ""]
+    heading: Float[Array, ""]
+    """Starts head within +- this angle of the x axis [rad]; pi for anywhere."""
+    dt: float = eqx.field(static=True, default=0.02)
+    horizon: int = eqx.field(static=True, default=150)
+
+    def reward(self, t: Float[Array, ""], x: State, u: Command) -> Float[Array, ""]:
+        """The paper's reward - 3 (sqrt(|p - goal|^2 + (1 cm)^2) - 1 cm)."""
+        r_pos = -1.0 * huber(5.0 * (x.p - self.goal))
+        r_vel = -0.1 * huber(x.v) - 0.1 * huber(u.omega)
+        r_act = -0.5 * huber(u.vector() - Command.hover().vector())
+        tip = jnp.sqrt(jnp.sum((x.p - self.goal) ** 2) + 0.01**2) - 0.01
+        return r_pos + r_vel + r_act - 3.0 * tip
