@@ -5,10 +5,14 @@ simulator missed, re-train the policy in the corrected simulator, and swap it in
 """
 
 import os
+import sys
 
 # Before jax is first imported: its compile cache otherwise reports, for every program it loads, machine features that
 # differ only in name. Set the variable yourself to see XLA's log.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+# Before scipy is first imported: the plant crazyflow needs it, and says so where it comes too late.
+if "scipy" not in sys.modules:
+    os.environ.setdefault("SCIPY_ARRAY_API", "1")
 
 from .adapt import Adapter as Adapter
 from .adapt import AdaptivePilot as AdaptivePilot

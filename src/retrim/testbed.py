@@ -10,7 +10,7 @@ from jax import random
 from jaxtyping import Array, Key
 
 from .adapt.plant import Plant
-from .adapt.plants import SimPlant
+from .adapt.plants import CrazyflowPlant, MujocoPlant, RotorpyPlant, SimPlant
 from .adapt.sensing import Sensing
 from .physics.bem import Bem
 from .physics.disturbance import Constant, Disturbance, RandomWalk, Reversing, Together
@@ -128,4 +128,8 @@ class Setting:
             return SimPlant(
                 Rotors.of(car, DT, thrust_error=self.thrust_error), around, sensing=SENSING[self.sensing](), seed=seed
             )
-        raise NotImplementedError(self.plant)
+        if self.plant == "mujoco":
+            return MujocoPlant(car, around, dt=DT)
+        if self.plant == "rotorpy":
+            return RotorpyPlant(around, dt=DT)
+        return CrazyflowPlant(around, dt=DT)

@@ -195,7 +195,7 @@ def test_the_papers_numbers():
         ("pretrain.rate = 'fast'", r"pretrain\.rate: Input should be a valid number"),
         ("adapt.improve_every = 0.005", r"adapt\.improve_every: Input should be greater than or equal to 0\.02"),
         ("goal = [nan, 0.0, 1.0]", r"goal\.0: Input should be a finite number"),
-        ("vehicle = 'medium'", r"vehicle: Input should be 'small' or 'large'"),
+        ("vehicle = 'medium'", r"vehicle: Input should be 'small', 'large' or 'kingfisher'"),
         ("= 3", r"overlay\.toml: Invalid statement"),
     ],
 )

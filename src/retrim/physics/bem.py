@@ -106,7 +106,7 @@ class Bem(AbstractHighRate[BemState]):
 
     def hub_velocities(self, b: RotorState, wind: Float[Array, "3"]) -> Float[Array, "4 3"]:
         """Velocity of each hub through the air, body frame [m/s]."""
-        return b.x.R.T @ (b.x.v - wind) + jnp.cross(b.omega, self.places())
+        return (b.x.R.T @ (b.x.v - wind))[None] + jnp.cross(b.omega[None], self.places())
 
     def places(self) -> Float[Array, "4 3"]:
         """Of the hubs, body frame [m]."""

@@ -89,7 +89,7 @@ class RandomWalk(eqx.Module):
         if not (bound > 0 and rate >= 0 and every > 0 and n >= 2):
             raise ValueError(f"RandomWalk: rate = {rate}, bound = {bound}, every = {every}, n = {n} cannot be")
         path = jnp.cumsum(rate * every**0.5 * random.normal(key, (n, 3)), axis=0)
-        path = path - path[0]
+        path = path - path[:1]
         return cls(bound - jnp.abs((path + bound) % (4.0 * bound) - 2.0 * bound), jnp.array(every))
 
     def __call__(self, t: Float[Array, ""], x: State) -> Conditions:

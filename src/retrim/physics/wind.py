@@ -54,14 +54,14 @@ class Turbulence(eqx.Module):
         across it (MIL-F-8785C).
         """
         k_quantile, k_phase = random.split(key)
-        share = (jnp.arange(n)[:, None] + random.uniform(k_quantile, (n, 3))) / n
+        share = (jnp.arange(n, dtype=float)[:, None] + random.uniform(k_quantile, (n, 3))) / n
         grid = jnp.tan(jnp.linspace(0.0, 1.0, 2001)[:-1] * jnp.pi / 2)
         across = (2.0 * jnp.arctan(grid) - grid / (1.0 + grid**2)) / jnp.pi
         s = jnp.stack(
             [jnp.tan(share[:, 0] * jnp.pi / 2), *(jnp.interp(share[:, i], across, grid) for i in (1, 2))], axis=1
         )
         fastest = 200.0  # [rad/s]: a millisecond step resolves no more
-        rate = jnp.minimum(s * speed / length, fastest)
+        rate = jnp.minimum(s * speed / length[None], fastest)
         return cls(rate, 2.0 * jnp.pi * random.uniform(k_phase, (n, 3)), sigma)
 
     def __call__(self, t: Float[Array, ""]) -> Float[Array, "3"]:
@@ -153,7 +153,7 @@ class Fan(eqx.Module):
         axes = axes_along(self.direction)
         along, *off = axes @ (x.p - self.outlet)
         width = self.width + self.SPREAD * jnp.maximum(along, 0.0)
-        inside = jax.nn.sigmoid(along / (0.2 * self.width))  # no jet behind the fan
+        inside = jax.nn.sigmoid(along / (0.2 * self.width) + 5.0)  # no jet behind the fan
         local = self.speed * self.width / width * jnp.exp(-0.5 * (off[0] ** 2 + off[1] ** 2) / width**2) * inside
         still = jnp.array([1.0, 0.0, 0.0], dtype=x.p.dtype)
         return Conditions.of(x.p.dtype, wind=local * (still + self.turbulence(t)) @ axes)

@@ -1,13 +1,12 @@
 """What plants of other simulators have in common: the tick, the command's delay, the surroundings, the samples."""
 
 import abc
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from ...physics.conditions import Conditions
 from ...physics.disturbance import Disturbance
@@ -82,6 +81,14 @@ class ForeignPlant(abc.ABC):
 
 
 @eqx.filter_jit
-def _surroundings(disturbance: Disturbance, times: Float[Array, "n"], x: State) -> Conditions:
+def _surroundings(disturbance: Disturbance, times: Any, x: State) -> Conditions:
     """Conditions at each of ``times`` [s], stacked."""
     return jax.vmap(lambda t: disturbance(t, x))(jnp.asarray(times, dtype=x.p.dtype))
+
+
+def whole_steps(dt: float, step: float) -> int:
+    """Steps of the simulator in a tick; raises ``ValueError`` if they do not fill it [s]."""
+    steps = round(dt / step)
+    if steps < 1 or abs(dt / step - steps) > 1e-6:
+        raise ValueError(f"a tick of {dt} s is no multiple of the simulator's step, {step} s")
+    return steps

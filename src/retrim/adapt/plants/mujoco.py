@@ -11,7 +11,7 @@ from ...physics.highrate import SIGNS
 from ...physics.state import STANDARD_GRAVITY
 from ...physics.vehicle import Vehicle
 from .extra import extra
-from .foreign import ForeignPlant, Pose
+from .foreign import ForeignPlant, Pose, whole_steps
 
 STEP = 2e-3  # [s]
 RATE_GAIN = 20.0  # [1/s]
@@ -52,13 +52,13 @@ class MujocoPlant(ForeignPlant):
     """One rigid body in MuJoCo: thrust at its centre, torques by a rate loop, drag of the medium on its body.
 
     2 ms steps. The drag is that of the vehicle's ``drag_area``; there is no rotor drag, so that wind moves it less
-    than it moves the other plants. Loads and weak rotors are heard once per tick, wind and push at each step. The
-    rate loop knows of no load. There is no ground.
+    than it moves the other plants. The rate loop is proportional: the torque of a weak rotor leaves it with a steady
+    error. It knows of no load. Loads and weak rotors are heard once per tick, wind and push at each step. There is no
+    ground.
     """
 
     def __init__(self, vehicle: Vehicle, disturbance: Disturbance, *, dt: float = 0.02) -> None:
-        self._steps = round(dt / STEP)
-        super().__init__(disturbance, dt, instants=self._steps)
+        super().__init__(disturbance, dt, instants=whole_steps(dt, STEP))
         low, high = vehicle.command_min, vehicle.command_max
         self._mass = float(vehicle.mass)
         self._inertia = np.asarray(vehicle.inertia, dtype=np.float64)
@@ -112,9 +112,8 @@ class MujocoPlant(ForeignPlant):
         if not np.array_equal(load, self._load):
             self._model.body_mass[1] = self._mass + load[0]
             self._model.body_inertia[1] = self._inertia + load[1:]
-            self._mujoco.mj_setConst(
-                self._model, self._mujoco.MjData(self._model)
-            )  # a spare: it moves what it is given
+            spare = self._mujoco.MjData(self._model)  # what it is given, it moves
+            self._mujoco.mj_setConst(self._model, spare)
             self._load = load
 
 

@@ -1,0 +1,275 @@
+"""What disturbs a flight: finite in every dtype, additive, repeatable, with the statistics that they state."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax, random
+
+from helpers import random_state
+from retrim.physics import (
+    BatterySag,
+    Bem,
+    Conditions,
+    Constant,
+    Disturbance,
+    Dryden,
+    Fan,
+    Payload,
+    Push,
+    RandomWalk,
+    RotorState,
+    State,
+    SteadyWind,
+    Together,
+    Turbulence,
+    WeakRotor,
+    small,
+)
+from retrim.physics.propeller import Inflow
+from retrim.physics.vehicle import payload_inertia
+from retrim.physics.wind import FEET, axes_along
+from retrim.testbed import DISTURBANCES
+
+SHAPES = {"push": (3,), "wind": (3,), "gain": (4,), "mass": (), "inertia": (3,)}
+
+
+@pytest.fixture(autouse=True)
+def loose():
+    """Until the test below is mended."""
+    with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
+        yield
+
+
+# RandomWalk.of: path - path[0]; Turbulence.of: arange(n) + floats, s * speed / length
+@pytest.mark.parametrize("name", ["walk", "gusts", "fan"])
+def test_types_are_explicit(name, key):
+    with jax.numpy_rank_promotion("raise"), jax.numpy_dtype_promotion("strict"):
+        DISTURBANCES[name](key)
+
+
+def at(*p):
+    return State.at(jnp.array(p, dtype=float))
+
+
+def over(disturbance, times, x=None):
+    """At many times."""
+    x = at(0.0, 0.0, 1.0) if x is None else x
+    return jax.jit(jax.vmap(lambda t: disturbance(t, x)))(jnp.asarray(times, dtype=x.p.dtype))
+
+
+def same(a, b, **tolerance):
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, **tolerance), a, b)
+
+
+@pytest.mark.parametrize("double", [True, False])
+@pytest.mark.parametrize("name", DISTURBANCES)
+def test_all(name, double):
+    """Finite, of the right shapes, in the dtype of the state, jitted and mapped, at once and after an hour."""
+    with jax.enable_x64(double):
+        disturbance = DISTURBANCES[name](random.key(1))
+        assert isinstance(disturbance, Disturbance)
+        found = over(disturbance, [0.0, 0.01, 10.0, 100.0, 3600.0], at(0.3, -0.2, 1.0))
+        for field, shape in SHAPES.items():
+            value = getattr(found, field)
+            assert value.shape == (5, *shape)
+            assert value.dtype == (jnp.float64 if double else jnp.float32)
+            assert np.isfinite(value).all()
+        calm = Conditions.calm(found.push.dtype)
+        quiet = jax.tree.map(lambda leaf, calm: bool((leaf == calm[None]).all()), found, calm)
+        assert all(jax.tree.leaves(quiet)) == (name == "none")
+
+
+def test_together_adds_and_gains_multiply(key):
+    t, x = jnp.array(1.0), random_state(key)
+    parts = (
+        Constant(jnp.array([1.0, 2.0, 3.0])),
+        SteadyWind(jnp.array([3.0, 0.0, 0.0])),
+        Payload.of(0.07),
+        WeakRotor.of(0, 0.9),
+        WeakRotor.of(0, 0.5),
+        Constant(jnp.array([1.0, 0.0, 0.0])),
+    )
+    both = Together(parts)(t, x)
+    np.testing.assert_allclose(both.push, [2.0, 2.0, 3.0])
+    np.testing.assert_allclose(both.wind, [3.0, 0.0, 0.0])
+    np.testing.assert_allclose(both.gain, [0.45, 1.0, 1.0, 1.0])
+    np.testing.assert_allclose(both.inertia, payload_inertia(0.07))
+    same(Together(parts[::-1])(t, x), both)
+    same(Together(())(t, x), Conditions.calm(x.p.dtype))
+
+
+def test_push_lifts_a_function(key):
+    x = random_state(key)
+    found = Push(lambda t, x: t * x.v)(jnp.array(2.0), x)
+    same(found, Conditions.of(x.p.dtype, push=2.0 * x.v))
+
+
+# ---- random walk
+
+
+def test_random_walk_stays_within_bounds_and_is_continuous(key):
+    walk = RandomWalk.of(2.0, 1.0, key=key, n=600)
+    push = over(walk, np.arange(0.0, 59.9, 0.01)).push
+    np.testing.assert_array_equal(push[0], 0.0)
+    assert 0.95 < jnp.abs(push).max() <= 1.0  # it meets the bounds, and turns there
+    per_step = jnp.abs(jnp.diff(walk.points, axis=0)).max()
+    assert jnp.abs(jnp.diff(push, axis=0)).max() <= 0.1 * per_step * (1 + 1e-9)
+    np.testing.assert_allclose(push[::10], walk.points[:599], atol=1e-9)
+
+
+def test_random_walk_spreads_as_stated(key):
+    ends = jax.vmap(lambda k: RandomWalk.of(0.5, 100.0, key=k, n=41).points)(random.split(key, 2000))
+    np.testing.assert_allclose(jnp.std(ends[:, 10], axis=0), 0.5, rtol=0.06)  # after one second
+    np.testing.assert_allclose(jnp.std(ends[:, 40], axis=0), 1.0, rtol=0.06)  # after four
+
+
+def test_random_walk_repeats_and_is_retraced(key):
+    walk = RandomWalk.of(0.5, 1.0, key=key, n=101)  # 10 s
+    same(walk, RandomWalk.of(0.5, 1.0, key=key, n=101))
+    assert not np.allclose(walk.points, RandomWalk.of(0.5, 1.0, key=random.key(1), n=101).points)
+    t = np.linspace(0.0, 10.0, 50)
+    same(over(walk, 20.0 - t), over(walk, t), atol=1e-9)
+    same(over(walk, 20.0 + t), over(walk, t), atol=1e-9)
+
+
+@pytest.mark.parametrize("bad", [{"bound": 0.0}, {"rate": -1.0}, {"every": 0.0}, {"n": 1}])
+def test_impossible_walks(bad, key):
+    with pytest.raises(ValueError, match=r"RandomWalk: .* cannot be"):
+        RandomWalk.of(**{"rate": 0.5, "bound": 1.0, "key": key, **bad})
+
+
+# ---- wind
+
+V, L, SIGMA = 5.0, np.array([20.0, 10.0, 5.0]), np.array([1.0, 2.0, 0.5])
+
+
+@pytest.fixture
+def turbulence(key):
+    return Turbulence.of(jnp.array(V), jnp.asarray(L), jnp.asarray(SIGMA), key=key)
+
+
+def test_turbulence_has_the_stated_variance_and_no_mean(turbulence, key):
+    gusts = jax.jit(jax.vmap(turbulence))(random.uniform(key, (40_000,), maxval=1e6))
+    np.testing.assert_allclose(jnp.std(gusts, axis=0), SIGMA, rtol=0.02)
+    np.testing.assert_allclose(jnp.mean(gusts, axis=0) / SIGMA, 0.0, atol=0.02)
+    assert np.abs(np.corrcoef(np.asarray(gusts).T) - np.eye(3)).max() < 0.03
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_turbulence_has_drydens_spectra(turbulence, axis):
+    """Energy below a frequency: of the sinusoids, and of the integrated spectrum (MIL-F-8785C)."""
+    l, found = L[axis] / V, np.asarray(turbulence.rate[:, axis])
+    for limit in (0.3 / l, 1.0 / l, 3.0 / l, 10.0 / l):
+        w = np.linspace(0.0, limit, 20_001)
+        along = 2.0 * l / np.pi / (1.0 + (l * w) ** 2)
+        across = l / np.pi * (1.0 + 3.0 * (l * w) ** 2) / (1.0 + (l * w) ** 2) ** 2
+        assert np.mean(found < limit) == pytest.approx(np.trapezoid(across if axis else along, w), abs=1.1 / 64)
+
+
+def test_dryden_blows_along_its_mean(key):
+    mean = jnp.array([3.0, 4.0, 0.0])
+    wind = over(Dryden.of(mean, key=key), random.uniform(key, (40_000,), maxval=1e6)).wind
+    gusts = (wind - mean[None]) @ axes_along(mean).T
+    level = 0.5 / (0.177 + 0.00823) ** 0.4
+    np.testing.assert_allclose(jnp.std(gusts, axis=0), [level, level, 0.5], rtol=0.02)
+    np.testing.assert_allclose(jnp.mean(wind, axis=0), mean, atol=0.03)
+
+
+@pytest.mark.parametrize(
+    ("mean", "altitude"), [((0, 0, 0), 10.0), ((0, 0, 5), 10.0), ((3, 0, 1), 10.0), ((3, 0, 0), 9.0 * FEET)]
+)
+def test_dryden_refuses(mean, altitude, key):
+    with pytest.raises(ValueError, match=r"Dryden: mean = .* must be horizontal and not zero"):
+        Dryden.of(jnp.array(mean, dtype=float), key=key, altitude=altitude)
+
+
+def fan(key, **changed):
+    given = {"speed": 6.0, "width": 0.3, "intensity": 0.0, **changed}
+    return Fan.of(jnp.array([1.0, 2.0, 1.0]), jnp.array(given.pop("direction", (2.0, 0.0, 0.0))), key=key, **given)
+
+
+def jet(fan, along, off=0.0):
+    """Wind along the jet at points relative to the outlet."""
+    p = jnp.stack(jnp.broadcast_arrays(*(jnp.asarray(n, dtype=float) for n in (along, off, 0.0))), axis=-1)
+    place = lambda p: fan(jnp.array(0.0), State.at(fan.outlet + p)).wind  # noqa: E731
+    return jax.jit(jnp.vectorize(place, signature="(k)->(k)"))(p)
+
+
+def test_jet_decays_and_ends_behind_the_fan(key):
+    along = np.array([0.5, 1.0, 2.0, 4.0])
+    wind = jet(fan(key), along)
+    np.testing.assert_allclose(wind[:, 0], 6.0 * 0.3 / (0.3 + 0.1 * along), rtol=1e-3)
+    np.testing.assert_array_equal(wind[:, 1:], 0.0)
+    np.testing.assert_allclose(jet(fan(key), [-0.9, -3.0]), 0.0, atol=1e-3)
+    assert float(jet(fan(key), 1.0, 2.0)[0]) < 1e-3
+
+
+def test_speed_at_the_outlet(key):
+    assert float(jet(fan(key), 0.0)[0]) == pytest.approx(6.0, rel=0.05)
+
+
+def test_jet_keeps_its_momentum(key):
+    off = np.linspace(0.0, 5.0, 2001)
+    flux = [np.trapezoid(jet(fan(key), along, off)[:, 0] ** 2 * off, off) for along in (1.0, 2.0, 4.0)]
+    np.testing.assert_allclose(flux, flux[0], rtol=1e-3)
+
+
+def test_jet_is_as_turbulent_as_stated(key):
+    wind = over(fan(key, intensity=0.2), random.uniform(key, (40_000,), maxval=1e6), at(3.0, 2.0, 1.0)).wind
+    local = 6.0 * 0.3 / 0.5
+    np.testing.assert_allclose(jnp.mean(wind, axis=0), [local, 0.0, 0.0], atol=0.02 * local)
+    np.testing.assert_allclose(jnp.std(wind, axis=0), 0.2 * local, rtol=0.05)
+
+
+@pytest.mark.parametrize("bad", [{"speed": 0.0}, {"width": -1.0}, {"intensity": 1.0}, {"direction": (0.0, 0.0, 1.0)}])
+def test_impossible_fans(bad, key):
+    with pytest.raises(ValueError, match=r"Fan: .* cannot be"):
+        fan(key, **bad)
+
+
+@jax.jit
+def acceleration(model, around):
+    """Of a hovering vehicle, when the inflow has settled."""
+    x, zero = at(0.0, 0.0, 1.0), jnp.zeros(3)
+    motors = jnp.sqrt(model.vehicle.mass * 9.81 / (4.0 * model.loop.thrust_map)) * jnp.ones(4)
+    body = RotorState(x, zero, motors, zero, zero)
+    inflow = jax.tree.map(lambda leaf: jnp.full(4, leaf), Inflow.above(motors.dtype))
+    inflow = lax.fori_loop(0, 8, lambda _, inflow: model.rotors(body, motors, inflow, around.wind)[1], inflow)
+    blades, _ = model.rotors(body, motors, inflow, around.wind)
+    return model.loads(body, motors, blades, around).force / model.vehicle.mass
+
+
+def test_wind_pushes_through_the_aerodynamics():
+    """Downwind, with 0.3 to 1 m/s^2 for every m/s; the model learns of it in no other way."""
+    around = SteadyWind(jnp.array([2.0, -1.0, 0.0]))(jnp.array(0.0), at(0.0, 0.0, 1.0))
+    np.testing.assert_array_equal(around.push, 0.0)
+    rate = np.asarray(acceleration(Bem.of(small(), 0.02), around)[:2]) / np.array([2.0, -1.0])
+    assert (rate > 0.3).all()
+    assert (rate < 1.0).all()
+
+
+# ---- trouble
+
+
+def test_payload_is_picked_up_and_dropped():
+    mass = over(Payload.of(0.07, picked=8.0, dropped=20.0), [0.0, 7.99, 8.0, 19.99, 20.0]).mass
+    np.testing.assert_allclose(mass, [0.0, 0.0, 0.07, 0.07, 0.0])
+    assert float(over(Payload.of(0.07), [1e6]).mass[0]) == pytest.approx(0.07)  # never dropped
+    for mass, picked, dropped in ((0.0, 0.0, 1.0), (0.1, 2.0, 2.0), (0.1, 3.0, 1.0)):
+        with pytest.raises(ValueError, match="Payload: mass = "):
+            Payload.of(mass, picked=picked, dropped=dropped)
+
+
+def test_battery_sags_to_a_floor():
+    gain = over(BatterySag(jnp.array(0.01), jnp.array(0.8)), [0.0, 10.0, 20.0, 1e4]).gain
+    np.testing.assert_allclose(gain, np.tile([[1.0], [0.9], [0.8], [0.8]], 4))
+    for rate, floor in ((-0.1, 0.8), (0.1, 0.0), (0.1, 1.1)):
+        with pytest.raises(ValueError, match="BatterySag: rate = "):
+            BatterySag(jnp.array(rate), jnp.array(floor))
+
+
+@pytest.mark.parametrize(("rotor", "share"), [(4, 0.9), (-1, 0.9), (0, 0.0), (0, 1.1)])
+def test_impossible_rotors(rotor, share):
+    with pytest.raises(ValueError, match="WeakRotor: rotor = "):
+        WeakRotor.of(rotor, share)
