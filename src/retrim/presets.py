@@ -140,7 +140,7 @@ VISION = Preset(
     task="vision",
     reward="sharp",
     delay=1,
-    lag=0.033,
+    pixel_noise=0.5,
     whitened=True,
     represent=3000,
     pretrain=Pretrain(epochs=300, envs=16, rate=3e-3, b2=0.95, clip=1.0, hidden=(256, 256), heading=TILT),
@@ -167,7 +167,7 @@ PRESETS: dict[str, Preset] = {
     # Seven points on the ground, five frames, three commands, no state; every point fed, as in the paper.
     "vision": VISION,
     # The same, but what the camera does not see is not observed; pixels are noisy and some are missed.
-    "vision-honest": dataclasses.replace(VISION, name="vision-honest", honest=True, pixel_noise=1.0, dropout=0.05),
+    "vision-honest": dataclasses.replace(VISION, name="vision-honest", honest=True, pixel_noise=1.0),
     # The paper's sizes: raw pixels, 500 x 300, updates of 50 epochs x 30 environments.
     "vision-paper": Preset(
         name="vision-paper",

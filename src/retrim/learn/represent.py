@@ -34,7 +34,7 @@ def represent(
     def sample(key: Key[Array, ""]) -> tuple[Float[Array, " o"], Float[Array, "15"]]:
         x, omega = random_motion(key, observation.goal)
         frames = observation.history(x, omega)
-        features = observation.whiten @ (observation.stacked(frames) - observation.mean)
+        features = observation.features(frames)
         _, visible = observation.pixels(x)
         still = jnp.zeros(observation.size - features.shape[0] - 7, dtype=x.p.dtype)
         state = jnp.concatenate([(x.p - observation.goal) / POSITION_SCALE, x.R.reshape(9), x.v / VELOCITY_SCALE])
@@ -62,4 +62,5 @@ def represent(
 def _glorot(layer: eqx.nn.Linear, key: Key[Array, ""]) -> eqx.nn.Linear:
     fan_out, fan_in = layer.weight.shape
     weight = (2.0 / (fan_in + fan_out)) ** 0.5 * random.normal(key, (fan_out, fan_in), layer.weight.dtype)
-    return eqx.tree_at(lambda l: (l.weight, l.bias), layer, (weight, jnp.zeros_like(layer.bias)))
+    fresh: eqx.nn.Linear = eqx.tree_at(lambda l: (l.weight, l.bias), layer, (weight, jnp.zeros(fan_out, weight.dtype)))
+    return fresh

@@ -11,14 +11,16 @@ from jaxtyping import Array, Bool, Float, Key
 from ..physics import so3
 from ..physics.state import STANDARD_GRAVITY, Command, State
 from .camera import Camera, in_camera
-from .homography import PATTERN, completed, pattern_homography, rotated
 from .observation import AbstractObservation
+from .sight import DT, Sight
 
+PATTERN = ((0.5, 0.5), (0.5, -0.5), (-0.5, -0.5), (-0.5, 0.5), (-0.5, 0.0), (0.0, 0.5), (0.5, 0.0))
+"""The points, relative to the one below the goal [m]: a square's corners and three mid-points of its sides."""
 BELOW = 1.0  # [m], from the goal to the ground
 FRAMES, STRIDE, COMMANDS = 5, 3, 3  # frames 60 ms apart, as published
 DEPTH = (FRAMES - 1) * STRIDE + 1
 FAR = 2.5  # pixels (normalised) farther than this from where they are at the goal are cut off there
-DT = 0.02  # [s] between frames that are kept
+STRANGE = 5.0  # standard deviations beyond which a whitened feature says no more
 
 
 class Seeing(NamedTuple):
@@ -27,8 +29,8 @@ class Seeing(NamedTuple):
     frames: Float[Array, "depth 14"]
     """Newest last."""
     commands: Float[Array, "3 4"]
-    H: Float[Array, "3 3"]
-    """From the ground below the goal to camera directions; see :mod:`retrim.tasks.homography`."""
+    sight: Sight
+    """Where the camera thinks that it is, to complete the points that it does not see."""
     key: Key[Array, ""]
 
 
@@ -36,8 +38,8 @@ class Keypoints(AbstractObservation[Seeing]):
     """o = [whitened pixels of five frames, which points are visible now, the last three commands]: 89 numbers.
 
     With ``honest`` false every point is fed, wherever it is, as in the paper's code. Else a point that the camera does
-    not see is not observed: where it would be follows from those that are, since all lie on the ground, and from
-    the rotation that was commanded since.
+    not see is not observed: where it would be follows from those that are, and from the commands; see
+    :class:`retrim.tasks.sight.Sight`.
 
     ``noise`` is that of a pixel, in pixels; drawn from the start and the tick, so that roll-outs repeat.
     """
@@ -77,7 +79,8 @@ class Keypoints(AbstractObservation[Seeing]):
         # symmetric: unique, so that a policy means the same on every machine; the floor is one pixel's variance
         lam, V = jnp.linalg.eigh(centred.T @ centred / frames.shape[0])
         scale = (jnp.maximum(lam, 0.0) + 1e-5) ** -0.5
-        return eqx.tree_at(lambda o: (o.mean, o.whiten), plain, (mean, (V * scale[None]) @ V.T))
+        whitened_: Keypoints = eqx.tree_at(lambda o: (o.mean, o.whiten), plain, (mean, (V * scale[None]) @ V.T))
+        return whitened_
 
     @property
     def size(self) -> int:
@@ -89,7 +92,8 @@ class Keypoints(AbstractObservation[Seeing]):
         frames = self.history(x, jnp.zeros_like(x.p))
         bits = lax.bitcast_convert_type(jnp.sum(x.p + x.v).astype(jnp.float32), jnp.int32)
         commands = jnp.zeros((COMMANDS, 4), dtype=x.p.dtype)
-        return Seeing(frames, commands, pattern_homography(x, self.goal, BELOW), random.key(bits))
+        key, k_sight = random.split(random.key(bits))
+        return Seeing(frames, commands, Sight.near(x, k_sight), key)
 
     def history(self, x: State, omega: Float[Array, "3"]) -> Float[Array, "depth 14"]:
         """Frames of a motion with constant velocity and body rates that ends in ``x``, oldest first."""
@@ -103,6 +107,10 @@ class Keypoints(AbstractObservation[Seeing]):
     def stacked(self, frames: Float[Array, "depth 14"]) -> Float[Array, "70"]:
         """The five frames that are shown, newest first."""
         return frames[::-STRIDE].reshape(-1)
+
+    def features(self, frames: Float[Array, "depth 14"]) -> Float[Array, "70"]:
+        """Whitened; frames that fit no motion, as when points come into sight, are cut off."""
+        return jnp.clip(self.whiten @ (self.stacked(frames) - self.mean), -STRANGE, STRANGE)
 
     def pixels(self, x: State) -> tuple[Float[Array, "7 2"], Bool[Array, " 7"]]:
         """Where the points appear, cut off far outside the image, and which are visible."""
@@ -122,20 +130,22 @@ class Keypoints(AbstractObservation[Seeing]):
         true, visible = self.pixels(x)
         noise = 2.0 * self.noise / self.camera.size * random.normal(k_noise, (7, 2), true.dtype)
         shown = true + lax.stop_gradient(noise)
-        H = memory.H
+        sight = memory.sight
         if self.honest:
             visible = visible & (random.uniform(k_drop, (7,), true.dtype) >= self.dropout)
-            H, filled = completed(self.camera, rotated(H, last.omega * DT), lax.stop_gradient(shown), visible)
-            filled = jnp.clip(filled, -FAR, FAR)
+            sharpness = 2.0 * jnp.maximum(self.noise, 0.5) / self.camera.size
+            sight = lax.stop_gradient(memory.sight).predicted(lax.stop_gradient(last))
+            sight = sight.corrected(self.camera, self.ground(), lax.stop_gradient(shown), visible, sharpness)
+            sight = lax.stop_gradient(sight)
+            filled, _ = self.pixels(sight.x)
             # the value of what is known, the gradient of what is: the completion follows the true point
             shown = jnp.where(visible[:, None], shown, true + lax.stop_gradient(filled - true))
-            H = lax.stop_gradient(H)
         scaled = jnp.concatenate([(last.c / STANDARD_GRAVITY - 1.0)[None], last.omega / self.omega_max])
         frames = jnp.concatenate([memory.frames, shown.reshape(1, 14)])[1:]
         commands = jnp.concatenate([memory.commands, scaled[None]])[1:]
-        features = self.whiten @ (self.stacked(frames) - self.mean)
+        features = self.features(frames)
         o = jnp.concatenate([features, visible.astype(true.dtype), commands.reshape(-1)])
-        return o, Seeing(frames, commands, H, key)
+        return o, Seeing(frames, commands, sight, key)
 
 
 def random_motion(key: Key[Array, ""], goal: Float[Array, "3"]) -> tuple[State, Float[Array, "3"]]:
