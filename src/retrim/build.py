@@ -1,5 +1,6 @@
 """From a preset's numbers to objects: task, models, learners, starts."""
 
+import dataclasses
 import functools
 import math
 from pathlib import Path
@@ -52,16 +53,25 @@ def task(preset: Preset, flown: Reference | None = None) -> AbstractTask:
 
 @functools.cache
 def keypoints(preset: Preset) -> Keypoints:
-    """What a vision policy sees; its whitening is computed once."""
+    """What a vision policy sees in training, where every point is fed; its whitening is computed once."""
     with jax.ensure_compile_time_eval():
         return Keypoints.of(
             jnp.array(preset.goal),
             vehicle(preset).omega_max,
-            honest=preset.honest,
+            honest=False,
             noise=preset.pixel_noise,
-            dropout=preset.dropout,
             whitened=preset.whitened,
         )
+
+
+def seen_in_flight(preset: Preset, flown: Reference | None = None) -> AbstractObservation[Any]:
+    """What the policy sees in flight: what it saw in training, unless visibility is honest.
+
+    Points that a camera does not see are completed by a pose filter so well that training need not know of it.
+    """
+    if preset.task == "vision" and preset.honest:
+        return dataclasses.replace(keypoints(preset), honest=True, dropout=jnp.array(preset.dropout))
+    return task(preset, flown).observation
 
 
 def _track(preset: Preset, state: StateObs, followed: Reference) -> AbstractTask:

@@ -96,11 +96,11 @@ class Preset:
     spread: float = Field(default=1.0, gt=0, allow_inf_nan=False)
     """Tracking starts lie within this of the reference, per axis [m]."""
     honest: bool = False
-    """Vision: a point that the camera does not see is not observed; else every point is fed, as in the paper."""
+    """Vision, in flight: what the camera does not see is not observed; else every point is fed, as in the paper."""
     pixel_noise: float = Field(default=0.0, ge=0, allow_inf_nan=False)
     """Vision, in training and flight [px]."""
     dropout: float = Field(default=0.0, ge=0, lt=1)
-    """Vision: probability that a visible point is missed in a frame, in training and flight."""
+    """Vision, in honest flight: probability that a visible point is missed in a frame."""
     whitened: bool = False
     """Vision: pixels whitened over random short motions; else as they are."""
     represent: NonNegativeInt = 0
@@ -126,12 +126,13 @@ class Preset:
 TRACK = Preset(
     name="track",
     task="track",
+    reference="circle+figure8+star",
     observation="preview",
     reward="sharp",
     history=2,
     delay=1,
     lag=0.033,
-    pretrain=Pretrain(epochs=300, envs=32, horizon=100, rate=3e-3, clip=1.0),
+    pretrain=Pretrain(epochs=600, envs=32, horizon=100, rate=3e-3, clip=1.0),
     adapt=Adapt(window=250, clip=1.0),
 )
 
@@ -167,7 +168,7 @@ PRESETS: dict[str, Preset] = {
     # Seven points on the ground, five frames, three commands, no state; every point fed, as in the paper.
     "vision": VISION,
     # The same, but what the camera does not see is not observed; pixels are noisy and some are missed.
-    "vision-honest": dataclasses.replace(VISION, name="vision-honest", honest=True, pixel_noise=1.0),
+    "vision-honest": dataclasses.replace(VISION, name="vision-honest", honest=True, pixel_noise=1.0, dropout=0.05),
     # The paper's sizes: raw pixels, 500 x 300, updates of 50 epochs x 30 environments.
     "vision-paper": Preset(
         name="vision-paper",

@@ -16,6 +16,7 @@ from jaxtyping import Array, Key
 from ..control.controller import PolicyController
 from ..learn.residual import Window
 from ..physics.state import Command
+from ..tasks.observation import AbstractObservation
 from .adapter import Adapter, AdaptState
 from .buffer import RollingBuffer
 from .plant import ControllerPilot, Sample
@@ -80,7 +81,10 @@ class _Learner:
 
 
 class AdaptivePilot:
-    """A pilot that learns as it flies. ``state`` is what has been learnt and admitted so far."""
+    """A pilot that learns as it flies. ``state`` is what has been learnt and admitted so far.
+
+    ``observation``: what the policy sees in flight, if that is not what it sees in training.
+    """
 
     def __init__(
         self,
@@ -91,13 +95,15 @@ class AdaptivePilot:
         *,
         dt: float,
         window: int,
+        observation: AbstractObservation[Any] | None = None,
         sinks: Sequence[Sink] = (),
     ) -> None:
+        self._seen = adapter.task.observation if observation is None else observation
         self._adapter, self._key, self._sinks = adapter, key, tuple(sinks)
         self._buffer = RollingBuffer(window)
         self._refiner = _Learner(schedule.refine_every, schedule.refine_charge, dt)
         self._improver = _Learner(schedule.improve_every, schedule.improve_charge, dt)
-        self._pilot = ControllerPilot(PolicyController(adapter.task.observation, state.policy.policy.plain()))
+        self._pilot = ControllerPilot(PolicyController(self._seen, state.policy.policy.plain()))
         self._tick = 0
         self._now = 0.0
         self.state = state
@@ -149,7 +155,7 @@ class AdaptivePilot:
         def publish() -> None:
             if verdict.admitted:
                 self.state = AdaptState(trained, self.state.residual)
-                self._pilot.controller = PolicyController(self._adapter.task.observation, trained.policy.plain())
+                self._pilot.controller = PolicyController(self._seen, trained.policy.plain())
             self._tell("policy" if verdict.admitted else "rejected", verdict.reason())
 
         return publish

@@ -101,6 +101,7 @@ class Campaign:
         self.preset, self.policy = preset, policy
         self._ticks, self._seed, self._workers = round(seconds / presets.DT), seed, 1 if measured else _cores()
         self._adapter = build.adapter(preset, flown)
+        self._seen = build.seen_in_flight(preset, flown)
         self._schedule = build.schedule(preset, measured=measured)
         self.setting = setting
         self._starts = build.flight_starts(preset, starts, seed, flown)
@@ -168,6 +169,7 @@ class Campaign:
             k_learn,
             dt=presets.DT,
             window=self.preset.adapt.window,
+            observation=self._seen,
         )
 
     def _plant(self, disturbance: str, start: int) -> Plant:
@@ -176,7 +178,7 @@ class Campaign:
 
     def _fly(self, plan: Plan, ticker: "_Ticker") -> Flight:
         adaptive = None if plan.method == "base" else self._pilot(plan.start, plan.method)
-        pilot: Pilot = adaptive or ControllerPilot(PolicyController(self._adapter.task.observation, self.policy))
+        pilot: Pilot = adaptive or ControllerPilot(PolicyController(self._seen, self.policy))
         plant = self._plant(plan.disturbance, plan.start)
         log = fly(plant, pilot, self._starts[plan.start], ticks=self._ticks, alive=self._alive, sinks=(ticker,))
         error, cross = _errors(self._adapter.task, log.t, State(*map(jnp.asarray, (log.p, log.R, log.v))))

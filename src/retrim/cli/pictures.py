@@ -25,6 +25,8 @@ def picture(
     setting: Setting,
     folder: Path,
     flown: Reference | None = None,
+    *,
+    stem: str | None = None,
 ) -> list[Path]:
     """``hover_<disturbance>.png`` and ``.svg`` of the flights under one disturbance; returns their paths."""
     base, adapted = (
@@ -36,7 +38,7 @@ def picture(
     title = f"{preset.task.capitalize()}: {where}, disturbance {disturbance!r}, preset {preset.name!r}"
     lap = None if flown is None else np.asarray(flown.rows)[:, :3]
     figure = plots.flight_figure(title, base, adapted, spans(disturbance, preset.goal, seconds), preset.goal, lap)
-    return plots.save(figure, folder, f"{preset.task}_{disturbance.replace('+', '_')}")
+    return plots.save(figure, folder, stem or f"{preset.task}_{disturbance.replace('+', '_')}")
 
 
 def spans(disturbance: str, goal: tuple[float, float, float], seconds: float) -> list[plots.Span]:

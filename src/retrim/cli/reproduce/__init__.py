@@ -5,10 +5,18 @@ from collections.abc import Callable
 from .hover import hover
 from .model import model
 from .plants import plants
+from .tracking import tracking
+from .vision import vision
 
-TABLES: dict[str, Callable[..., int]] = {"hover": hover, "plants": plants, "model": model}
+TABLES: dict[str, Callable[..., int]] = {
+    "hover": hover,
+    "tracking": tracking,
+    "vision": vision,
+    "plants": plants,
+    "model": model,
+}
 
 
 def reproduce() -> int:
-    """Tables and figures, each a command of its own: hover, plants, model."""
+    """Tables and figures, each a command of its own: hover, tracking, vision, plants, model."""
     raise AssertionError("reproduce has commands of its own")
