@@ -32,7 +32,8 @@ from ..physics.state import Command, State
 from ..physics.vehicle import small
 from ..presets import Preset
 from ..testbed import Setting, disturbance
-from .training import nominal_error
+from .session import Stopwatch
+from .training import nominal_error, train
 
 
 @dataclass(frozen=True)
@@ -92,6 +93,14 @@ def _pretrain(preset: Preset, runs: int) -> dict[str, Any]:
     return row
 
 
+def _see_and_pretrain() -> dict[str, Any]:
+    """Representation, then policy, of the preset vision."""
+    preset, watch = presets.load("vision"), Stopwatch()
+    policy, _, _ = train(preset, 0)
+    row = {"compile_s": watch.compile_s, "run_s": watch.total_s - watch.compile_s}
+    return row | {"remarks": f"hover error {1000 * nominal_error(preset, policy):.1f} mm"}
+
+
 def _learner() -> tuple[Adapter, AdaptState, Window]:
     """Adapter, its state with a residual that is not zero, and a full window of flight under the large disturbance."""
     preset = presets.load("paper")
@@ -125,7 +134,6 @@ def _residual() -> dict[str, Any]:
 def _programs() -> dict[str, Any]:
     """Trace and compile, or load, everything a flight needs: policy, plant, residual fit, policy update."""
     from .flights import Campaign
-    from .session import Stopwatch
 
     watch = Stopwatch()
     preset = presets.load("fast")
@@ -225,6 +233,13 @@ WORKS: dict[str, Work] = {
         "pretrain 300 x 100 x 150", "40 s", lambda: _pretrain(presets.load("paper"), 1), "15 s", "50.6 s (5.1 s)"
     ),
     "pretrain-fast": Work("pretrain 150 x 16 x 150, to 5 mm", "6 s", lambda: _pretrain(presets.load("fast"), 3)),
+    "pretrain-track-paper": Work(
+        "pretrain tracking 300 x 100 x 150", "45 s", lambda: _pretrain(presets.load("track-paper"), 1)
+    ),
+    "pretrain-track": Work(
+        "pretrain tracking 600 x 32 x 100, three references", "-", lambda: _pretrain(presets.load("track"), 1)
+    ),
+    "pretrain-vision": Work("learn to see, and pretrain 300 x 16 x 150", "30 s, to 0.02 m", _see_and_pretrain),
     "burst": Work("policy update 30 x 10 x 150, with residual", "0.8 s", _burst, "1.5 s", "2.5 s (6.1 s, each call)"),
     "residual": Work("residual, 3 nets x 100 iterations x 100 samples", "0.1 s", _residual, "2 s", "0.53 s (1.1 s)"),
     "programs-cold": Work("all programs of a flight, empty cache", "compile 60 s", _programs, cached=True),

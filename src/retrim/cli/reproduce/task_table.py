@@ -79,8 +79,8 @@ def _flown(
 def _lines(block: Block, part: list[dict[str, Any]], own: float) -> list[str]:
     by = {(row["method"], row["disturbance"]): row for row in part}
     crashed, n = sum(row["crashes"] for row in part), sum(row["n"] for row in part)
-    lines = [f"## {block.title}", "", f"Preset `{block.preset.name}`; {1000 * own:.0f} mm in its own model. {crashed} of "
-             f"{n} flights crashed.", "", "| | none | small | large |", "|---|---|---|---|"]  # fmt: skip
+    about = f"Preset `{block.preset.name}`; {1000 * own:.0f} mm in its own model. {crashed} of {n} flights crashed."
+    lines = [f"## {block.title}", "", about, "", "| | none | small | large |", "|---|---|---|---|"]
     for method in block.methods:
         ours = [by.get((method, level)) for level in LEVELS]
         cells = " | ".join("-" if row is None else cell(row) for row in ours)

@@ -32,9 +32,9 @@ ABOUT = (
     "",
     "Made by `retrim reproduce tracking`. Mean distance from where the reference is at the time [m], over the last",
     "10 s; mean ± standard deviation over starts. Cross-track: distance from the nearest point of the lap. Small",
-    "quadrotor. Preset `track`: one policy, trained on all three references, sees them ahead. `track-paper`: o = [p, R, v]",
-    "and the paper's reward, a policy for each reference. The paper's rows are from its own plant; its circle and ours",
-    "take 3 s.",
+    "quadrotor. Preset `track`: one policy, trained on all three references, sees them ahead. `track-paper`: it has",
+    "o = [p, R, v] and the paper's reward, a policy for each reference. The paper's rows are from its own plant; its",
+    "circle and ours take 3 s.",
 )
 
 
