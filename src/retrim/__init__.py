@@ -26,9 +26,12 @@ from .adapt import Schedule as Schedule
 from .adapt import SimPlant as SimPlant
 from .adapt import fly as fly
 from .checkpoint import PolicyError as PolicyError
+from .checkpoint import load_delta as load_delta
 from .checkpoint import load_policy as load_policy
+from .checkpoint import save_delta as save_delta
 from .checkpoint import save_policy as save_policy
 from .control import AbstractController as AbstractController
+from .control import LoraPolicy as LoraPolicy
 from .control import Policy as Policy
 from .control import PolicyController as PolicyController
 from .learn import EnsembleResidual as EnsembleResidual
@@ -43,10 +46,12 @@ from .learn import pretrain as pretrain
 from .learn import residual_targets as residual_targets
 from .learn import rollout as rollout
 from .physics import AbstractDynamics as AbstractDynamics
+from .physics import Bem as Bem
 from .physics import Command as Command
 from .physics import Constant as Constant
 from .physics import Hybrid as Hybrid
 from .physics import PointMass as PointMass
+from .physics import Push as Push
 from .physics import Reversing as Reversing
 from .physics import Rotors as Rotors
 from .physics import State as State
@@ -58,4 +63,6 @@ from .presets import PresetError as PresetError
 from .tasks import AbstractObservation as AbstractObservation
 from .tasks import AbstractTask as AbstractTask
 from .tasks import Hover as Hover
+from .tasks import Reference as Reference
 from .tasks import StateObs as StateObs
+from .tasks import from_csv as from_csv

@@ -1,12 +1,16 @@
 """Policies as files: weights, the preset that says how to fly them, and a checksum."""
 
+import hashlib
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 from jax import random
 
 from . import build, presets
 from .adapt import wire
+from .control.lora import LoraPolicy
 from .control.policy import Policy
 from .presets import Preset
 
@@ -50,6 +54,50 @@ def load_policy(path: str | Path) -> tuple[Policy, Preset]:
         return wire.unpack(data, like, kind="policy", source=str(file)), preset
     except (wire.WireError, presets.PresetError, OSError) as error:
         raise PolicyError(str(error)) from error
+
+
+def fingerprint(policy: Policy) -> str:
+    """Of a policy's weights, in single precision: a delta belongs to one base."""
+    digest = hashlib.sha256()
+    for layer in policy.layers:
+        for leaf in (layer.weight, layer.bias):
+            digest.update(np.asarray(leaf, dtype=np.float32, order="C").tobytes())
+    return digest.hexdigest()
+
+
+def save_delta(path: str | Path, policy: LoraPolicy) -> None:
+    """Write what a low-rank policy has learnt, without its base: about 50 kB for the paper's network."""
+    path = Path(path)
+    ranks = "-".join(str(thin.down.shape[0]) for thin in policy.delta)
+    about = {"base": fingerprint(policy.base), "ranks": ranks, "scale": repr(float(policy.scale))}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(path.name + ".partial")
+    partial.write_bytes(wire.pack(policy.delta, kind="delta", about=about))
+    partial.replace(path)
+
+
+def load_delta(path: str | Path, base: Policy) -> LoraPolicy:
+    """Read a delta and put it on ``base``; ``.plain()`` flies.
+
+    Raises :class:`PolicyError` for a file that is missing, damaged or of another kind, and for another base.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise PolicyError(f"{path}: no such file; `retrim fly --adapt lora --out DIR` makes a delta.safetensors")
+    try:
+        if (size := path.stat().st_size) > wire.MAX_BYTES:
+            raise PolicyError(f"{path}: {size} bytes, more than the {wire.MAX_BYTES} that are accepted")
+        data = path.read_bytes()
+        header = wire.describe(data, kind="delta", source=str(path))
+        if header.get("base") != fingerprint(base):
+            raise PolicyError(f"{path}: made for another base policy, {header.get('base', 'unnamed')[:12]}..., not for "
+                              f"{fingerprint(base)[:12]}...")  # fmt: skip
+        ranks, scale = tuple(map(int, header["ranks"].split("-"))), float(header["scale"])
+        like = jax.eval_shape(lambda: LoraPolicy.of(base, key=random.key(0), ranks=ranks, scale=scale))
+        delta = wire.unpack(data, like.delta, kind="delta", source=str(path))
+        return LoraPolicy(base, delta, jnp.asarray(scale, dtype=base.layers[0].weight.dtype))
+    except (wire.WireError, OSError, KeyError, ValueError) as error:
+        raise error if isinstance(error, PolicyError) else PolicyError(f"{path}: {error}") from error
 
 
 def _architecture(policy: Policy) -> str:

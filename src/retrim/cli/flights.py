@@ -22,6 +22,7 @@ from ..adapt.buffer import RollingBuffer
 from ..adapt.lockstep import AdaptivePilot, Event
 from ..adapt.plant import ControllerPilot, Log, Pilot, Plant, Sample, fly
 from ..control.controller import PolicyController
+from ..control.lora import LoraPolicy
 from ..control.policy import Policy
 from ..physics.state import State
 from ..presets import Preset
@@ -60,6 +61,8 @@ class Flight:
     """The task's error at each tick [m]."""
     events: tuple[Event, ...]
     task: str = "hover"
+    learnt: Policy | LoraPolicy | None = None
+    """The policy at the end of a flight that adapted."""
     cross: np.ndarray | None = None
     """Tracking: distance from the nearest point of the lap at each tick [m]."""
 
@@ -184,7 +187,15 @@ class Campaign:
         error, cross = _errors(self._adapter.task, log.t, State(*map(jnp.asarray, (log.p, log.R, log.v))))
         events = tuple(adaptive.events) if adaptive else ()
         off_lap = None if cross is None else np.asarray(cross)
-        return Flight(plan, log, np.asarray(error), events, self.preset.task, off_lap)
+        return Flight(
+            plan,
+            log,
+            np.asarray(error),
+            events,
+            self.preset.task,
+            adaptive.state.policy.policy if adaptive else None,
+            off_lap,
+        )
 
     def _alive(self, sample: Sample) -> bool:
         if self.stop.is_set():

@@ -7,7 +7,8 @@ from rich.table import Table
 
 from .. import build, presets, testbed
 from ..adapt.sink import JsonlSink
-from ..checkpoint import load_policy
+from ..checkpoint import load_delta, load_policy, save_delta, save_policy
+from ..control.lora import LoraPolicy
 from ..presets import Preset
 from ..tasks.reference import Reference
 from ..testbed import PlantName, SensingName, Setting, VehicleName
@@ -21,6 +22,7 @@ SECONDS = {"hover": 30.0, "vision": 30.0, "track": 60.0}  # of a flight, as in t
 
 def fly(
     policy: Path,
+    delta: Path | None = None,
     disturbance: str = "large",
     plant: PlantName = "bem",
     adapt: Literal["none", "full", "lora"] = "full",
@@ -39,6 +41,7 @@ def fly(
 
     Args:
         policy: A policy.safetensors, or the folder that holds one.
+        delta: A low-rank delta.safetensors of an earlier flight, to put on the policy.
         disturbance: What disturbs the flight: none, small, large, reversing, walk, wind, gusts, fan, payload, pickup,
             battery, weak-rotor, or several at once, as wind+payload.
         adapt: full: re-train all weights in flight; lora: a low-rank delta (ranks 4, 10, 1); none: fly as it is.
@@ -58,10 +61,12 @@ def fly(
         seconds: Length of a flight; 30 s for hover, 60 s for tracking by default.
         starts: Number of flights, each from another start.
         seed: Seed of the starts and of the learners.
-        out: Folder for results.json, events.jsonl and the picture; a new one under runs/ by default.
+        out: Folder for results.json, events.jsonl, what was learnt and the picture; a new one under runs/ by default.
     """
     watch = Stopwatch()
     weights, preset = load_policy(policy)
+    if delta is not None:
+        weights = load_delta(delta, weights).plain()
     if config is not None:
         preset = _same_policy(preset, presets.overlaid(preset, config), config)
     seconds = seconds or SECONDS[preset.task]
@@ -89,6 +94,7 @@ def fly(
         console.print("interrupted before the first flight was over; nothing was saved")
         return 130
     write_events(flights, folder)
+    save_learnt(flights, preset, folder)
     table = rows(flights, task=preset.task, setting=setting)
     write_results(folder, seeds=[seed], watch=watch, rows=table, interrupted=interrupted, preset=presets.values(preset))
     many = f"{starts} start{'s' * (starts > 1)}"
@@ -145,6 +151,15 @@ def _same_policy(trained: Preset, overlaid: Preset, config: Path) -> Preset:
     if trained.pretrain != overlaid.pretrain:
         raise presets.PresetError(f"{config}: [pretrain] cannot change for a policy that is trained")
     return overlaid
+
+
+def save_learnt(flights: list[Flight], preset: Preset, folder: Path) -> None:
+    """What the first whole flight learnt: ``adapted.safetensors``, or of a low-rank policy ``delta.safetensors``."""
+    learnt = next((f.learnt for f in flights if f.learnt is not None and not f.log.crashed), None)
+    if isinstance(learnt, LoraPolicy):
+        save_delta(folder / "delta.safetensors", learnt)
+    elif learnt is not None:
+        save_policy(folder / "adapted.safetensors", learnt, preset)
 
 
 def write_events(flights: list[Flight], folder: Path) -> None:

@@ -1,0 +1,231 @@
+"""Low-rank adaptation: nothing at first, the base never moves, exact gradients, sizes as published."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from jax import random
+
+from helpers import hover_task, tiny_preset
+from retrim import build
+from retrim.adapt.buffer import RollingBuffer
+from retrim.adapt.gate import judge
+from retrim.control import LoraPolicy, Policy
+from retrim.control.lora import Thin
+from retrim.learn import PolicyState, bptt, policy_gradient, policy_loss
+from retrim.learn.pretrain import starts
+from retrim.physics import Command, PointMass, State, small
+
+RANKS = (3, 4, 1)
+
+
+def size(tree):
+    return sum(leaf.size for leaf in jax.tree.leaves(tree))
+
+
+def moved(lora, key):
+    """With a delta that changes something."""
+    leaves, shape = jax.tree.flatten(lora.delta)
+    keys = random.split(key, len(leaves))
+    return lora.retrained(
+        shape.unflatten([l + 0.2 * random.normal(k, l.shape) for k, l in zip(keys, leaves, strict=True)])
+    )
+
+
+def same(a, b):
+    jax.tree.map(np.testing.assert_array_equal, a, b)
+
+
+@pytest.fixture
+def base(key):
+    fresh = Policy.of(15, small(), key=key, hidden=(8, 8))
+    noise = [
+        0.3 * random.normal(k, layer.weight.shape) for k, layer in zip(random.split(key, 3), fresh.layers, strict=True)
+    ]
+    return eqx.tree_at(lambda p: [l.weight for l in p.layers], fresh, noise)
+
+
+@pytest.fixture
+def lora(base, key):
+    return LoraPolicy.of(base, key=key, ranks=RANKS)
+
+
+def test_parameter_count_of_the_paper(key):
+    lora = LoraPolicy.of(Policy.of(15, small(), key=key), key=key)
+    assert [thin.down.shape[0] for thin in lora.trained] == [4, 10, 1]
+    assert size(lora.trained) == 12_864
+    assert size(lora.base.layers) == 272_900
+
+
+def test_a_fresh_delta_changes_nothing(base, lora, key):
+    same(lora.plain(), base)
+    for k in random.split(key, 3):
+        o = random.normal(k, (15,))
+        np.testing.assert_array_equal(lora.plain()(o).vector(), base(o).vector())
+    for thin in lora.delta:
+        np.testing.assert_array_equal(thin.up, 0.0)
+        bound = thin.down.shape[1] ** -0.5
+        assert 0.5 * bound < float(jnp.abs(thin.down).max()) <= bound
+
+
+def test_merged_by_hand(base, lora, key):
+    """W + scale up down in NumPy, bias as it was; and the commands of y = W x + scale B (A x) + b."""
+    trained = moved(lora, key)
+    plain = trained.plain()
+    for layer, frozen, thin in zip(plain.layers, base.layers, trained.delta, strict=True):
+        merged = np.asarray(frozen.weight) + 4.0 * np.asarray(thin.up) @ np.asarray(thin.down)
+        np.testing.assert_allclose(layer.weight, merged, rtol=1e-12, atol=1e-13)
+        np.testing.assert_array_equal(layer.bias, frozen.bias)
+        rank = np.linalg.matrix_rank(np.asarray(layer.weight - frozen.weight), tol=1e-9)
+        assert rank == thin.down.shape[0]
+    h = o = np.asarray(random.normal(key, (15,)))
+    for i, (frozen, thin) in enumerate(zip(base.layers, trained.delta, strict=True)):
+        h = frozen.weight @ h + 4.0 * thin.up @ (thin.down @ h) + frozen.bias
+        h = np.maximum(h, 0.0) if i < 2 else h
+    np.testing.assert_allclose(plain(jnp.asarray(o)).vector(), base.bounded(jnp.asarray(h)).vector(), rtol=1e-10)
+    assert float(jnp.abs(plain(jnp.asarray(o)).vector() - base(jnp.asarray(o)).vector()).max()) > 1e-3
+
+
+def test_merging_twice_and_forgetting(base, lora, key):
+    """Plain is plain; and with the fresh delta put back, it is the base again."""
+    trained = moved(lora, key)
+    same(trained.plain().plain(), trained.plain())
+    same(trained.retrained(lora.delta).plain(), base)
+
+
+def test_scale_counts(base, key):
+    one, two = (moved(LoraPolicy.of(base, key=key, ranks=RANKS, scale=s), key).plain() for s in (1.0, 2.0))
+    for frozen, a, b in zip(base.layers, one.layers, two.layers, strict=True):
+        np.testing.assert_allclose(b.weight - frozen.weight, 2.0 * (a.weight - frozen.weight), atol=1e-13)
+
+
+@pytest.mark.parametrize("touched", [False, True])
+def test_gradient_through_the_pull_is_exact(touched, lora, key):
+    """What bptt does, taps and then back through the merger, against autodiff of the loss in the delta."""
+    task, model = hover_task(horizon=5), PointMass(0.02)
+    lora = moved(lora, key) if touched else lora
+    x0 = jax.vmap(task.reset)(random.split(key, 3))
+
+    @eqx.filter_jit
+    def both(lora):
+        layers, pull = jax.vjp(lambda delta: lora.retrained(delta).plain().layers, lora.trained)
+        value, by_layers = policy_gradient(lora.plain().retrained(layers), model, task, x0, delay=1)
+        loss = lambda delta: policy_loss(lora.retrained(delta).plain(), model, task, x0, delay=1)  # noqa: E731
+        return (value, pull(by_layers)[0]), jax.value_and_grad(loss)(lora.delta)
+
+    (value, found), (expected, wanted) = both(lora)
+    assert float(value) == pytest.approx(float(expected), rel=1e-13)
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-12 * max(1.0, float(jnp.abs(b).max())))
+    assert max(float(jnp.abs(leaf).max()) for leaf in jax.tree.leaves(found)) > 1e-4
+    if not touched:  # B is zero: A has no gradient yet, B has
+        for thin in found:
+            np.testing.assert_array_equal(thin.down, 0.0)
+
+
+def test_no_gradient_reaches_the_base(lora, key):
+    lora = moved(lora, key)
+    o = random.normal(key, (15,))
+    slope = jax.jit(jax.grad(lambda p: jnp.sum(p.plain()(o).vector())))(lora)
+    for leaf in jax.tree.leaves((slope.base, slope.scale)):
+        np.testing.assert_array_equal(leaf, 0.0)
+    assert all(float(jnp.abs(thin.up).max()) > 0.0 for thin in slope.delta)
+
+
+@pytest.mark.usefixtures("optax_promotion")
+def test_training_moves_the_delta_only_and_lowers_the_loss(key):
+    task, model = hover_task(horizon=40, heading=0.3), PointMass(0.02)
+    base = Policy.of(15, small(), key=key, hidden=(32, 32))
+    lora = LoraPolicy.of(base, key=key)
+    before = jax.tree.map(np.array, base)
+    optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(1e-2))
+    train = eqx.filter_jit(lambda s, x0: bptt(s, model, task, x0, optimiser=optimiser))
+    state, losses = train(PolicyState(lora, optimiser.init(lora.trained)), starts(task, key, 40, 8))
+    assert losses.shape == (40,)
+    trained = state.policy
+    same(trained.base, before)
+    same(trained.scale, lora.scale)
+    for thin, fresh in zip(trained.delta, lora.delta, strict=True):
+        assert float(jnp.abs(thin.up - fresh.up).max()) > 1e-3
+        assert float(jnp.abs(thin.down - fresh.down).max()) > 1e-4
+    x0 = jax.vmap(task.reset)(random.split(random.key(9), 32))
+    loss = eqx.filter_jit(lambda policy: policy_loss(policy, model, task, x0))
+    assert float(loss(trained.plain())) < 0.7 * float(loss(base))
+
+
+@pytest.mark.usefixtures("optax_promotion")
+def test_a_gradient_that_is_not_finite_changes_nothing(lora, key):
+    task, optimiser = hover_task(horizon=3), optax.adam(1e-2)
+    state = PolicyState(lora, optimiser.init(lora.trained))
+    x0 = starts(task, key, 1, 2)
+    broken = eqx.tree_at(lambda s: s.x.v, x0, x0.x.v.at[0, 0, 0].set(jnp.nan))
+    after, losses = eqx.filter_jit(lambda s, x: bptt(s, PointMass(0.02), task, x, optimiser=optimiser))(state, broken)
+    assert not np.isfinite(losses).all()
+    same(after, state)
+
+
+@pytest.mark.usefixtures("optax_promotion")
+def test_the_learner_beside_the_flight_takes_it(key):
+    """Improve returns a low-rank policy with the same base; the gate's costs are those of the plain policies."""
+    preset = tiny_preset(pretrain={"horizon": 20})
+    adapter = build.adapter(preset)
+    base = build.policy(preset, random.key(0))
+    state = adapter.init(build.lora(base, random.key(1)), build.residual(preset, random.key(2)))
+    buffer = RollingBuffer(preset.adapt.window)
+    for i in range(20):
+        buffer.push(0.02 * i, State.at(jnp.array([0.3, 0.0, 1.0])), Command.hover())
+    k = random.key(3)
+    after, verdict = adapter.improve(state.policy, state.residual.residual, buffer.window(), k)
+    assert isinstance(after.policy, LoraPolicy)
+    same(after.policy.base, base)
+    assert any(float(jnp.abs(thin.up).max()) > 0.0 for thin in after.policy.delta)
+    plain = PolicyState(base, adapter.init(base, state.residual.residual).policy.optimiser)
+    _, unadapted = adapter.improve(plain, state.residual.residual, buffer.window(), k)
+    assert float(verdict.incumbent) == pytest.approx(float(unadapted.incumbent), rel=1e-12)  # the base, both times
+    assert bool(verdict.finite)
+    assert bool(verdict.admitted) == (float(verdict.candidate) <= float(verdict.incumbent))
+    # a broken delta is found in the merged weights
+    task = build.task(preset)
+    x0 = jax.vmap(task.reset)(random.split(key, 2))
+    bad = eqx.tree_at(lambda p: p.delta[0].up, after.policy, jnp.full_like(after.policy.delta[0].up, jnp.nan))
+    found = judge(bad.plain(), base, build.nominal(preset), task, x0)
+    assert found.reason() == "a weight is not finite"
+
+
+# ---- refusals
+
+
+@pytest.mark.parametrize(
+    ("ranks", "message"),
+    [
+        ((3, 4), r"2 ranks \(3, 4\) for 3 layers"),
+        ((3, 4, 1, 1), "4 ranks .* for 3 layers"),
+        ((0, 4, 1), "rank 0 for weights 8 x 15"),
+        ((3, -1, 1), "rank -1 for weights 8 x 8"),
+        ((3, 4, 5), "rank 5 for weights 4 x 8"),
+        ((9, 4, 1), "rank 9 for weights 8 x 15"),
+    ],
+)
+def test_impossible_ranks(ranks, message, base, key):
+    with pytest.raises(ValueError, match=message):
+        LoraPolicy.of(base, key=key, ranks=ranks)
+
+
+def test_the_largest_ranks_are_possible(base, key):
+    full = LoraPolicy.of(base, key=key, ranks=(8, 8, 4))
+    assert size(full.delta) == 8 * 23 + 8 * 16 + 4 * 12
+
+
+def test_a_delta_must_fit(base, lora, key):
+    with pytest.raises(ValueError, match="2 deltas for 3 layers"):
+        LoraPolicy(base, lora.delta[:2], lora.scale)
+    wider = LoraPolicy.of(Policy.of(15, small(), key=key, hidden=(9, 8)), key=key, ranks=RANKS)
+    with pytest.raises(ValueError, match=r"layer 0 has weights \(8, 15\), the delta \(9, 3\) x \(3, 15\)"):
+        LoraPolicy(base, wider.delta, lora.scale)
+    with pytest.raises(ValueError, match="layer 0"):
+        lora.retrained(wider.delta)
+    ranks_differ = Thin(jnp.zeros((2, 8)), jnp.zeros((4, 1)))
+    with pytest.raises(ValueError, match=r"layer 2 has weights \(4, 8\), the delta \(4, 1\) x \(2, 8\)"):
+        LoraPolicy(base, (*lora.delta[:2], ranks_differ), lora.scale)

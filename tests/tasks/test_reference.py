@@ -1,0 +1,469 @@
+"""References as tables: shapes as published, derivatives, flatness, laps, families, files, what cannot be flown."""
+
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import random
+
+from helpers import replaced
+from retrim.physics import Command, PointMass, State, small, with_payload
+from retrim.tasks import REFERENCES, Reference, from_csv, joined
+from retrim.tasks.reference import POINTS, circle, figure8, spun_up, star
+
+PERIODS = {"circle": 3.0, "figure8": 5.0, "star": 6.0}
+RAMP = 3.0
+BOUNDS = {  # of the lap: lowest and highest x, then y
+    "circle": ((0.0, 2.0), (-1.0, 1.0)),
+    "figure8": ((0.0, 3.0), (-0.5, 0.5)),
+    "star": ((0.0, 1.0 + math.cos(math.radians(36.0))), (-math.sin(math.radians(72.0)), math.sin(math.radians(72.0)))),
+}
+CORNERS = [1.0 + np.exp(1j * (math.pi + k * math.radians(72.0))) for k in range(5)]  # of the star, x + i y
+
+named = pytest.mark.parametrize("name", REFERENCES)
+
+
+@pytest.fixture(scope="module")
+def tables():
+    return {name: make() for name, make in REFERENCES.items()}
+
+
+_thousand = eqx.filter_jit(lambda reference, times: jax.vmap(reference)(times))
+
+
+def at(reference, times):
+    """The reference at many times, by one compiled program."""
+    times = np.asarray(times, dtype=float)
+    padded = np.append(times, np.zeros(-len(times) % 1000)).reshape(-1, 1000)
+    found = [_thousand(reference, jnp.asarray(part)) for part in padded]
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(times)], *found)
+
+
+def at_one(reference, t):
+    return jax.tree.map(lambda leaf: leaf[0], at(reference, [t]))
+
+
+def row_times(reference):
+    return float(reference.every) * np.arange(reference.rows.shape[0])
+
+
+@pytest.fixture
+def promoting():
+    """As outside the tests; see the first test that fails without it."""
+    with jax.numpy_dtype_promotion("standard"):
+        yield
+
+
+def line(t):
+    return [t, 0.0, 1.0]
+
+
+# ---- the three shapes of the paper
+
+
+@named
+def test_starts_at_rest_at_the_origin(name, tables):
+    here = at_one(tables[name], 0.0)
+    np.testing.assert_allclose(here.p, [0.0, 0.0, 1.0], atol=1e-9)
+    np.testing.assert_allclose(here.v, 0.0, atol=1e-6)
+    np.testing.assert_allclose(here.u, [9.81, 0.0, 0.0, 0.0], atol=1e-4)
+    assert here.heading == 0.0
+
+
+@named
+def test_repeats_with_its_period_and_no_other(name, tables):
+    reference, period = tables[name], PERIODS[name]
+    assert float(reference.lap[1] - reference.lap[0]) == period
+    times = RAMP + period * np.linspace(0.0, 0.99, 57)
+    first = at(reference, times)
+    for laps in (1, 2, 40):
+        later = at(reference, times + laps * period)
+        for a, b in zip(first, later, strict=True):
+            np.testing.assert_allclose(b, a, atol=1e-8)
+    for part in (0.2, 0.5):
+        assert np.abs(at(reference, times + part * period).p - first.p).max() > 0.3
+
+
+@named
+def test_extent(name, tables):
+    lap = at(tables[name], RAMP + PERIODS[name] * np.linspace(0.0, 1.0, 3000)).p
+    for axis in (0, 1):
+        low, high = BOUNDS[name][axis]
+        assert float(lap[:, axis].min()) == pytest.approx(low, abs=0.01)
+        assert float(lap[:, axis].max()) == pytest.approx(high, abs=0.01)
+    np.testing.assert_array_equal(tables[name].rows[:, 2], 1.0)
+
+
+def test_circle_is_round_and_starts_towards_minus_y(tables):
+    points = np.asarray(at(tables["circle"], np.linspace(0.0, 6.0, 500)).p)
+    np.testing.assert_allclose(np.hypot(points[:, 0] - 1.0, points[:, 1]), 1.0, atol=1e-4)
+    assert points[100, 1] < -0.01
+
+
+def test_star_has_five_corners_and_straight_edges(tables):
+    times = row_times(tables["star"])
+    lap = np.asarray(tables["star"].rows)[times >= RAMP]
+    z = lap[:, 0] + 1j * lap[:, 1]
+    for corner in CORNERS:
+        assert np.abs(z - corner).min() < 0.01
+    assert np.abs(z - 1.0).max() <= 1.0 + 1e-9
+    # an edge is on a line that passes the centre at cos 72 of the radius
+    v = lap[:, 3] + 1j * lap[:, 4]
+    straight = np.abs(np.abs(v) - 1.585) < 1e-3
+    assert straight.mean() > 0.95
+    offset = np.imag((z - 1.0) * np.conj(v))[straight] / np.abs(v[straight])
+    np.testing.assert_allclose(np.abs(offset), math.cos(math.radians(72.0)), atol=1e-6)
+
+
+def test_speeds_after_spin_up(tables):
+    for name, speed in (("circle", 2.0 * math.pi / 3.0), ("star", 1.585)):
+        v = np.asarray(tables[name].rows)[row_times(tables[name]) >= RAMP, 3:6]
+        speeds = np.linalg.norm(v, axis=1)
+        assert np.median(speeds) == pytest.approx(speed, abs=1e-3)
+        assert np.percentile(speeds, 95) - np.percentile(speeds, 5) < 2e-3
+
+
+def test_the_start_is_smooth():
+    times = np.linspace(0.0, 4.0, 4001)
+    path = np.array([spun_up(float(t)) for t in times])
+    assert (np.diff(path) >= 0.0).all()
+    rate = np.gradient(path, times)
+    assert path[0] == 0.0
+    assert rate[0] == pytest.approx(0.0, abs=1e-9)
+    np.testing.assert_allclose(rate[times > 3.0], 1.0, atol=1e-6)
+    assert np.abs(np.diff(rate)).max() < 1e-3  # no jump of velocity
+    assert path[-1] == pytest.approx(1.5 + 1.0)
+
+
+# ---- continuity and derivatives
+
+
+@named
+def test_continuous_also_across_the_lap(name, tables):
+    """No step is longer than the fastest speed allows; nor at the seam."""
+    reference, end = tables[name], RAMP + PERIODS[name]
+    fastest = float(np.linalg.norm(np.asarray(reference.rows)[:, 3:6], axis=1).max())
+    times = np.linspace(0.0, end + PERIODS[name] + 0.5, 6000)
+    steps = np.linalg.norm(np.diff(np.asarray(at(reference, times).p), axis=0), axis=1)
+    assert steps.max() < 1.01 * fastest * (times[1] - times[0]) + 1e-4
+    for seam in (end, end + PERIODS[name]):
+        before, after = at_one(reference, seam - 1e-9), at_one(reference, seam + 1e-9)
+        for a, b, near in zip(before, after, (5e-5, 2e-4, 2e-3, 0.0), strict=True):
+            np.testing.assert_allclose(b, a, atol=near)
+
+
+@named
+def test_velocity_is_the_derivative_of_position(name, tables):
+    rows, every = np.asarray(tables[name].rows), float(tables[name].every)
+    slopes = (rows[2:, :3] - rows[:-2, :3]) / (2.0 * every)
+    wrong = np.linalg.norm(slopes - rows[1:-1, 3:6], axis=1)
+    if name == "star":  # at a corner there is none
+        near = np.abs((rows[1:-1, 0] + 1j * rows[1:-1, 1])[:, None] - np.array(CORNERS)[None]).min(axis=1) < 0.03
+        assert near.mean() < 0.15
+        wrong = wrong[~near]
+    assert wrong.max() < 1e-3
+    assert np.linalg.norm(rows[:, 3:6], axis=1).max() > 1.0  # the bound says something
+
+
+def test_interpolates_linearly_between_rows(tables):
+    reference = tables["circle"]
+    t = (100.0 + 0.25) * float(reference.every)
+    mixed = 0.75 * reference.rows[100] + 0.25 * reference.rows[101]
+    here = at_one(reference, t)
+    np.testing.assert_allclose(jnp.concatenate([here.p, here.v, here.u, here.heading[None]]), mixed, atol=1e-12)
+
+
+# ---- flatness
+
+
+def attitude_of(reference, t, h=0.02):
+    """Body axes from the table's velocity alone: z along the thrust that its change needs, x towards the heading."""
+    ahead, behind = at_one(reference, t + h).v, at_one(reference, t - h).v
+    thrust = np.asarray((ahead - behind) / (2.0 * h)) + [0.0, 0.0, 9.81]
+    z = thrust / np.linalg.norm(thrust)
+    heading = float(at_one(reference, t).heading)
+    y = np.cross(z, [math.cos(heading), math.sin(heading), 0.0])
+    y = y / np.linalg.norm(y)
+    return jnp.asarray(np.stack([np.cross(y, z), y, z], axis=1))
+
+
+def flown_open_loop(reference, t0, seconds, h=0.005):
+    """A point mass under the reference's own command, from the reference's own state; and where it should be."""
+    here = at_one(reference, t0)
+    x = State(jnp.array(here.p), attitude_of(reference, t0) if t0 > 0.0 else jnp.eye(3), jnp.array(here.v))
+    times = t0 + h * np.arange(round(seconds / h))
+    _, path = _open_loop(x, jnp.asarray(at(reference, times + 0.5 * h).u), h)
+    return np.linalg.norm(path - at(reference, times + h).p, axis=1)
+
+
+@eqx.filter_jit
+def _open_loop(x, commands, h):
+    def tick(x, u):
+        x = PointMass(h).step(x, Command.of(u), jnp.zeros(3))
+        return x, x.p
+
+    return jax.lax.scan(tick, x, commands)
+
+
+@pytest.mark.parametrize(("name", "t0"), [("circle", 4.0), ("circle", 0.0), ("figure8", 3.5), ("figure8", 4.7)])
+def test_its_command_flies_it(name, t0, tables):
+    assert flown_open_loop(tables[name], t0, 1.0).max() < 5e-3
+
+
+def test_its_command_flies_it_while_turning():
+    """A climbing circle, the nose along the motion."""
+
+    def helix(t):
+        return [math.cos(t), math.sin(t), 1.0 + 0.2 * t, t + 0.5 * math.pi]
+
+    reference = Reference.of(helix, seconds=6.0)
+    assert flown_open_loop(reference, 2.0, 1.0).max() < 5e-3
+    spin = np.asarray(at_one(reference, 3.0).u)
+    assert spin[3] == pytest.approx(1.0, abs=0.02)
+
+
+def test_thrust_of_the_circle_by_hand(tables):
+    """(2 pi / 3 s)^2 x 1 m sideways on top of gravity."""
+    c = at(tables["circle"], np.linspace(3.5, 5.5, 50)).u[:, 0]
+    np.testing.assert_allclose(c, math.hypot((2.0 * math.pi / 3.0) ** 2, 9.81), rtol=1e-3)
+
+
+def test_at_a_jump_it_hovers(tables):
+    rows = np.asarray(tables["star"].rows)
+    assert np.abs(rows[:, 6] - 9.81).max() < 0.5  # no command flies a corner, and none pretends to
+
+
+# ---- what a vehicle cannot fly
+
+
+def test_the_papers_smooth_shapes_can_be_flown(tables):
+    assert tables["circle"].worst_violation(small()) is None
+    assert tables["figure8"].worst_violation(small()) is None
+
+
+def test_names_the_jump(tables):
+    """Edges meet at 36 degrees: the velocity turns by 144, 2 x 1.585 m/s x sin 72 = 3.02 m/s."""
+    text = tables["star"].worst_violation(small())
+    assert "velocity jumps by 3.0" in text
+    when = float(text.split(" at ")[1].split(" s")[0])
+    corner = at_one(tables["star"], when).p
+    assert np.abs(complex(corner[0], corner[1]) - np.array(CORNERS)).min() < 0.03
+
+
+def test_names_the_thrust():
+    """Loaded with more than its weight, the small one has 28.6 m/s^2; a circle at 27.4 m/s^2 needs 29.1."""
+    heavy = with_payload(small(), 0.3)
+    text = circle(radius=1.0, period=1.2).worst_violation(heavy)
+    assert "needs 29.1 m/s² of thrust" in text
+    assert "the vehicle has 28.6" in text
+    assert "thrust" not in circle(radius=1.0, period=1.3).worst_violation(heavy)
+
+
+@pytest.mark.xfail(strict=True, reason="an acceleration beyond JUMP is always called a jump, also on a smooth path")
+def test_names_the_thrust_of_a_far_too_fast_circle():
+    assert "of thrust" in circle(radius=3.0, period=1.0).worst_violation(small())
+
+
+def test_names_the_axis_of_the_rate():
+    """A nose that turns at 6 rad/s on the spot; a circle that needs more roll than a lazy vehicle has."""
+    spin = Reference.of(lambda t: [0.0, 0.0, 1.0, 6.0 * t], seconds=2.0)
+    text = spin.worst_violation(small())
+    assert "it needs 6.0 rad/s about z" in text
+    assert "the limit is 4.0" in text
+    lazy = replaced(small(), omega_max=jnp.array([0.5, 6.0, 4.0]))
+    assert "rad/s about x" in circle().worst_violation(lazy)
+
+
+# ---- what is refused
+
+
+def test_a_path_must_be_finite_and_of_three_or_four_numbers():
+    with pytest.raises(ValueError, match=r"at 1\.\d+ s the path gives .*nan"):
+        Reference.of(lambda t: [math.nan if t > 1.0 else 0.0, 0.0, 1.0], seconds=2.0)
+    with pytest.raises(ValueError, match=r"the path gives \[.*inf"):
+        Reference.of(lambda t: [math.inf, 0.0, 1.0], seconds=2.0)
+    for wrong in ([0.0, 1.0], [0.0] * 5, [[0.0, 0.0, 1.0]]):
+        with pytest.raises(ValueError, match="not 3 or 4 finite numbers"):
+            Reference.of(lambda t, wrong=wrong: wrong, seconds=2.0)
+
+
+@pytest.mark.parametrize(
+    "sizes", [{"seconds": 0.0}, {"lap": 2.0}, {"lap": -0.1}, {"lap": 2.5}, {"points": 1}, {"seconds": math.nan}]
+)
+def test_impossible_sizes(sizes):
+    with pytest.raises(ValueError, match="cannot be"):
+        Reference.of(line, **({"seconds": 2.0} | sizes))
+
+
+def test_number_of_rows():
+    assert Reference.of(line, seconds=1.0).rows.shape == (POINTS, 11)
+    assert Reference.of(line, seconds=1.0, points=7).rows.shape == (7, 11)
+
+
+# ---- without a lap
+
+
+def test_the_end_is_held():
+    reference = Reference.of(lambda t: [math.sin(0.5 * math.pi * t), 0.0, 1.0], seconds=1.0)
+    end = at_one(reference, 1.0)
+    for t in (1.001, 5.0, 1e4):
+        later = at_one(reference, t)
+        for a, b in zip(end, later, strict=True):
+            np.testing.assert_array_equal(a, b)
+    np.testing.assert_allclose(end.p, [1.0, 0.0, 1.0], atol=1e-6)
+    np.testing.assert_allclose(end.v, 0.0, atol=0.01)
+
+
+# ---- files
+
+
+def written(tmp_path, text):
+    file = tmp_path / "path.csv"
+    file.write_text(text)
+    return file
+
+
+def helix_csv(tmp_path, header):
+    times = np.linspace(2.0, 8.0, 61)
+    rows = [[t, math.cos(t), math.sin(t), 0.2 * t, 0.5 * t] for t in times]
+    text = "\n".join(", ".join(f"{value:.9f}" for value in row) for row in rows)
+    return written(tmp_path, header + text + "\n\n")
+
+
+@pytest.mark.parametrize("header", ["t,x,y,z,yaw\n", "Time, x [m], y, z, yaw\n", ""])
+def test_helix_from_csv(header, tmp_path):
+    """Through its points, at their times; away from the ends, where it must come to rest, its derivative too."""
+    reference = from_csv(helix_csv(tmp_path, header))
+    for t in (0.0, 1.0, 3.0, 4.4, 6.0):
+        here, s = at_one(reference, t), t + 2.0
+        np.testing.assert_allclose(here.p, [math.cos(s), math.sin(s), 0.2 * s], atol=1e-4)
+        assert float(here.heading) == pytest.approx(0.5 * s, abs=1e-4)
+        if 0.5 < t < 5.5:
+            np.testing.assert_allclose(here.v, [-math.sin(s), math.cos(s), 0.2], atol=5e-3)
+    for t in (0.0, 6.0, 100.0):
+        here = at_one(reference, t)
+        assert float(jnp.linalg.norm(here.v)) < 0.15
+    np.testing.assert_allclose(at_one(reference, 50.0).p, at_one(reference, 6.0).p, atol=0.0)
+
+
+def test_without_yaw_it_heads_along_x(tmp_path):
+    reference = from_csv(written(tmp_path, "t,x,y,z\n0,0,0,1\n2,1,0,1\n4,1,1,2\n"))
+    np.testing.assert_array_equal(reference.rows[:, 10], 0.0)
+    np.testing.assert_allclose(at_one(reference, 2.0).p, [1.0, 0.0, 1.0], atol=1e-4)
+
+
+@pytest.mark.xfail(strict=True, reason="the command of the last instant of braking is held with the end")
+def test_at_a_held_end_it_asks_for_hover(tmp_path):
+    reference = from_csv(written(tmp_path, "0,0,0,1\n1,1,1,1\n2,2,0,1\n"))
+    np.testing.assert_allclose(at_one(reference, 10.0).u, [9.81, 0.0, 0.0, 0.0], atol=0.05)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("t,x,y,z\n0,0,0,1\n1,one,0,1\n", r"line 3: '1,one,0,1' is not t, x, y, z\[, yaw\] in numbers"),
+        ("0,0,0,1\nt,x,y,z\n", "line 2: 't,x,y,z' is not"),
+        ("0,0,0\n1,0,0\n", "line 1: '0,0,0' is not"),
+        ("0,0,0,1,0,0\n", "line 1: '0,0,0,1,0,0' is not"),
+        ("0,0,0,1\n1,0,0,1,0\n", "line 2: '1,0,0,1,0' is not"),
+        ("0,0,0,1\n\n1,0,0,1\n1,0,0,2\n", r"line 4: time 1\.0 s does not come after 1\.0 s"),
+        ("0,0,0,1\n2,0,0,1\n1,0,0,2\n", r"line 3: time 1\.0 s does not come after 2\.0 s"),
+        ("t,x,y,z\n0,0,0,1\n", "1 points; a trajectory needs at least two"),
+        ("", "0 points"),
+        ("0,0,0,1\n1,nan,0,1\n", r"line 2: '1,nan,0,1' is not .* finite"),
+        ("0,0,0,1\ninf,0,0,1\n", "line 2: .*finite"),
+        ("0,0,0,1\n1,0,,1\n", "line 2: '1,0,,1' is not"),
+    ],
+)
+def test_faults_of_a_file_are_named_with_their_line(text, message, tmp_path):
+    with pytest.raises(ValueError, match=message) as error:
+        from_csv(written(tmp_path, text))
+    assert "path.csv" in str(error.value)
+
+
+# ---- families
+
+
+@pytest.mark.xfail(strict=True, raises=TypeError, reason="seconds times an integer range, in joined() and distance()")
+@pytest.mark.parametrize("what", ["joined", "distance"])
+def test_no_silent_promotion(what, tables):
+    if what == "joined":
+        joined([tables["circle"]], seconds=6.0)
+    else:
+        tables["circle"].distance(jnp.zeros(3))
+
+
+@pytest.mark.usefixtures("promoting")
+def test_each_stretch_of_a_family_is_its_reference(tables):
+    family = joined(list(tables.values()))
+    times = 0.02 * np.arange(950)
+    for k, reference in enumerate(tables.values()):
+        found, wanted = at(family, 20.0 * k + times), at(reference, times)
+        for a, b in zip(found, wanted, strict=True):
+            np.testing.assert_allclose(a, b, atol=1e-9)
+    between = at(family, times + 0.01).p - at(tables["circle"], times + 0.01).p
+    assert np.abs(between).max() < 1e-3
+
+
+@pytest.mark.usefixtures("promoting")
+def test_starts_of_a_family_never_straddle(tables):
+    """4 s of roll-out, and half a second of preview, from wherever one may start, stay in the stretch."""
+    family = joined(list(tables.values()), seconds=8.0, every=0.02)
+    for k, (first, last) in enumerate(np.asarray(family.joins)):
+        assert 8.0 * k <= first < last
+        assert last + 4.0 + 0.5 < 8.0 * (k + 1) - 0.02
+    assert family.joins.shape == (3, 2)
+
+
+def test_a_family_needs_members_and_time(tables):
+    for members, seconds in (([], 20.0), (list(tables.values()), 5.9)):
+        with pytest.raises(ValueError, match="at least 1, of at least 6 s"):
+            joined(members, seconds=seconds)
+
+
+# ---- cross-track
+
+
+@pytest.mark.usefixtures("promoting")
+@named
+def test_no_distance_on_the_lap(name, tables):
+    reference = tables[name]
+    rows, times = np.asarray(reference.rows), row_times(reference)
+    on = rows[times >= RAMP][::37, :3]
+    np.testing.assert_allclose(jax.vmap(reference.distance)(jnp.asarray(on)), 0.0, atol=1e-12)
+    spacing = np.linalg.norm(np.diff(rows[:, :3], axis=0), axis=1).max()
+    between = at(reference, RAMP + PERIODS[name] * np.linspace(0.0, 1.0, 333)).p
+    assert float(jax.vmap(reference.distance)(between).max()) <= 0.51 * spacing  # rows are what it knows
+
+
+@pytest.mark.usefixtures("promoting")
+def test_distance_from_a_circle_is_the_radial_offset(tables, key):
+    angle, offset = random.uniform(key, (2, 20))
+    for a, d in zip(6.28 * np.asarray(angle), 0.9 * np.asarray(offset) + 0.05, strict=True):
+        for way in (1.0 + d, 1.0 - 0.9 * d):
+            p = jnp.array([1.0 + way * math.cos(a), way * math.sin(a), 1.0])
+            assert float(tables["circle"].distance(p)) == pytest.approx(abs(way - 1.0), abs=1e-3)
+    above = jnp.array([2.0, 0.0, 1.7])
+    assert float(tables["circle"].distance(above)) == pytest.approx(0.7, abs=1e-3)
+
+
+@pytest.mark.usefixtures("promoting")
+def test_distance_knows_the_lap_only(tables):
+    """The way into the lap does not count; without a lap everything does."""
+
+    def path(t):
+        return [0.0, 0.0, t] if t < 1.0 else [math.sin(2.0 * math.pi * t), 0.0, 1.0]
+
+    start = jnp.zeros(3)
+    assert float(Reference.of(path, seconds=2.0, lap=1.0).distance(start)) == pytest.approx(1.0, abs=1e-2)
+    assert float(Reference.of(path, seconds=2.0).distance(start)) == pytest.approx(0.0, abs=1e-2)
+
+
+@pytest.mark.parametrize("make", [circle, figure8, star])
+def test_size_and_period_can_be_chosen(make):
+    reference = make(period=4.0, ramp=2.0)
+    np.testing.assert_array_equal(reference.lap, [2.0, 6.0])
+    np.testing.assert_allclose(at_one(reference, 2.5).p, at_one(reference, 6.5).p, atol=1e-8)

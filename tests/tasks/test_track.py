@@ -1,0 +1,235 @@
+"""Tracking: rewards by hand, starts, bounds, errors; a preview that is relative, the same in training and in flight."""
+
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import random
+
+from helpers import GOAL, random_command, random_state, replaced
+from retrim.adapt import ControllerPilot, Sample
+from retrim.control import Policy, PolicyController
+from retrim.learn import rollout
+from retrim.physics import Command, PointMass, State, small, so3
+from retrim.tasks import Preview, Reference, SharpTrack, Start, StateObs, Track
+from retrim.tasks.reference import circle, star
+
+
+@pytest.fixture(scope="module")
+def loop():
+    return circle()
+
+
+@pytest.fixture(scope="module")
+def nose():
+    """A slow climb with a heading of 30 degrees: everything by hand."""
+    return Reference.of(lambda t: [0.2 * t, 0.1 * t, 1.0, math.pi / 6.0], seconds=10.0)
+
+
+def tracking(reference, make=Track, *, history=2, spread=1.0, box=5.0, horizon=12, preview=True):
+    seen = Preview(reference, small().omega_max, history) if preview else StateObs(jnp.array(GOAL), small().omega_max)
+    return make(reference, seen, jnp.array(spread), jnp.array(box), 0.02, horizon)
+
+
+def on(reference, t):
+    """The state that is the reference at ``t``, level, heading as it says."""
+    here = reference(jnp.array(t))
+    return State(here.p, so3.rotz(here.heading), here.v)
+
+
+# ---- rewards
+
+
+def test_paper_reward_by_hand(nose):
+    """|p - p_ref| = .5 -> .125; |v - v_ref| = 2.5 -> 2; |u - u_hover| = 2.5 -> 2, weighed 0.1."""
+    x = on(nose, 3.0)
+    x = State(x.p + jnp.array([0.3, 0.0, -0.4]), x.R, x.v + jnp.array([0.0, 1.5, 2.0]))
+    u = Command(jnp.array(9.81 - 1.5), jnp.array([0.0, 0.0, 2.0]))
+    assert float(tracking(nose).reward(jnp.array(3.0), x, u)) == pytest.approx(-(0.125 + 2.0 + 0.1 * 2.0), rel=1e-9)
+
+
+def test_sharp_reward_by_hand(nose):
+    """|5 (p - p_ref)| = 2.5 -> 2; |v - v_ref| = .5 -> .125; |u - u_ref| = 1 -> .5, weighed 0.1; 60 degrees off."""
+    x = on(nose, 3.0)
+    turned = so3.rotz(jnp.array(math.pi / 6.0 + math.pi / 3.0))
+    x = State(x.p + jnp.array([0.3, 0.0, -0.4]), turned, x.v + jnp.array([0.3, 0.4, 0.0]))
+    u = Command.of(nose(jnp.array(3.0)).u + jnp.array([0.6, 0.0, 0.8, 0.0]))
+    wanted = -(2.0 + 0.125 + 0.1 * 0.5 + 0.5 * (1.0 - 0.5))
+    assert float(tracking(nose, SharpTrack).reward(jnp.array(3.0), x, u)) == pytest.approx(wanted, rel=1e-6)
+
+
+def test_what_each_reward_wants(loop):
+    """The sharp one is zero, and greatest, for the reference with its own command; the paper's asks for hover."""
+    t, x = jnp.array(4.0), on(loop, 4.0)
+    own = Command.of(loop(t).u)
+    assert float(tracking(loop, SharpTrack).reward(t, x, own)) == pytest.approx(0.0, abs=1e-12)
+    assert float(tracking(loop, SharpTrack).reward(t, x, Command.hover())) < -1e-3
+    assert float(tracking(loop).reward(t, x, Command.hover())) == 0.0
+    assert float(tracking(loop).reward(t, x, own)) < -1e-3
+
+
+@pytest.mark.parametrize("make", [Track, SharpTrack])
+def test_reward_is_differentiable_everywhere(make, loop, key):
+    task, t = tracking(loop, make), jnp.array(4.0)
+    slope = jax.jit(jax.grad(lambda xu, t: task.reward(t, *xu)))
+    steep = 0.0
+    for x, u in [(on(loop, 4.0), Command.of(loop(t).u)), (random_state(key), random_command(key))]:
+        leaves = jax.tree.leaves(slope((x, u), t))
+        assert all(np.isfinite(leaf).all() for leaf in leaves)
+        steep = max(float(jnp.abs(leaf).max()) for leaf in leaves)
+    assert steep > 0.1
+
+
+# ---- errors and bounds
+
+
+def test_error_knows_the_time_and_cross_track_does_not(loop):
+    """Half a lap late on a circle of 1 m: 2 m behind, and nowhere off the track."""
+    with jax.numpy_dtype_promotion("standard"):
+        task, x = tracking(loop), on(loop, 4.0)
+        error, across = jax.jit(task.error), jax.jit(task.cross_track)
+        assert float(error(jnp.array(4.0), x)) == 0.0
+        assert float(error(jnp.array(7.0), x)) == pytest.approx(0.0, abs=1e-8)  # a whole lap later
+        assert float(error(jnp.array(5.5), x)) == pytest.approx(2.0, abs=1e-3)
+        assert float(across(x)) < 0.007
+        outside = replaced(x, p=x.p + 0.25 * (x.p - jnp.array([1.0, 0.0, 1.0])))
+        assert float(across(outside)) == pytest.approx(0.25, abs=1e-3)
+        assert float(error(jnp.array(4.0), outside)) == pytest.approx(0.25, abs=1e-3)
+
+
+def test_alive_moves_with_the_box(loop):
+    alive = jax.jit(tracking(loop, box=0.5).alive)
+    x = on(loop, 4.0)
+    assert alive(jnp.array(4.0), x)
+    assert not alive(jnp.array(5.5), x)  # the box has gone on
+    for axis in range(3):
+        for off, inside in ((0.49, True), (0.51, False), (-0.51, False)):
+            assert bool(alive(jnp.array(4.0), replaced(x, p=x.p.at[axis].add(off)))) is inside
+    assert not alive(jnp.array(4.0), replaced(x, p=x.p.at[0].set(jnp.nan)))
+    assert not alive(jnp.array(4.0), replaced(x, v=x.v.at[0].set(jnp.inf)))
+
+
+@pytest.mark.parametrize("spread", [0.3, 1.0])
+def test_starts_keep_to_their_bounds(spread, loop):
+    task = tracking(loop, spread=spread)
+    start = jax.jit(jax.vmap(task.reset))(random.split(random.key(3), 3000))
+    here = jax.jit(jax.vmap(loop))(start.t)
+    away = np.abs(np.asarray(start.x.p - here.p))
+    assert away.max() <= spread
+    assert away.max(axis=0).min() > 0.97 * spread  # and use them
+    assert (np.asarray(start.x.v - here.v)).std() == pytest.approx(0.3, rel=0.05)
+    turns = np.asarray(jax.vmap(so3.log)(start.x.R))  # its heading is zero
+    assert np.abs(turns).max() <= 0.1 * math.pi + 1e-9
+    assert np.abs(turns).max(axis=0).min() > 0.97 * 0.1 * math.pi
+    # two of three on the lap, one of three on the way to it
+    t = np.asarray(start.t)
+    assert t.min() >= 0.0
+    assert t.max() <= 6.0
+    assert (t > 3.0).mean() == pytest.approx(2.0 / 3.0, abs=0.04)
+
+
+def test_starts_repeat_and_head_along(nose):
+    task = tracking(nose)
+    reset = jax.jit(task.reset)
+    first, again, other = reset(random.key(1)), reset(random.key(1)), reset(random.key(2))
+    jax.tree.map(np.testing.assert_array_equal, first, again)
+    assert not np.array_equal(first.x.p, other.x.p)
+    headings = jax.vmap(lambda k: jnp.arctan2(*task.reset(k).x.R[jnp.array([1, 0]), 0]))(
+        random.split(random.key(1), 200)
+    )
+    assert float(jnp.mean(headings)) == pytest.approx(math.pi / 6.0, abs=0.05)
+
+
+# ---- the preview
+
+
+def seen_by(observation, t, x, last=None, memory=None):
+    memory = observation.init(x) if memory is None else memory
+    return observation(memory, jnp.array(t), x, Command.hover() if last is None else last)
+
+
+@pytest.mark.parametrize("history", [0, 2, 3])
+def test_preview_layout(history, loop, key):
+    observation, t = Preview(loop, small().omega_max, history), 3.7
+    x, memory = random_state(key), None
+    for k in range(4):
+        u = Command(jnp.array(9.81 * (1.0 + k)), jnp.array([6.0, 0.0, -4.0]) * k)
+        o, memory = seen_by(observation, t, x, u, memory)
+    assert o.shape == (observation.size,) == (35 + 4 * history,)
+    soon = [loop(jnp.array(t + ahead)).p - x.p for ahead in (0.0, 0.08, 0.16, 0.28, 0.4)]
+    np.testing.assert_allclose(o[:15], np.concatenate(soon), atol=1e-12)
+    later = [(loop(jnp.array(t + ahead)).v - x.v) / 5.0 for ahead in (0.0, 0.2)]
+    np.testing.assert_allclose(o[15:21], np.concatenate(later), atol=1e-12)
+    np.testing.assert_array_equal(o[21:30], np.asarray(x.R).reshape(9))
+    np.testing.assert_allclose(o[30:33], np.asarray(x.v) / 5.0)
+    np.testing.assert_array_equal(o[33:35], [1.0, 0.0])
+    newest = [[k, k, 0.0, -k] for k in range(4)][4 - history :]
+    np.testing.assert_allclose(o[35:], np.reshape(newest, -1), atol=1e-12)
+
+
+def test_preview_shows_the_heading(nose):
+    o, _ = seen_by(Preview(nose, small().omega_max, 0), 1.0, on(nose, 1.0))
+    np.testing.assert_allclose(o[33:35], [math.cos(math.pi / 6.0), 0.5], atol=1e-12)
+    np.testing.assert_allclose(o[:3], 0.0, atol=1e-12)
+
+
+def test_preview_knows_no_place(loop, key):
+    """Shape and vehicle moved together: it sees the same. Only one of them moved: it does not."""
+    by = jnp.array([3.0, -7.0, 2.0])
+    moved = eqx.tree_at(lambda r: r.rows, loop, loop.rows.at[:, :3].add(by))
+    x = random_state(key)
+    see = jax.jit(lambda reference, x: seen_by(Preview(reference, small().omega_max, 1), 4.4, x)[0])
+    there = replaced(x, p=x.p + by)
+    np.testing.assert_allclose(see(moved, there), see(loop, x), atol=1e-12)
+    assert float(jnp.abs(see(moved, x) - see(loop, x)).max()) > 1.0
+
+
+@pytest.mark.parametrize("t0", [0.0, 1.7, 5.95])
+@pytest.mark.parametrize("preview", [True, False])
+def test_simulation_and_flight_see_the_same(t0, preview, loop, key):
+    """The pilot, given the states and times of a roll-out that starts anywhere, issues its very commands."""
+    task = tracking(loop, preview=preview)
+    policy = Policy.of(task.observation.size, small(), key=key, hidden=(8,))
+    policy = jax.tree.map(lambda leaf: leaf + 0.1, policy)  # so that what is seen matters
+    x0 = replaced(on(loop, t0), p=loop(jnp.array(t0)).p + 0.2)
+    simulated = eqx.filter_jit(rollout)(PointMass(0.02), task, policy, Start(jnp.array(t0), x0))
+    pilot = ControllerPilot(PolicyController(task.observation, policy))
+    for k in range(task.horizon):
+        x = jax.tree.map(lambda leaf, k=k: leaf[k], simulated.x)
+        u = pilot(Sample(t0 + k * 0.02, x, Command.hover()))
+        np.testing.assert_allclose(u.vector(), Command(simulated.u.c[k], simulated.u.omega[k]).vector(), rtol=1e-10)
+    assert np.ptp(np.asarray(simulated.u.c)) > 1e-4
+
+
+def test_another_reference_is_data(loop):
+    """No recompilation for another shape: that is what lets a policy fly what it never saw."""
+    traces = []
+
+    @eqx.filter_jit
+    def step(task, t, x):
+        traces.append(1)
+        return task.observation(task.observation.init(x), t, x, Command.hover())[0], task.reward(t, x, Command.hover())
+
+    x, t = on(loop, 4.0), jnp.array(4.0)
+    one, other = step(tracking(loop), t, x), step(tracking(star()), t, x)
+    assert len(traces) == 1
+    assert not np.allclose(one[0], other[0])
+
+
+@pytest.mark.parametrize("make", [Track, SharpTrack])
+def test_gradient_through_a_rollout_is_finite(make, loop, key):
+    task = tracking(loop, make)
+    policy = jax.tree.map(lambda leaf: leaf + 0.05, Policy.of(task.observation.size, small(), key=key, hidden=(8,)))
+
+    @eqx.filter_jit
+    def slope(layers, start):
+        cost = lambda layers: -jnp.mean(rollout(PointMass(0.02), task, policy.retrained(layers), start).reward)  # noqa: E731
+        return jax.grad(cost)(layers)
+
+    for start in (task.reset(key), Start(jnp.array(4.0), on(loop, 4.0))):
+        leaves = jax.tree.leaves(slope(policy.layers, start))
+        assert all(np.isfinite(leaf).all() for leaf in leaves)
+        assert max(float(jnp.abs(leaf).max()) for leaf in leaves) > 1e-4
