@@ -8,9 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from retrim import AdaptivePilot, Bem, ControllerPilot, Log, PolicyController, Push, SimPlant, build, fly, presets
-from retrim import pretrain as epochs_of_pretraining
-from retrim.physics import small
+from retrim import AdaptivePilot, ControllerPilot, Log, PolicyController, SimPlant, build, fly, presets, pretrain
+from retrim.physics import Bem, Push, small
 
 QUICK = {
     "pretrain": {"epochs": 100, "envs": 8, "horizon": 100, "hidden": [32, 32]},
@@ -29,7 +28,7 @@ def main(*, quick: bool = False) -> None:
     ticks = 250 if quick else 1500  # of 20 ms
 
     # Pretrain in a model of one equation, which knows nothing of what follows.
-    training = epochs_of_pretraining(
+    training = pretrain(
         build.policy(preset, jax.random.key(0)),
         build.nominal(preset),
         build.task(preset),
@@ -40,9 +39,9 @@ def main(*, quick: bool = False) -> None:
         delay=preset.delay,
     )
     losses = []
-    for state, chunk in training:
+    for state, chunk in training:  # after every ten epochs
+        policy = state.policy
         losses.extend(chunk.tolist())
-    policy = state.policy
     print(f"pretrained: loss {losses[0]:.2f} -> {losses[-1]:.2f} in {len(losses)} epochs")
 
     # A realistic plant, pushed by 2 m/s² along each axis: any function of time and state will do.

@@ -12,10 +12,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from retrim import AdaptivePilot, Bem, ControllerPilot, Log, PolicyController, Reference, SimPlant, build, fly
-from retrim import from_csv, presets
+from retrim import AdaptivePilot, ControllerPilot, Log, PolicyController, SimPlant, build, fly, presets
 from retrim.cli.training import train
-from retrim.physics import SteadyWind, small
+from retrim.physics import Bem, SteadyWind, small
+from retrim.tasks import Reference, from_csv
 from retrim.tasks.reference import spun_up
 
 QUICK = {

@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from retrim import AdaptivePilot, Bem, ControllerPilot, Log, PolicyController, SimPlant, build, fly, presets, pretrain
+from retrim import AdaptivePilot, ControllerPilot, Log, PolicyController, SimPlant, build, fly, presets, pretrain
 from retrim.learn.represent import represent
-from retrim.physics import SteadyWind, small
+from retrim.physics import Bem, SteadyWind, small
 
 QUICK = {
     "represent": 100,
@@ -46,9 +46,9 @@ def main(*, quick: bool = False) -> None:
         delay=preset.delay,
     )
     losses = []
-    for state, chunk in training:
+    for state, chunk in training:  # after every ten epochs
+        policy = state.policy
         losses.extend(chunk.tolist())
-    policy = state.policy
     print(f"learnt to fly: loss {losses[0]:.2f} -> {losses[-1]:.2f}")
 
     # In flight only what the camera sees is observed; a filter of the pose fills in the rest.

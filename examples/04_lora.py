@@ -1,17 +1,16 @@
 """Low-rank adaptation: the pretrained policy is frozen, and only a thin delta on it is trained in flight.
 
-You learn to adapt with a LoraPolicy instead of a Policy, and to merge it into plain weights. Printed are how many numbers
-each trains, the hover error without and with adaptation, and by how much base and merged weights moved.
+You learn to adapt with a LoraPolicy instead of a Policy, and to merge it into plain weights. Printed are how many
+numbers each trains, the hover error without and with adaptation, and by how much base and merged weights moved.
 """
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from retrim import AdaptivePilot, Bem, Constant, ControllerPilot, LoraPolicy, PolicyController, SimPlant, build, fly
-from retrim import presets
+from retrim import AdaptivePilot, ControllerPilot, LoraPolicy, PolicyController, SimPlant, build, fly, presets
 from retrim.cli.training import train
-from retrim.physics import small
+from retrim.physics import Bem, Constant, small
 
 QUICK = {
     "pretrain": {"epochs": 100, "envs": 8, "horizon": 100, "hidden": [32, 32]},

@@ -1,7 +1,8 @@
 """A residual of your own: three numbers instead of a neural network, fitted in one line.
 
 You learn that any (x, u) -> acceleration corrects a model, how flight data become its targets, and how to improve a
-policy by hand: what AdaptivePilot does for you, in the open. Printed are the fitted bias, and the error before and after.
+policy by hand: what AdaptivePilot does for you, in the open. Printed are the fitted bias, and the error before and
+after.
 """
 
 import equinox as eqx
@@ -11,11 +12,11 @@ import numpy as np
 import optax
 from jaxtyping import Array
 
-from retrim import Bem, Command, Constant, ControllerPilot, Hybrid, Log, PolicyController, PolicyState, SimPlant, State
-from retrim import Window, bptt, build, fly, presets, residual_targets
+from retrim import ControllerPilot, Log, PolicyController, SimPlant, build, fly, presets
 from retrim.cli.training import train
+from retrim.learn import PolicyState, Window, bptt, residual_targets
 from retrim.learn.pretrain import starts
-from retrim.physics import small
+from retrim.physics import Bem, Command, Constant, Hybrid, State, small
 
 QUICK = {"pretrain": {"epochs": 100, "envs": 8, "horizon": 100, "hidden": [32, 32]}}
 
@@ -32,9 +33,9 @@ class Bias(eqx.Module):
 
 def window_of(log: Log, ticks: int) -> Window:
     """The last ticks of a flight. A log has the command that led to each state, a window the one that followed it."""
-    x = State(*(jnp.asarray(leaf[-ticks - 1 : -1]) for leaf in (log.p, log.R, log.v)))
+    t, p, R, v = (jnp.asarray(rows[-ticks - 1 : -1]) for rows in (log.t, log.p, log.R, log.v))
     u = jnp.asarray(log.u[-ticks:])
-    return Window(jnp.asarray(log.t[-ticks - 1 : -1]), x, Command(u[:, 0], u[:, 1:]), jnp.ones(ticks, dtype=bool))
+    return Window(t, jax.vmap(State)(p, R, v), jax.vmap(Command.of)(u), jnp.ones(ticks, dtype=bool))
 
 
 def main(*, quick: bool = False) -> None:

@@ -10,10 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from retrim import AdaptivePilot, Bem, Command, Constant, ControllerPilot, PolicyController, SimPlant, State, Vehicle
-from retrim import build, fly, presets
+from retrim import AdaptivePilot, ControllerPilot, PolicyController, SimPlant, build, fly, presets
 from retrim.cli.training import train
-from retrim.physics import STANDARD_GRAVITY, small
+from retrim.physics import STANDARD_GRAVITY, Bem, Command, Constant, State, Vehicle, small
 
 QUICK = {
     "pretrain": {"epochs": 100, "envs": 8, "horizon": 100, "hidden": [32, 32]},

@@ -9,9 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from retrim import AdaptivePilot, Command, ControllerPilot, PlantError, PolicyController, Sample, State, build, fly
-from retrim import presets
-from retrim.adapt.plant import refuse_unsound
+from retrim import AdaptivePilot, Command, ControllerPilot, PolicyController, Sample, State, build, fly, presets
+from retrim.adapt.plant import PlantError, refuse_unsound
 from retrim.cli.training import train
 
 QUICK = {

@@ -107,7 +107,6 @@ class Setting:
             )
         if self.plant not in ("bem", "simple") and self.sensing != "ideal":
             raise PresetError(f"plant {self.plant} shows its true state; sensing {self.sensing!r} needs bem or simple")
-
         if not -0.5 <= self.thrust_error <= 0.5:
             raise PresetError(f"thrust error {self.thrust_error} must be between -0.5 and 0.5")
 

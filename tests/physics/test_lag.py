@@ -40,7 +40,7 @@ def test_without_lag_it_is_the_base_model(key):
     for a, b in zip(jax.tree.leaves(plain), jax.tree.leaves(quick.inner), strict=True):
         np.testing.assert_allclose(b, a, atol=1e-5)
     slow = flown(lagged(), lagged().init(x), us)
-    assert float(jnp.abs(slow.inner.v - plain.v).max()) > 0.05
+    assert float(jnp.abs(slow.inner.v - plain.v).max()) > 0.01
 
 
 @pytest.mark.parametrize("tau", [0.01, 0.033, 0.2])
@@ -77,7 +77,7 @@ def fine(x, us, tau, h=1e-3):
 
 def test_thrust_over_a_tick_is_its_mean(key):
     """Without turning, velocity is exact: only the integral of thrust counts."""
-    us = replaced(commands(key, 8), omega=jnp.zeros((8, 3)))
+    us = jax.tree.map(lambda leaf: leaf if leaf.ndim == 1 else jnp.zeros_like(leaf), commands(key, 8))
     x = random_state(key)
     found, true = flown(lagged(), lagged().init(x), us).inner, fine(x, us, TAU)
     np.testing.assert_allclose(found.v, true.v, atol=1e-4)  # the error of 1 ms steps
@@ -154,11 +154,10 @@ def test_wraps_and_is_wrapped(key):
 def window(key, n, delay):
     """A flight that the lagged model made; commands act ``delay`` ticks after they were issued."""
     issued = commands(key, n)
-    held = Command(jnp.full(delay, 9.81), jnp.zeros((delay, 3)))
-    acting = jax.tree.map(lambda h, u: jnp.concatenate([h, u])[:n], held, issued)
+    acting = stacked([Command.hover()] * delay + [jax.tree.map(lambda l, k=k: l[k], issued) for k in range(n - delay)])
     states = flown(lagged(), lagged().init(State.at(jnp.array(GOAL))), acting).inner
     x = jax.tree.map(lambda leaf: leaf[:n], states)
-    return Window(DT * jnp.arange(n), x, issued, jnp.ones(n, dtype=bool))
+    return Window(jnp.asarray(DT * np.arange(n)), x, issued, jnp.ones(n, dtype=bool))
 
 
 @pytest.mark.parametrize("delay", [0, 1, 2])

@@ -90,7 +90,7 @@ def test_error_knows_the_time_and_cross_track_does_not(loop):
     """Half a lap late on a circle of 1 m: 2 m behind, and nowhere off the track."""
     with jax.numpy_dtype_promotion("standard"):
         task, x = tracking(loop), on(loop, 4.0)
-        error, across = jax.jit(task.error), jax.jit(task.cross_track)
+        error, across = eqx.filter_jit(task.error), eqx.filter_jit(task.cross_track)
         assert float(error(jnp.array(4.0), x)) == 0.0
         assert float(error(jnp.array(7.0), x)) == pytest.approx(0.0, abs=1e-8)  # a whole lap later
         assert float(error(jnp.array(5.5), x)) == pytest.approx(2.0, abs=1e-3)
@@ -101,7 +101,7 @@ def test_error_knows_the_time_and_cross_track_does_not(loop):
 
 
 def test_alive_moves_with_the_box(loop):
-    alive = jax.jit(tracking(loop, box=0.5).alive)
+    alive = eqx.filter_jit(tracking(loop, box=0.5).alive)
     x = on(loop, 4.0)
     assert alive(jnp.array(4.0), x)
     assert not alive(jnp.array(5.5), x)  # the box has gone on
@@ -133,7 +133,7 @@ def test_starts_keep_to_their_bounds(spread, loop):
 
 def test_starts_repeat_and_head_along(nose):
     task = tracking(nose)
-    reset = jax.jit(task.reset)
+    reset = eqx.filter_jit(task.reset)
     first, again, other = reset(random.key(1)), reset(random.key(1)), reset(random.key(2))
     jax.tree.map(np.testing.assert_array_equal, first, again)
     assert not np.array_equal(first.x.p, other.x.p)

@@ -37,7 +37,7 @@ def model(out: Path | None = None) -> int:
     folder = run_folder(out, "reproduce")
     with console.status("computing the curves of the blade-element model ..."):
         figure = panel_figure(
-            "The plant `bem`", [thrust_panel(), drag_panel(), inflow_panel(), rate_panel(), step_panel(), sag_panel()]
+            "The plant bem", [thrust_panel(), drag_panel(), inflow_panel(), rate_panel(), step_panel(), sag_panel()]
         )
         plots.save(figure, folder, "model")
         table = published()
