@@ -139,15 +139,17 @@ def test_the_projection_does_not_depend_on_distance(camera, key):
 # ---- keypoints
 
 
+begin = eqx.filter_jit(lambda o, x: o.init(x))
+step = eqx.filter_jit(lambda x, u: PointMass(0.02).step(x, u, jnp.zeros(3)))
 see = eqx.filter_jit(lambda o, memory, x, last: o(memory, jnp.array(0.0), x, last))
 
 
 def watched(observation, x, us):
     """Observations of a point mass under the commands ``us``, as a policy would get them; and the last state."""
-    memory, last, shown = observation.init(x), Command.hover(), []
+    memory, last, shown = begin(observation, x), Command.hover(), []
     for u in us:
         o, memory = see(observation, memory, x, last)
-        x, last = PointMass(0.02).step(x, u, jnp.zeros(3)), u
+        x, last = step(x, u), u
         shown.append(np.asarray(o))
     return np.array(shown), memory, x
 
