@@ -207,7 +207,6 @@ def drawn(window, key, n):
     return jax.vmap(Start)(window.t[row], jax.tree.map(lambda leaf: leaf[row], window.x))
 
 
-@pytest.mark.xfail(strict=True, reason="Start is built from a whole window, against its own shapes")
 def test_starts_drawn_from_a_window_keep_to_their_shapes(key):
     x = State.at(jnp.array([0.3, 0.0, 1.0]))
     buffer = RollingBuffer(3)

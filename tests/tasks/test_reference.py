@@ -50,13 +50,6 @@ def row_times(reference):
     return float(reference.every) * np.arange(reference.rows.shape[0])
 
 
-@pytest.fixture
-def promoting():
-    """As outside the tests; see the first test that fails without it."""
-    with jax.numpy_dtype_promotion("standard"):
-        yield
-
-
 def line(t):
     return [t, 0.0, 1.0]
 
@@ -262,7 +255,6 @@ def test_names_the_thrust():
     assert "thrust" not in circle(radius=1.0, period=1.3).worst_violation(heavy)
 
 
-@pytest.mark.xfail(strict=True, reason="an acceleration beyond JUMP is always called a jump, also on a smooth path")
 def test_names_the_thrust_of_a_far_too_fast_circle():
     assert "of thrust" in circle(radius=3.0, period=1.0).worst_violation(small())
 
@@ -355,7 +347,6 @@ def test_without_yaw_it_heads_along_x(tmp_path):
     np.testing.assert_allclose(at_one(reference, 2.0).p, [1.0, 0.0, 1.0], atol=1e-4)
 
 
-@pytest.mark.xfail(strict=True, reason="the command of the last instant of braking is held with the end")
 def test_at_a_held_end_it_asks_for_hover(tmp_path):
     reference = from_csv(written(tmp_path, "0,0,0,1\n1,1,1,1\n2,2,0,1\n"))
     np.testing.assert_allclose(at_one(reference, 10.0).u, [9.81, 0.0, 0.0, 0.0], atol=0.05)
@@ -387,7 +378,6 @@ def test_faults_of_a_file_are_named_with_their_line(text, message, tmp_path):
 # ---- families
 
 
-@pytest.mark.xfail(strict=True, reason="seconds times an integer range, in joined() and distance()")
 @pytest.mark.parametrize("what", ["joined", "distance"])
 def test_no_silent_promotion(what, tables):
     if what == "joined":
@@ -396,7 +386,6 @@ def test_no_silent_promotion(what, tables):
         tables["circle"].distance(jnp.zeros(3))
 
 
-@pytest.mark.usefixtures("promoting")
 def test_each_stretch_of_a_family_is_its_reference(tables):
     family = joined(list(tables.values()))
     times = 0.02 * np.arange(950)
@@ -408,7 +397,6 @@ def test_each_stretch_of_a_family_is_its_reference(tables):
     assert np.abs(between).max() < 1e-3
 
 
-@pytest.mark.usefixtures("promoting")
 def test_starts_of_a_family_never_straddle(tables):
     """4 s of roll-out, and half a second of preview, from wherever one may start, stay in the stretch."""
     family = joined(list(tables.values()), seconds=8.0, every=0.02)
@@ -427,7 +415,6 @@ def test_a_family_needs_members_and_time(tables):
 # ---- cross-track
 
 
-@pytest.mark.usefixtures("promoting")
 @named
 def test_no_distance_on_the_lap(name, tables):
     reference = tables[name]
@@ -439,7 +426,6 @@ def test_no_distance_on_the_lap(name, tables):
     assert float(jax.vmap(reference.distance)(between).max()) <= 0.51 * spacing  # rows are what it knows
 
 
-@pytest.mark.usefixtures("promoting")
 def test_distance_from_a_circle_is_the_radial_offset(tables, key):
     angle, offset = random.uniform(key, (2, 20))
     for a, d in zip(6.28 * np.asarray(angle), 0.9 * np.asarray(offset) + 0.05, strict=True):
@@ -450,7 +436,6 @@ def test_distance_from_a_circle_is_the_radial_offset(tables, key):
     assert float(tables["circle"].distance(above)) == pytest.approx(0.7, abs=1e-3)
 
 
-@pytest.mark.usefixtures("promoting")
 def test_distance_knows_the_lap_only(tables):
     """The way into the lap does not count; without a lap everything does."""
 

@@ -30,13 +30,6 @@ def keypoints(**options):
     return Keypoints.of(jnp.array(GOAL), small().omega_max, **({"whitened": False} | options))
 
 
-@pytest.fixture
-def broadcasting():
-    """As outside the tests; see the test that fails without it."""
-    with jax.numpy_rank_promotion("allow"):
-        yield
-
-
 def near():
     """Sees everything for a while."""
     return State(jnp.array([0.05, -0.1, 1.1]), jnp.eye(3), jnp.array([0.1, 0.2, -0.05]))
@@ -158,12 +151,10 @@ def gentle(key, n):
     return [Command(9.81 + 0.5 * random.normal(k, ()), 0.3 * random.normal(k, (3,))) for k in random.split(key, n)]
 
 
-@pytest.mark.xfail(strict=True, reason="the noise of an axis times the noise of all points, in Keypoints.__call__")
 def test_no_silent_broadcast(plain):
     plain(plain.init(near()), jnp.array(0.0), near(), Command.hover())
 
 
-@pytest.mark.usefixtures("broadcasting")
 def test_layout(plain, key):
     us = gentle(key, 6)
     shown, _, _ = watched(plain, near(), us)
@@ -177,7 +168,6 @@ def test_layout(plain, key):
     np.testing.assert_allclose(shown[5, 77:], np.reshape(issued, 12), atol=1e-12)
 
 
-@pytest.mark.usefixtures("broadcasting")
 def test_the_same_start_sees_the_same(key):
     noisy, us = keypoints(noise=2.0, dropout=0.2), gentle(key, 4)
     first, again = watched(noisy, near(), us)[0], watched(noisy, near(), us)[0]
@@ -187,7 +177,6 @@ def test_the_same_start_sees_the_same(key):
     assert not np.allclose(watched(noisy, elsewhere, us)[0] - first, quiet, atol=1e-4)  # other noise
 
 
-@pytest.mark.usefixtures("broadcasting")
 def test_without_noise_it_shows_the_projection_and_with_noise_its_deviation(plain):
     """In pixels: of 1280 and 720 across an image that is 2 wide and high."""
     exact = np.asarray(plain.pixels(near())[0])
@@ -206,7 +195,6 @@ def test_without_noise_it_shows_the_projection_and_with_noise_its_deviation(plai
     np.testing.assert_allclose(off.reshape(-1, 2).mean(axis=0), 0.0, atol=0.15)
 
 
-@pytest.mark.usefixtures("broadcasting")
 @pytest.mark.parametrize("noise", [0.0, 1.0])
 def test_honesty_costs_nothing_while_everything_is_seen(noise, key):
     us = gentle(key, 8)
@@ -215,7 +203,6 @@ def test_honesty_costs_nothing_while_everything_is_seen(noise, key):
     np.testing.assert_allclose(honest, open_, atol=1e-12)
 
 
-@pytest.mark.usefixtures("broadcasting")
 def test_what_is_out_of_sight_is_not_observed(plain):
     """Its flag is down, and what is shown is the filter's, not the truth; without honesty it is the truth."""
     aside = State(jnp.array([0.9, 0.0, 1.0]), jnp.eye(3), jnp.zeros(3))
@@ -230,7 +217,6 @@ def test_what_is_out_of_sight_is_not_observed(plain):
     np.testing.assert_allclose(o[:14].reshape(7, 2), pixels, atol=1e-12)
 
 
-@pytest.mark.usefixtures("broadcasting")
 @pytest.mark.parametrize("place", [(0.05, -0.1, 1.1), (0.9, 0.0, 1.0), (4.0, 0.0, 0.3)])
 @pytest.mark.parametrize("honest", [True, False])
 def test_gradient_of_the_observation_is_finite(place, honest, white):
@@ -427,7 +413,6 @@ def test_learns_to_see(white, key):
         assert float(jnp.abs(after.weight - before.weight).max()) > 0.01
 
 
-@pytest.mark.usefixtures("broadcasting")
 @pytest.mark.parametrize("honest", [True, False])
 def test_simulation_and_flight_see_the_same(honest, white, key):
     """Noise and lost points included: the pilot, given the states of a roll-out, issues its very commands."""

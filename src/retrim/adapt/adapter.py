@@ -112,5 +112,5 @@ def _drawn(window: Window, key: Key[Array, ""], n: int) -> Start:
     """``n`` states, with their times, drawn from the valid part of the window."""
     weight = window.valid.astype(window.x.p.dtype)
     row = random.choice(key, window.valid.shape[0], (n,), p=weight / jnp.sum(weight))
-    drawn: Start = jax.tree.map(lambda leaf: leaf[row], Start(window.t, window.x))
+    drawn: Start = jax.vmap(Start)(window.t[row], jax.tree.map(lambda leaf: leaf[row], window.x))
     return drawn

@@ -128,7 +128,7 @@ class Keypoints(AbstractObservation[Seeing]):
         """One frame more."""
         key, k_noise, k_drop = random.split(memory.key, 3)
         true, visible = self.pixels(x)
-        noise = 2.0 * self.noise / self.camera.size * random.normal(k_noise, (7, 2), true.dtype)
+        noise = (2.0 * self.noise / self.camera.size)[None] * random.normal(k_noise, (7, 2), true.dtype)
         shown = true + lax.stop_gradient(noise)
         sight = memory.sight
         if self.honest:

@@ -78,11 +78,14 @@ class Reference(eqx.Module):
         i = jnp.clip(jnp.floor(where), 0, self.rows.shape[0] - 2).astype(jnp.int32)
         part = (where - i.astype(where.dtype)).astype(self.rows.dtype)
         row = (1.0 - part) * self.rows[i] + part * self.rows[i + 1]
-        return Point(row[:3], row[3:6], row[6:10], row[10])
+        over = (length <= 0) & (t >= end)  # at rest, where the end is held
+        hover = jnp.zeros(4, dtype=row.dtype).at[0].set(STANDARD_GRAVITY)
+        v, u = jnp.where(over, jnp.zeros_like(row[3:6]), row[3:6]), jnp.where(over, hover, row[6:10])
+        return Point(row[:3], v, u, row[10])
 
     def distance(self, p: Float[Array, "3"]) -> Float[Array, ""]:
         """Cross-track error: from ``p`` to the nearest row of the lap, or of the whole trajectory without one [m]."""
-        times = self.every * jnp.arange(self.rows.shape[0])
+        times = self.every * jnp.arange(self.rows.shape[0], dtype=self.every.dtype)
         on_lap = (times >= self.lap[0] - 1e-6) | (self.lap[0] == self.lap[1])
         away = jnp.sqrt(jnp.sum((self.rows[:, :3] - p[None]) ** 2, axis=1))
         return jnp.min(jnp.where(on_lap, away, jnp.inf))
@@ -94,7 +97,8 @@ class Reference(eqx.Module):
         leaps = np.linalg.norm(np.diff(rows[:, 3:6], axis=0), axis=1) / float(self.every)
         i, j = int(np.argmax(rows[:, 6])), int(np.argmax(np.max(np.abs(rows[:, 7:10]) / rate_max, axis=1)))
         k, axis = int(np.argmax(leaps)), int(np.argmax(np.abs(rows[j, 7:10]) / rate_max))
-        if leaps[k] > JUMP:
+        aside = max(leaps[max(k - 3, 0)], leaps[min(k + 3, len(leaps) - 1)])  # a jump stands alone
+        if leaps[k] > JUMP and leaps[k] > 3.0 * aside:
             leap = np.linalg.norm(rows[k + 1, 3:6] - rows[k, 3:6])
             return f"its velocity jumps by {leap:.2f} m/s at {times[k]:.2f} s; corners will be cut"
         if rows[i, 6] > c_max:
@@ -111,7 +115,7 @@ def joined(references: Sequence[Reference], *, seconds: float = 20.0, every: flo
     """A family as one table, ``seconds`` of each, one after another: for roll-outs of up to 4 s."""
     if not references or seconds < 6.0:
         raise ValueError(f"joined: {len(references)} references of {seconds} s; at least 1, of at least 6 s")
-    times = every * jnp.arange(round(seconds / every))
+    times = every * jnp.arange(round(seconds / every), dtype=float)
     rows = []
     for reference in references:
         points = jax.vmap(reference)(times)
@@ -206,7 +210,8 @@ def _row(path: Path3, t: float, last: float) -> np.ndarray:
     v = (around[3] - around[1])[:3] / (2.0 * h)
     pulls = [(around[k + 1] - 2.0 * around[k] + around[k - 1])[:3] / h**2 for k in (1, 2, 3)]
     p = at(t)
-    if max(np.linalg.norm(a) for a in pulls) > JUMP:
+    fine = (at(middle + 0.1 * h) - 2.0 * around[2] + at(middle - 0.1 * h))[:3] / (0.1 * h) ** 2
+    if max(np.linalg.norm(a - fine) for a in pulls) > JUMP:  # a jump does not look the same from nearer
         return np.concatenate([p[:3], v, [STANDARD_GRAVITY, 0.0, 0.0, 0.0], p[3:]])
     R_before, R, R_after = (_attitude(a, here[3]) for a, here in zip(pulls, around[1:4], strict=True))
     turn = R.T @ (R_after - R_before) / (2.0 * h)
