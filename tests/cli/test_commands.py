@@ -76,7 +76,7 @@ def test_fly_writes_rows_events_and_pictures(folder):
     assert {e["event"] for e in events} >= {"residual"}
     for kind in ("png", "svg"):
         assert (folder / "f" / f"hover_small.{kind}").stat().st_size > 10_000
-    assert "steady-state hover error [m]" in out
+    assert "hover error [m], last 2 s of 5 s, 2" in out
 
 
 def test_fly_repeats(folder):

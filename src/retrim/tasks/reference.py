@@ -14,7 +14,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.interpolate import CubicSpline
 
 from ..physics.state import STANDARD_GRAVITY
 from ..physics.vehicle import Vehicle
@@ -190,6 +189,8 @@ def from_csv(file: Path) -> Reference:
         rows.append(row)
     if len(rows) < 2:
         raise ValueError(f"{file}: {len(rows)} points; a trajectory needs at least two")
+    from scipy.interpolate import CubicSpline  # here: it takes as long to import as all of retrim
+
     table = np.array(rows)
     spline = CubicSpline(table[:, 0] - table[0, 0], table[:, 1:], bc_type="clamped")
     return Reference.of(lambda t: spline(t), seconds=float(table[-1, 0] - table[0, 0]))
