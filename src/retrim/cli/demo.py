@@ -23,7 +23,7 @@ WHY = {
 
 def demo(
     preset: Literal["fast", "released", "paper"] = "fast",
-    plant: PlantName = "bem",
+    plant: PlantName = "simple",
     seconds: float = 30.0,
     starts: int = 8,
     seed: int = 0,
@@ -33,7 +33,7 @@ def demo(
 
     Args:
         preset: fast trains in seconds and has the plant's delay in its model; paper and released take about a minute.
-        plant: bem: blade-element rotors; simple: rotors with linear drag; the others are extras to install.
+        plant: simple: rotors with linear drag, the quickest; bem: blade-element rotors; the others are extras.
         seconds: Length of a flight.
         starts: Flights per disturbance and method, each from another start.
         seed: Seed of everything.
