@@ -49,7 +49,6 @@ def fly(
             trained on by default. Another one needs a policy that sees its reference (preset track).
         plant: bem: blade-element rotors; simple: rotors with linear drag; rotorpy, mujoco, crazyflow: independent
             simulators, each an extra to install.
-        adapt: full: also fly it while residual and policy are re-trained; none: only as it is.
         vehicle: Quadrotor that the plant simulates; that which the policy was trained for by default. rotorpy and
             crazyflow fly their own.
         sensing: What the policy sees of the state: ideal, mocap (0.3 mm, 3 mm/s, 1 mrad) or rough (1 mm, 10 mm/s,

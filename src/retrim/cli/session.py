@@ -106,6 +106,20 @@ def machine() -> str:
     return ", ".join([f"{cores} CPU cores ({name})", *accelerators])
 
 
+def said(words: Sequence[str]) -> str:
+    """The command line, without where its results go, and with names for absolute paths: what another machine needs."""
+    kept, words = list[str](), list(words)
+    while words:
+        option, sign, value = words.pop(0).partition("=")
+        if option == "--out":
+            words = words if sign else words[1:]
+        elif sign:
+            kept.append(f"{option}={Path(value).name if Path(value).is_absolute() else value}")
+        else:
+            kept.append(Path(option).name if Path(option).is_absolute() else option)
+    return " ".join(["retrim", *kept])
+
+
 def write_results(
     folder: Path,
     *,
@@ -119,7 +133,7 @@ def write_results(
     """``results.json`` (or another ``name``) in ``folder``."""
     results = {
         "schema": SCHEMA,
-        "command": " ".join(["retrim", *sys.argv[1:]]),
+        "command": said(sys.argv[1:]),
         "commit": commit(),
         "versions": {name: version(name) for name in ("retrim", "jax", "jaxlib", "equinox", "optax", "numpy")}
         | {"python": platform.python_version()},

@@ -64,7 +64,7 @@ def tracking(
                 blocks.append(Block(f"{reference}, seeing it ahead", settings, reference, paper=paper))
             else:
                 own = with_reference(name, reference)
-                blocks.append(Block(f"{reference}, without seeing it", own, reference, ("base", "full"), paper))
+                blocks.append(Block(f"{reference}, without seeing it", own, reference, paper=paper))
         if settings.observation == "preview":
             other = with_reference(name, "circle+star")
             blocks.append(Block("figure8, never seen in training", other, "figure8", ("base", "full")))
