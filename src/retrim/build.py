@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jax import random
-from jaxtyping import Array, Key
+from jaxtyping import Array, Float, Key
 
 from .adapt.adapter import Adapter
-from .adapt.lockstep import Schedule
+from .adapt.lockstep import AdaptivePilot, Schedule
 from .control.lora import LoraPolicy
 from .control.policy import Policy
+from .learn.pretrain import pretrain
+from .learn.represent import represent
 from .learn.residual import EnsembleResidual
 from .physics.dynamics import AbstractDynamics, PointMass
 from .physics.lag import Lagged
@@ -119,6 +122,34 @@ def optimiser(preset: Preset) -> optax.GradientTransformation:
     return optax.chain(optax.clip_by_global_norm(p.clip or math.inf), optax.adam(schedule, b2=p.b2))
 
 
+def pretraining(preset: Preset, seed: int = 0) -> Iterator[tuple[Policy, Float[Array, " epochs"]]]:
+    """Train a policy from scratch: after every few epochs the policy so far, and the losses of those epochs.
+
+    Where the preset has it, the policy first learns to see; the first value comes after that.
+    """
+    k_init, k_train = random.split(random.key(seed))
+    fresh, p = policy(preset, k_init), preset.pretrain
+    if preset.task == "vision" and preset.represent:
+        fresh, _ = represent(fresh, keypoints(preset), random.split(k_init)[1], steps=preset.represent)
+    epochs = pretrain(
+        fresh,
+        nominal(preset),
+        task(preset),
+        k_train,
+        optimiser=optimiser(preset),
+        epochs=p.epochs,
+        envs=p.envs,
+        delay=preset.delay,
+        chunk=math.gcd(p.epochs, 10),
+    )
+    return ((state.policy.plain(), losses) for state, losses in epochs)
+
+
+def pretrained(preset: Preset, seed: int = 0) -> Policy:
+    """A policy trained from scratch, in silence; :func:`pretraining` shows progress."""
+    return list(pretraining(preset, seed))[-1][0]
+
+
 def adapter(preset: Preset, flown: Reference | None = None) -> Adapter:
     """The learner beside the flight; it re-trains on what is ``flown``, or on what the policy was trained on."""
     a = preset.adapt
@@ -157,6 +188,28 @@ def schedule(preset: Preset, *, measured: bool = False) -> Schedule:
         a.improve_every,
         None if measured else a.refine_charge,
         None if measured else a.improve_charge,
+    )
+
+
+def pilot(
+    preset: Preset,
+    policy: Policy | LoraPolicy,
+    key: Key[Array, ""],
+    flown: Reference | None = None,
+    *,
+    measured: bool = False,
+) -> AdaptivePilot:
+    """Flies ``policy`` and re-trains it as it flies; the key is consumed. ``measured`` as in :func:`schedule`."""
+    k_residual, k_learn = random.split(key)
+    learner = adapter(preset, flown)
+    return AdaptivePilot(
+        learner,
+        learner.init(policy, residual(preset, k_residual)),
+        schedule(preset, measured=measured),
+        k_learn,
+        dt=DT,
+        window=preset.adapt.window,
+        observation=seen_in_flight(preset, flown),
     )
 
 

@@ -1,8 +1,8 @@
-"""What a results file says of the command that made it."""
+"""What a results file says of the command that made it, and of its time."""
 
 import pytest
 
-from retrim.cli.session import said
+from retrim.cli.session import Stopwatch, said
 
 
 @pytest.mark.parametrize(
@@ -17,3 +17,10 @@ from retrim.cli.session import said
 )
 def test_no_place_on_this_machine_is_recorded(words, kept):
     assert said(words) == f"retrim {kept}"
+
+
+def test_programs_traced_inside_others_count_once():
+    watch = Stopwatch()
+    for start, end in ((1.0, 2.0), (1.5, 2.5), (4.0, 4.5), (3.5, 5.0), (7.0, 8.0)):  # by their ends, as they come
+        watch.compiled(start, end)
+    assert watch.compile_s == pytest.approx(1.5 + 1.5 + 1.0)

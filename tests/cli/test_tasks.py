@@ -85,7 +85,7 @@ def test_star_is_flown_with_a_warning(folder):
 
 def test_vision_learns_to_see_and_flies_honestly(folder):
     words = "--preset", "vision-honest", "--config", "see.toml", "--out", "v"
-    assert "learnt to see" in retrim("pretrain", "vision", *words, cwd=folder)
+    assert "vision error in its own model" in retrim("pretrain", "vision", *words, cwd=folder)
     retrim("fly", "--policy", "v", "--seconds", "3", "--disturbance", "none", "--out", "vf", cwd=folder)
     assert (folder / "vf" / "vision_none.png").exists()
 

@@ -34,6 +34,7 @@ from .session import console
 
 Method = Literal["base", "full", "lora"]
 LEARNERS = 2  # folded into a seed for the learners of flights
+LOW_RANK = 0  # folded into a learner's key for the delta that it starts from
 STEADY = {
     "hover": 2.0,
     "vision": 2.0,
@@ -103,9 +104,9 @@ class Campaign:
     ) -> None:
         self.preset, self.policy = preset, policy
         self._ticks, self._seed, self._workers = round(seconds / presets.DT), seed, 1 if measured else _cores()
+        self._flown, self._measured = flown, measured
         self._adapter = build.adapter(preset, flown)
         self._seen = build.seen_in_flight(preset, flown)
-        self._schedule = build.schedule(preset, measured=measured)
         self.setting = setting
         self._starts = build.flight_starts(preset, starts, seed, flown)
         self.stop = threading.Event()
@@ -162,18 +163,9 @@ class Campaign:
         return [f.result() for f in done if not f.cancelled() and f.exception() is None], interrupted
 
     def _pilot(self, start: int, method: Method) -> AdaptivePilot:
-        k_residual, k_learn = random.split(random.fold_in(random.fold_in(random.key(self._seed), LEARNERS), start))
-        policy = self.policy if method == "full" else build.lora(self.policy, random.fold_in(k_residual, 0))
-        state = self._adapter.init(policy, build.residual(self.preset, k_residual))
-        return AdaptivePilot(
-            self._adapter,
-            state,
-            self._schedule,
-            k_learn,
-            dt=presets.DT,
-            window=self.preset.adapt.window,
-            observation=self._seen,
-        )
+        key = random.fold_in(random.fold_in(random.key(self._seed), LEARNERS), start)
+        policy = build.lora(self.policy, random.fold_in(key, LOW_RANK)) if method == "lora" else self.policy
+        return build.pilot(self.preset, policy, key, self._flown, measured=self._measured)
 
     def _plant(self, disturbance: str, start: int) -> Plant:
         """The same gusts and sensor noise for every method that flies from a start."""

@@ -6,6 +6,7 @@ import os
 import platform
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Sequence
 from datetime import datetime
@@ -25,7 +26,8 @@ class Stopwatch:
 
     def __init__(self) -> None:
         self._began = time.perf_counter()
-        self._compiling = 0.0
+        self._compiling = list[tuple[float, float]]()  # when, without overlap, in order
+        self._lock = threading.Lock()
         jax.monitoring.register_event_duration_secs_listener(self._listen)
 
     def _listen(self, event: str, duration_secs: float, **_: str | int) -> None:
@@ -34,12 +36,22 @@ class Stopwatch:
             "/jax/core/compile/jaxpr_to_mlir_module_duration",
             "/jax/core/compile/backend_compile_duration",
         ):
-            self._compiling += duration_secs
+            now = time.perf_counter()
+            self.compiled(max(self._began, now - duration_secs), now)
+
+    def compiled(self, start: float, end: float) -> None:
+        """Note that something was being compiled; programs traced inside others, or on two threads, count once."""
+        with self._lock:
+            while self._compiling and self._compiling[-1][1] >= start:
+                before = self._compiling.pop()
+                start, end = min(start, before[0]), max(end, before[1])
+            self._compiling.append((start, end))
 
     @property
     def compile_s(self) -> float:
-        """Seconds spent compiling so far, added up over threads."""
-        return self._compiling
+        """Seconds so far in which something was being compiled."""
+        with self._lock:
+            return sum(end - start for start, end in self._compiling)
 
     @property
     def total_s(self) -> float:

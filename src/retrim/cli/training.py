@@ -11,47 +11,25 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from .. import build, presets
 from ..control.policy import Policy
-from ..learn.pretrain import pretrain
-from ..learn.represent import represent
 from ..learn.rollout import rollout
 from ..physics.dynamics import AbstractDynamics
 from ..presets import Preset
 from ..tasks.task import AbstractTask, Start
 from .session import console
 
-CHUNK = 10
-
 
 def train(preset: Preset, seed: int) -> tuple[Policy, list[float], bool]:
     """A pretrained policy, each epoch's loss, and whether Ctrl-C cut it short (then it is the last state reached)."""
-    k_init, k_train = random.split(random.key(seed))
-    policy, losses, interrupted = build.policy(preset, k_init), list[float](), False
+    policy, losses, interrupted = build.policy(preset, random.key(seed)), list[float](), False
     p = preset.pretrain
-    if preset.represent and preset.task == "vision":
-        with console.status(f"learning to see, {preset.represent} steps ..."):
-            k_init, k_see = random.split(k_init)
-            policy, errors = represent(policy, build.keypoints(preset), k_see, steps=preset.represent)
-            console.print(f"learnt to see: mean error of the state {float(errors[-50:].mean()):.3f} (scaled)")
+    first = f"learning to see, {preset.represent} steps ..." if preset.represent else "compiling ..."
     columns = TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[loss]}"), TimeRemainingColumn()
-    chunk = CHUNK if p.epochs % CHUNK == 0 else 1
     with Progress(*columns, console=console) as progress:
-        bar = progress.add_task(
-            f"pretraining, {p.epochs} x {p.envs} x {p.horizon}", total=p.epochs, loss="compiling ..."
-        )
+        bar = progress.add_task(f"pretraining, {p.epochs} x {p.envs} x {p.horizon}", total=p.epochs, loss=first)
         try:
-            for state, chunk_losses in pretrain(
-                policy,
-                build.nominal(preset),
-                build.task(preset),
-                k_train,
-                optimiser=build.optimiser(preset),
-                epochs=p.epochs,
-                envs=p.envs,
-                delay=preset.delay,
-                chunk=chunk,
-            ):
-                losses += [float(loss) for loss in chunk_losses]
-                policy = state.policy.plain()
+            for trained, latest in build.pretraining(preset, seed):
+                policy = trained
+                losses += [float(loss) for loss in latest]
                 progress.update(bar, completed=len(losses), loss=f"loss {losses[-1]:.3f}")
         except KeyboardInterrupt:
             interrupted = True

@@ -1,10 +1,9 @@
 """Stabilising hover at a goal (paper, Sec. IV-A.1)."""
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jax import random
 from jaxtyping import Array, Bool, Float, Key
@@ -12,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Key
 from ..physics import so3
 from ..physics.state import Command, State
 from .observation import AbstractObservation
-from .task import AbstractTask, Start, huber
+from .task import AbstractTask, Start, huber, within
 
 TILT = 0.1 * math.pi  # [rad], 18 degrees
 
@@ -24,23 +23,15 @@ class AbstractHover(AbstractTask):
     strong disturbance ends every flight and leaves nothing to learn from.
     """
 
-    if TYPE_CHECKING:  # as in AbstractTask
-
-        @property
-        def goal(self) -> Float[Array, "3"]:
-            """Where to hover, world [m]."""
-
-        @property
-        def box(self) -> Float[Array, ""]:
-            """Half its side [m]."""
-
-        @property
-        def heading(self) -> Float[Array, ""]:
-            """Starts head within +- this angle of the x axis [rad]; pi for anywhere."""
-    else:
-        goal: eqx.AbstractVar[Float[Array, "3"]]
-        box: eqx.AbstractVar[Float[Array, ""]]
-        heading: eqx.AbstractVar[Float[Array, ""]]
+    goal: Float[Array, "3"]
+    """Where to hover, world [m]."""
+    observation: AbstractObservation[Any]
+    box: Float[Array, ""]
+    """Half its side [m]."""
+    heading: Float[Array, ""]
+    """Starts head within +- this angle of the x axis [rad]; pi for anywhere."""
+    dt: float = eqx.field(static=True, default=0.02)
+    horizon: int = eqx.field(static=True, default=150)
 
     def reset(self, key: Key[Array, ""]) -> Start:
         """Goal +- 1 m per axis, yaw within ``heading``, pitch and roll within 18 degrees, 0.1 m/s of velocity noise."""
@@ -52,9 +43,7 @@ class AbstractHover(AbstractTask):
 
     def alive(self, t: Float[Array, ""], x: State) -> Bool[Array, ""]:
         """Inside the box, and finite."""
-        finite = jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(x)])
-        inside: Bool[Array, ""] = jnp.all(jnp.abs(x.p - self.goal) <= self.box) & jnp.all(finite)
-        return inside
+        return within(self.box, x, self.goal)
 
     def error(self, t: Float[Array, ""], x: State) -> Float[Array, ""]:
         """Distance from the goal [m]."""
@@ -64,37 +53,23 @@ class AbstractHover(AbstractTask):
 class Hover(AbstractHover):
     """With the paper's reward."""
 
-    goal: Float[Array, "3"]
-    observation: AbstractObservation[Any]
-    box: Float[Array, ""]
-    heading: Float[Array, ""]
-    """Starts head within +- this angle of the x axis [rad]; pi for anywhere."""
-    dt: float = eqx.field(static=True, default=0.02)
-    horizon: int = eqx.field(static=True, default=150)
-
     def reward(self, t: Float[Array, ""], x: State, u: Command) -> Float[Array, ""]:
         """r_pos + r_vel + r_act of the paper. The rate term acts on the commanded body rates, which Eq. (1) obeys."""
-        r_pos = -1.0 * huber(5.0 * (x.p - self.goal))
-        r_vel = -0.1 * huber(x.v) - 0.1 * huber(u.omega)
-        r_act = -0.5 * huber(u.vector() - Command.hover().vector())
-        return r_pos + r_vel + r_act
+        return _printed(self.goal, x, u)
 
 
 class SharpHover(AbstractHover):
     """With a reward that has a tip at the goal: the paper's is flat there, and a policy stays centimetres off."""
 
-    goal: Float[Array, "3"]
-    observation: AbstractObservation[Any]
-    box: Float[Array, ""]
-    heading: Float[Array, ""]
-    """Starts head within +- this angle of the x axis [rad]; pi for anywhere."""
-    dt: float = eqx.field(static=True, default=0.02)
-    horizon: int = eqx.field(static=True, default=150)
-
     def reward(self, t: Float[Array, ""], x: State, u: Command) -> Float[Array, ""]:
         """The paper's reward - 3 (sqrt(|p - goal|^2 + (1 cm)^2) - 1 cm)."""
-        r_pos = -1.0 * huber(5.0 * (x.p - self.goal))
-        r_vel = -0.1 * huber(x.v) - 0.1 * huber(u.omega)
-        r_act = -0.5 * huber(u.vector() - Command.hover().vector())
         tip = jnp.sqrt(jnp.sum((x.p - self.goal) ** 2) + 0.01**2) - 0.01
-        return r_pos + r_vel + r_act - 3.0 * tip
+        return _printed(self.goal, x, u) - 3.0 * tip
+
+
+def _printed(goal: Float[Array, "3"], x: State, u: Command) -> Float[Array, ""]:
+    """The paper's reward."""
+    r_pos = -1.0 * huber(5.0 * (x.p - goal))
+    r_vel = -0.1 * huber(x.v) - 0.1 * huber(u.omega)
+    r_act = -0.5 * huber(u.vector() - Command.hover().vector())
+    return r_pos + r_vel + r_act

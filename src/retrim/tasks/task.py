@@ -4,6 +4,7 @@ import abc
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
@@ -55,6 +56,13 @@ class AbstractTask(eqx.Module):
     @abc.abstractmethod
     def error(self, t: Float[Array, ""], x: State) -> Float[Array, ""]:
         """The paper's metric: distance from where the vehicle should be [m]."""
+
+
+def within(box: Float[Array, ""], x: State, centre: Float[Array, "3"]) -> Bool[Array, ""]:
+    """Whether ``x`` is finite, and no farther than ``box`` [m] from ``centre`` (world) along any axis."""
+    finite = jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(x)])
+    inside: Bool[Array, ""] = jnp.all(jnp.abs(x.p - centre) <= box) & jnp.all(finite)
+    return inside
 
 
 def huber(y: Float[Array, " n"]) -> Float[Array, ""]:
