@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from retrim import AdaptivePilot, ControllerPilot, Log, PolicyController, SimPlant, build, fly, presets, pretrain
+from retrim import ControllerPilot, Log, PolicyController, SimPlant, build, fly, presets
 from retrim.physics import Bem, Push, small
 
 QUICK = {
@@ -28,21 +28,10 @@ def main(*, quick: bool = False) -> None:
     ticks = 250 if quick else 1500  # of 20 ms
 
     # Pretrain in a model of one equation, which knows nothing of what follows.
-    training = pretrain(
-        build.policy(preset, jax.random.key(0)),
-        build.nominal(preset),
-        build.task(preset),
-        jax.random.key(1),
-        optimiser=build.optimiser(preset),
-        epochs=preset.pretrain.epochs,
-        envs=preset.pretrain.envs,
-        delay=preset.delay,
-    )
-    losses = []
-    for state, chunk in training:  # after every ten epochs
-        policy = state.policy
-        losses.extend(chunk.tolist())
-    print(f"pretrained: loss {losses[0]:.2f} -> {losses[-1]:.2f} in {len(losses)} epochs")
+    for trained, losses in build.pretraining(preset):  # after every ten epochs
+        policy = trained
+        print(f"pretraining: loss {float(losses[-1]):.3f}", end="\r")
+    print()
 
     # A realistic plant, pushed by 2 m/s² along each axis: any function of time and state will do.
     plant = SimPlant(Bem.of(small(), presets.DT), Push(lambda t, x: jnp.full_like(x.p, 2.0)))
@@ -51,10 +40,7 @@ def main(*, quick: bool = False) -> None:
     base = ControllerPilot(PolicyController(build.seen_in_flight(preset), policy))
     print(f"without adaptation: {error(fly(plant, base, x0, ticks=ticks), preset.goal):.3f} m off")
 
-    adapter = build.adapter(preset)
-    state = adapter.init(policy, build.residual(preset, jax.random.key(2)))
-    window = preset.adapt.window
-    pilot = AdaptivePilot(adapter, state, build.schedule(preset), jax.random.key(3), dt=presets.DT, window=window)
+    pilot = build.pilot(preset, policy, jax.random.key(1))
     print(f"with adaptation:    {error(fly(plant, pilot, x0, ticks=ticks), preset.goal):.3f} m off")
     for event in pilot.events:
         print(f"  {event.t:5.2f} s  {event.kind}: {event.note}")

@@ -12,8 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from retrim import AdaptivePilot, ControllerPilot, Log, PolicyController, SimPlant, build, fly, presets
-from retrim.cli.training import train
+from retrim import ControllerPilot, Log, PolicyController, SimPlant, build, fly, presets
 from retrim.physics import Bem, SteadyWind, small
 from retrim.tasks import Reference, from_csv
 from retrim.tasks.reference import spun_up
@@ -45,8 +44,10 @@ def main(*, quick: bool = False) -> None:
     hasty = Reference.of(lambda t: climb(3.0 * t), seconds=11.0 / 3.0, lap=1.0, points=256)
     print(f"three times as fast? {hasty.worst_violation(small()) or 'yes'}")
 
-    policy, losses, _ = train(preset, seed=0)
-    print(f"trained on {preset.reference}: loss {losses[0]:.2f} -> {losses[-1]:.2f}")
+    for trained, losses in build.pretraining(preset):  # after every ten epochs
+        policy = trained
+        print(f"pretraining: loss {float(losses[-1]):.3f}", end="\r")
+    print()
 
     plant = SimPlant(Bem.of(small(), presets.DT), SteadyWind(jnp.array([3.0, 0.0, 0.0])))
     ticks = 250 if quick else 1500
@@ -54,10 +55,7 @@ def main(*, quick: bool = False) -> None:
     pilot = ControllerPilot(PolicyController(build.seen_in_flight(preset, mine), policy))
     print(f"the climb in 3 m/s of wind, not adapted: {error(fly(plant, pilot, x0, ticks=ticks), mine):.3f} m off")
 
-    adapter = build.adapter(preset, mine)  # re-trains on what is flown
-    state = adapter.init(policy, build.residual(preset, jax.random.key(1)))
-    window = preset.adapt.window
-    pilot = AdaptivePilot(adapter, state, build.schedule(preset), jax.random.key(2), dt=presets.DT, window=window)
+    pilot = build.pilot(preset, policy, jax.random.key(1), flown=mine)  # re-trains on what is flown
     print(f"adapted in flight:                       {error(fly(plant, pilot, x0, ticks=ticks), mine):.3f} m off")
 
     # The first ten seconds as points in a file, one every half second: t, x, y, z, heading.

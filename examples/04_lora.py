@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from retrim import AdaptivePilot, ControllerPilot, LoraPolicy, PolicyController, SimPlant, build, fly, presets
-from retrim.cli.training import train
 from retrim.physics import Bem, Constant, small
 
 QUICK = {
@@ -32,7 +31,7 @@ def moved(before: object, after: object) -> float:
 def main(*, quick: bool = False) -> None:
     """Adapt a delta, then merge it."""
     preset = presets.changed(presets.load("fast"), **(QUICK if quick else {}))
-    policy, _, _ = train(preset, seed=0)
+    policy = build.pretrained(preset)
     lora = LoraPolicy.of(policy, key=jax.random.key(1))  # ranks 4, 10, 1; it starts as a delta of zero
     print(f"trained in flight: {numbers(lora.trained)} numbers instead of {numbers(policy.trained)}")
 
@@ -44,11 +43,8 @@ def main(*, quick: bool = False) -> None:
         log = fly(plant, pilot, x0, ticks=ticks)
         return float(np.linalg.norm(log.p[-100:] - np.array(preset.goal), axis=1).mean())
 
-    adapter = build.adapter(preset)
-    state = adapter.init(lora, build.residual(preset, jax.random.key(2)))
-    window = preset.adapt.window
-    pilot = AdaptivePilot(adapter, state, build.schedule(preset), jax.random.key(3), dt=presets.DT, window=window)
-    seen = adapter.task.observation
+    pilot = build.pilot(preset, lora, jax.random.key(2))
+    seen = build.seen_in_flight(preset)
     print(f"base policy:            {error(ControllerPilot(PolicyController(seen, policy))):.3f} m off")
     print(f"adapted, low rank:      {error(pilot):.3f} m off")
 

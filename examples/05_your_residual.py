@@ -12,9 +12,8 @@ import numpy as np
 import optax
 from jaxtyping import Array
 
-from retrim import ControllerPilot, Log, PolicyController, SimPlant, build, fly, presets
-from retrim.cli.training import train
-from retrim.learn import PolicyState, Window, bptt, residual_targets
+from retrim import ControllerPilot, PolicyController, SimPlant, build, fly, presets
+from retrim.learn import PolicyState, bptt, residual_targets
 from retrim.learn.pretrain import starts
 from retrim.physics import Bem, Command, Constant, Hybrid, State, small
 
@@ -31,17 +30,10 @@ class Bias(eqx.Module):
         return self.a
 
 
-def window_of(log: Log, ticks: int) -> Window:
-    """The last ticks of a flight. A log has the command that led to each state, a window the one that followed it."""
-    t, p, R, v = (jnp.asarray(rows[-ticks - 1 : -1]) for rows in (log.t, log.p, log.R, log.v))
-    u = jnp.asarray(log.u[-ticks:])
-    return Window(t, jax.vmap(State)(p, R, v), jax.vmap(Command.of)(u), jnp.ones(ticks, dtype=bool))
-
-
 def main(*, quick: bool = False) -> None:
     """Fly, fit, improve, fly again."""
     preset = presets.changed(presets.load("fast"), **(QUICK if quick else {}))
-    policy, _, _ = train(preset, seed=0)
+    policy = build.pretrained(preset)
     task, nominal = build.task(preset), build.nominal(preset)
     plant = SimPlant(Bem.of(small(), presets.DT), Constant(jnp.array([2.0, 2.0, 2.0])))
     pilot = ControllerPilot(PolicyController(task.observation, policy))
@@ -51,7 +43,7 @@ def main(*, quick: bool = False) -> None:
     print(f"before: {np.linalg.norm(log.p[-100:] - goal, axis=1).mean():.3f} m off")
 
     # What the model missed in each tick of the last two seconds; the best constant is its mean.
-    rows = residual_targets(window_of(log, 100), nominal, delay=preset.plant_delay)
+    rows = residual_targets(log.window(100), nominal, delay=preset.plant_delay)
     bias = Bias(jnp.mean(rows.a_res, axis=0))
     print(f"fitted bias: {', '.join(f'{a:.2f}' for a in bias.a.tolist())} m/s², where the push is 2 along each axis")
 

@@ -10,8 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from retrim import AdaptivePilot, ControllerPilot, PolicyController, SimPlant, build, fly, presets
-from retrim.cli.training import train
+from retrim import ControllerPilot, PolicyController, SimPlant, build, fly, presets
 from retrim.physics import STANDARD_GRAVITY, Bem, Command, Constant, State, Vehicle, small
 
 QUICK = {
@@ -42,18 +41,15 @@ def main(*, quick: bool = False) -> None:
     check("mine ", mine())
 
     preset = presets.changed(presets.load("fast"), **(QUICK if quick else {}))
-    policy, _, _ = train(preset, seed=0)  # for the small quadrotor
+    policy = build.pretrained(preset)  # for the small quadrotor
     plant = SimPlant(Bem.of(mine(), presets.DT), CALM)
     x0, goal, ticks = build.flight_starts(preset, 1)[0], np.array(preset.goal), 250 if quick else 1500
 
-    adapter = build.adapter(preset)
-    base = ControllerPilot(PolicyController(adapter.task.observation, policy))
+    base = ControllerPilot(PolicyController(build.seen_in_flight(preset), policy))
     log = fly(plant, base, x0, ticks=ticks)
     print(f"small's policy on mine: {np.linalg.norm(log.p[-100:] - goal, axis=1).mean():.3f} m off")
 
-    state = adapter.init(policy, build.residual(preset, jax.random.key(1)))
-    window = preset.adapt.window
-    pilot = AdaptivePilot(adapter, state, build.schedule(preset), jax.random.key(2), dt=presets.DT, window=window)
+    pilot = build.pilot(preset, policy, jax.random.key(1))
     log = fly(plant, pilot, x0, ticks=ticks)
     print(f"adapted in flight:      {np.linalg.norm(log.p[-100:] - goal, axis=1).mean():.3f} m off")
 

@@ -9,9 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from retrim import AdaptivePilot, Command, ControllerPilot, PolicyController, Sample, State, build, fly, presets
+from retrim import Command, ControllerPilot, PolicyController, Sample, State, build, fly, presets
 from retrim.adapt.plant import PlantError, refuse_unsound
-from retrim.cli.training import train
 
 QUICK = {
     "pretrain": {"epochs": 100, "envs": 8, "horizon": 100, "hidden": [32, 32]},
@@ -57,16 +56,13 @@ def main(*, quick: bool = False) -> None:
     """Fly the toy with a policy that was trained without it."""
     # The toy acts at once: it has no delay of commands to declare, only lag.
     preset = presets.changed(presets.load("fast"), plant_delay=0, **(QUICK if quick else {}))
-    policy, _, _ = train(preset, seed=0)
+    policy = build.pretrained(preset)
     x0, goal, ticks = build.flight_starts(preset, 1)[0], np.array(preset.goal), 250 if quick else 1500
 
-    adapter = build.adapter(preset)
-    log = fly(Toy(), ControllerPilot(PolicyController(adapter.task.observation, policy)), x0, ticks=ticks)
+    log = fly(Toy(), ControllerPilot(PolicyController(build.seen_in_flight(preset), policy)), x0, ticks=ticks)
     print(f"without adaptation: {np.linalg.norm(log.p[-100:] - goal, axis=1).mean():.3f} m off")
 
-    state = adapter.init(policy, build.residual(preset, jax.random.key(1)))
-    window = preset.adapt.window
-    pilot = AdaptivePilot(adapter, state, build.schedule(preset), jax.random.key(2), dt=presets.DT, window=window)
+    pilot = build.pilot(preset, policy, jax.random.key(1))
     log = fly(Toy(), pilot, x0, ticks=ticks)
     print(f"with adaptation:    {np.linalg.norm(log.p[-100:] - goal, axis=1).mean():.3f} m off")
     for event in pilot.events[:4]:

@@ -52,6 +52,24 @@ def test_window_is_a_copy():
     assert float(before.x.p[-1, 0]) == 1.0
 
 
+def test_a_log_gives_the_window_that_was_seen_in_flight(trained):
+    """Of a log and of a buffer, each state stands with the command that followed it."""
+    preset, policy = trained[:2]
+    buffer, inner = RollingBuffer(10), ControllerPilot(PolicyController(build.task(preset).observation, policy))
+
+    def pilot(sample):
+        u = inner(sample)
+        buffer.push(sample.t, sample.x, u)
+        return u
+
+    log = fly(Setting("simple").make("small"), pilot, build.flight_starts(preset, 1)[0], ticks=15)
+    seen, kept = buffer.window(), log.window(10)
+    for a, b in zip(jax.tree.leaves(seen), jax.tree.leaves(kept), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-12)
+    with pytest.raises(ValueError, match="16 ticks of a flight of 15"):
+        log.window(16)
+
+
 def test_buffer_size():
     with pytest.raises(ValueError, match="size = 1 must be at least 2"):
         RollingBuffer(1)

@@ -18,7 +18,6 @@ from retrim.control.lora import Thin
 from retrim.learn import PolicyState, bptt, policy_gradient, policy_loss
 from retrim.learn.pretrain import starts
 from retrim.physics import Command, PointMass, State, small
-from retrim.tasks import Start
 
 RANKS = (3, 4, 1)
 
@@ -172,7 +171,6 @@ def test_a_gradient_that_is_not_finite_changes_nothing(lora, key):
 def test_the_learner_beside_the_flight_takes_it(key, monkeypatch):
     """Improve returns a low-rank policy with the same base; the gate is given plain policies."""
     preset = tiny_preset(pretrain={"horizon": 20, "hidden": (12, 12)})
-    monkeypatch.setattr("retrim.adapt.adapter._drawn", drawn)  # see the next test
     judged = []
 
     def noting(candidate, incumbent, *rest, **options):
@@ -202,19 +200,15 @@ def test_the_learner_beside_the_flight_takes_it(key, monkeypatch):
     assert found.reason() == "a weight is not finite"
 
 
-def drawn(window, key, n):
-    row = random.choice(key, window.valid.shape[0], (n,), p=window.valid / jnp.sum(window.valid))
-    return jax.vmap(Start)(window.t[row], jax.tree.map(lambda leaf: leaf[row], window.x))
-
-
-def test_starts_drawn_from_a_window_keep_to_their_shapes(key):
-    x = State.at(jnp.array([0.3, 0.0, 1.0]))
-    buffer = RollingBuffer(3)
-    for i in range(2):
-        buffer.push(0.02 * i, x, Command.hover())
-    with jax.numpy_dtype_promotion("standard"):
-        wanted = drawn(buffer.window(), key, 4)
-        same(adapter_module._drawn(buffer.window(), key, 4), wanted)
+def test_starts_are_drawn_from_what_was_flown(key):
+    """Each is a state of the window with its own time; rows that were never filled are not drawn."""
+    buffer = RollingBuffer(5)
+    for i in range(3):
+        buffer.push(0.02 * (i + 1), State.at(jnp.array([float(i + 1), 0.0, 1.0])), Command.hover())
+    found = adapter_module._drawn(buffer.window(), key, 60)
+    np.testing.assert_allclose(found.t, 0.02 * found.x.p[:, 0])
+    assert set(np.asarray(found.x.p[:, 0]).tolist()) == {1.0, 2.0, 3.0}
+    assert found.x.R.shape == (60, 3, 3)
 
 
 # ---- refusals

@@ -5,11 +5,13 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from ..control.controller import AbstractController
+from ..learn.residual import Window
 from ..physics.state import Command, State
 from .sink import Sink
 
@@ -108,6 +110,24 @@ class Log(NamedTuple):
     """Commands issued for the ticks that ended in these states: c [m/s^2], omega [rad/s]."""
     crashed: bool
     """The vehicle left the task's bounds; the flight ended there."""
+
+    @property
+    def x(self) -> State:
+        """The states, ticks in front."""
+        states: State = jax.vmap(State)(*map(jnp.asarray, (self.p, self.R, self.v)))
+        return states
+
+    def window(self, ticks: int) -> Window:
+        """The last ticks as a learner takes them: each state with the command that *followed* it.
+
+        Raises ``ValueError`` for a flight that was shorter.
+        """
+        if not 0 < ticks < len(self.t):
+            raise ValueError(f"Log.window: {ticks} ticks of a flight of {len(self.t) - 1}")
+        states = jax.tree.map(lambda leaf: leaf[-ticks - 1 : -1], self.x)
+        t = jnp.asarray(self.t[-ticks - 1 : -1], dtype=states.p.dtype)
+        u = jax.vmap(Command.of)(jnp.asarray(self.u[-ticks:], dtype=states.p.dtype))
+        return Window(t, states, u, jnp.ones(ticks, dtype=bool))
 
 
 def fly(

@@ -176,7 +176,7 @@ class Campaign:
         pilot: Pilot = adaptive or ControllerPilot(PolicyController(self._seen, self.policy))
         plant = self._plant(plan.disturbance, plan.start)
         log = fly(plant, pilot, self._starts[plan.start], ticks=self._ticks, alive=self._alive, sinks=(ticker,))
-        error, cross = _errors(self._adapter.task, log.t, State(*map(jnp.asarray, (log.p, log.R, log.v))))
+        error, cross = _errors(self._adapter.task, log.t, log.x)
         events = tuple(adaptive.events) if adaptive else ()
         off_lap = None if cross is None else np.asarray(cross)
         return Flight(

@@ -2,13 +2,14 @@
 
 import itertools
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .. import testbed
+from .. import build, testbed
 from ..physics.conditions import Conditions
 from ..physics.state import State
 from ..presets import Preset
@@ -29,15 +30,23 @@ def picture(
     stem: str | None = None,
 ) -> list[Path]:
     """``hover_<disturbance>.png`` and ``.svg`` of the flights under one disturbance; returns their paths."""
-    base, adapted = (
-        [_track(f) for f in flights if f.plan.disturbance == disturbance and f.plan.method in method]
-        for method in (("base",), ("full", "lora"))
-    )
+    shown = [f for f in flights if f.plan.disturbance == disturbance]
+    before = [f for f in shown if f.plan.method == "base"]
+    after = [f for f in shown if f.plan.method != "base"]
+    base, adapted = ([_track(f) for f in group] for group in (before, after))
     seconds = max(float(track.t[-1]) for track in (*base, *adapted))
     where = f"{setting.flown} on plant {setting.plant!r}"
     title = f"{preset.task.capitalize()}: {where}, disturbance {disturbance!r}, preset {preset.name!r}"
-    lap = None if flown is None else np.asarray(flown.rows)[:, :3]
-    figure = plots.flight_figure(title, base, adapted, spans(disturbance, preset.goal, seconds), preset.goal, lap)
+
+    if preset.task == "vision":
+        at_goal = _sighting(preset, jax.tree.map(lambda leaf: leaf[None], State.at(jnp.array(preset.goal)))).pixel[0]
+        first, last = ([_sighting(preset, f.log.x) for f in group[:1]] for group in (before, after))
+        beside = partial(plots.camera, base=first, adapted=last, wanted=at_goal)
+    elif flown is not None:
+        beside = partial(plots.laps, base=base, adapted=adapted, lap=np.asarray(flown.rows)[:, :3])
+    else:
+        beside = partial(plots.paths, base=base, adapted=adapted, goal=preset.goal)
+    figure = plots.flight_figure(title, base, adapted, spans(disturbance, preset.goal, seconds), beside)
     return plots.save(figure, folder, stem or f"{preset.task}_{disturbance.replace('+', '_')}")
 
 
@@ -77,3 +86,8 @@ def _label(here: Conditions) -> str:
 
 def _track(flight: Flight) -> plots.Track:
     return plots.Track(flight.log.t, flight.log.p, flight.error, flight.swaps, flight.log.crashed)
+
+
+def _sighting(preset: Preset, x: State) -> plots.Sighting:
+    pixel, visible = jax.jit(jax.vmap(build.keypoints(preset).pixels))(x)
+    return plots.Sighting(np.asarray(pixel), np.asarray(visible))

@@ -1,5 +1,6 @@
 """Pictures of flights: the only place that imports matplotlib."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,6 +33,16 @@ class Track:
 
 
 @dataclass(frozen=True)
+class Sighting:
+    """What the camera saw in one flight."""
+
+    pixel: np.ndarray
+    """Ticks x 7 x 2; the image is [-1, 1] x [-1, 1]."""
+    visible: np.ndarray
+    """Ticks x 7."""
+
+
+@dataclass(frozen=True)
 class Span:
     """A disturbance while it lasts."""
 
@@ -44,17 +55,9 @@ class Span:
 
 
 def flight_figure(
-    title: str,
-    base: list[Track],
-    adapted: list[Track],
-    spans: list[Span],
-    goal: tuple[float, float, float],
-    lap: np.ndarray | None = None,
+    title: str, base: list[Track], adapted: list[Track], spans: list[Span], beside: Callable[[Axes], None]
 ) -> Figure:
-    """Error over time beside the path from above; base against adapted, one thin line a flight, the mean thick.
-
-    With a ``lap`` (points x 3), the path is that over it in the last ten seconds.
-    """
+    """Error over time, base against adapted, one thin line a flight, the mean thick; ``beside`` draws what is right."""
     with plt.rc_context(
         {"font.size": 11, "axes.spines.top": False, "axes.spines.right": False, "svg.fonttype": "none"}
     ):
@@ -63,10 +66,7 @@ def flight_figure(
         )
         figure.suptitle(title, fontsize=14, fontweight="bold", color=INK)
         _errors(left, base, adapted, spans)
-        if lap is None:
-            _paths(right, base, adapted, goal)
-        else:
-            _laps(right, base, adapted, lap)
+        beside(right)
         figure.legend(loc="outside lower center", ncols=4, frameon=False)
     return figure
 
@@ -107,7 +107,8 @@ def _errors(axes: Axes, base: list[Track], adapted: list[Track], spans: list[Spa
     axes.margins(x=0)
 
 
-def _paths(axes: Axes, base: list[Track], adapted: list[Track], goal: tuple[float, float, float]) -> None:
+def paths(axes: Axes, base: list[Track], adapted: list[Track], goal: tuple[float, float, float]) -> None:
+    """The paths from above, to the goal."""
     for tracks, color, name in ((base, BASE, "base"), (adapted, ADAPTED, "adapted")):
         for i, track in enumerate(tracks):
             axes.plot(track.p[:, 0], track.p[:, 1], color=color, alpha=0.35, linewidth=0.9)
@@ -128,7 +129,8 @@ def _paths(axes: Axes, base: list[Track], adapted: list[Track], goal: tuple[floa
     axes.set_aspect("equal", adjustable="datalim")
 
 
-def _laps(axes: Axes, base: list[Track], adapted: list[Track], lap: np.ndarray) -> None:
+def laps(axes: Axes, base: list[Track], adapted: list[Track], lap: np.ndarray) -> None:
+    """The paths of the last ten seconds from above, over the lap (points x 3)."""
     axes.plot(lap[:, 0], lap[:, 1], color="#BBBBBB", linewidth=5, label="reference", zorder=1)
     for tracks, color, name in ((base, BASE, "base"), (adapted, ADAPTED, "adapted")):
         for i, track in enumerate(track for track in tracks if not track.crashed):
@@ -139,3 +141,22 @@ def _laps(axes: Axes, base: list[Track], adapted: list[Track], lap: np.ndarray) 
             )  # fmt: skip
     axes.set(xlabel="x [m]", ylabel="y [m]", title="the last laps from above")
     axes.set_aspect("equal", adjustable="datalim")
+
+
+def camera(axes: Axes, base: list[Sighting], adapted: list[Sighting], wanted: np.ndarray) -> None:
+    """What the camera saw in the first flight of each kind; ``wanted`` (7 x 2): where the points are at the goal."""
+    for sightings, color, name in ((base, BASE, "base"), (adapted, ADAPTED, "adapted")):
+        for sighting in sightings[:1]:
+            seen = np.where(sighting.visible[:, :, None], sighting.pixel, np.nan)
+            for i in range(seen.shape[1]):
+                axes.plot(seen[:, i, 0], seen[:, i, 1], color=color, alpha=0.5, linewidth=0.9)
+                axes.plot(
+                    seen[-1, i, 0], seen[-1, i, 1], "o", color=color, markersize=7, markeredgecolor="white",
+                    label=None if i else f"{name}, at the end",
+                )  # fmt: skip
+            first = seen[0][sighting.visible[0]]
+            axes.plot(first[:, 0], first[:, 1], ".", color="#999999", label="at the start" if color == BASE else None)
+    axes.plot(wanted[:, 0], wanted[:, 1], "+", color=INK, markersize=14, markeredgewidth=1.6, label="at the target")
+    axes.set(xlabel="image, across", ylabel="image, down", title="what the camera saw of the seven points")
+    axes.set(xlim=(-1, 1), ylim=(1, -1))
+    axes.spines[["top", "right"]].set_visible(True)

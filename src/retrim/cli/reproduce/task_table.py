@@ -52,7 +52,7 @@ def table(
             {**row, "preset": block.preset.name, "reference": block.reference, "block": block.title} for row in part
         ]
         lines += _lines(block, part, own)
-        console.print("\n".join(_lines(block, part, own)), markup=False)
+        console.print("\n".join(_lines(block, part, own)), markup=False, soft_wrap=True)
         lines += _picture(block, flights, plant, name, folder)
         foot = f"Compiling {watch.compile_s:.0f} s, all else {watch.total_s - watch.compile_s:.0f} s."
         text = [*about, "", f"Commit {commit()}; {machine()}. Plant `{plant}`, seed {seed}, {starts} starts,",
