@@ -62,9 +62,14 @@ class Plant(Protocol):
         ...
 
 
+def numbers(u: Command) -> np.ndarray:
+    """[c, omega] in NumPy; unlike ``u.vector()`` not an operation of JAX, of which a tick should have few."""
+    return np.append(np.asarray(u.c), np.asarray(u.omega))
+
+
 def refuse_unsound(u: Command, plant: str) -> None:
     """Raise ``PlantError``, naming the entry, if a command is not finite; every plant calls it first."""
-    for name, value in zip(("c", "omega[0]", "omega[1]", "omega[2]"), np.asarray(u.vector()).tolist(), strict=True):
+    for name, value in zip(("c", "omega[0]", "omega[1]", "omega[2]"), numbers(u).tolist(), strict=True):
         if not math.isfinite(value):
             raise PlantError(f"{plant}: command refused, {name} = {value} is not finite")
 
@@ -160,6 +165,6 @@ def fly(
         np.stack([np.asarray(s.really.p) for s in samples]),
         np.stack([np.asarray(s.really.R) for s in samples]),
         np.stack([np.asarray(s.really.v) for s in samples]),
-        np.stack([np.asarray(s.u.vector()) for s in samples]),
+        np.stack([numbers(s.u) for s in samples]),
         crashed,
     )

@@ -11,7 +11,7 @@ import numpy as np
 from ...physics.conditions import Conditions
 from ...physics.disturbance import Disturbance
 from ...physics.state import STANDARD_GRAVITY, Command, State
-from ..plant import PlantError, Sample, refuse_unsound
+from ..plant import PlantError, Sample, numbers, refuse_unsound
 
 HOVER = np.array([STANDARD_GRAVITY, 0.0, 0.0, 0.0])
 
@@ -71,7 +71,7 @@ class ForeignPlant(abc.ABC):
         after = self._advance(self._held, around)
         dtype = self._x.p.dtype
         self._x = State(*(jnp.asarray(a, dtype=dtype) for a in after))
-        self._held = np.asarray(u.vector(), dtype=np.float64)
+        self._held = numbers(u).astype(np.float64)
         self._ticks += 1
         return Sample(self._ticks * self.dt, self._x, u, truth=self._x)
 
