@@ -2,14 +2,11 @@
 
 import json
 import resource
-import statistics
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -25,80 +22,14 @@ from ..adapt.plant import ControllerPilot, fly
 from ..adapt.plants.closed_loop import closed_loop
 from ..control.controller import PolicyController
 from ..learn.bptt import PolicyState
-from ..learn.pretrain import train_chunk
 from ..learn.residual import Window
 from ..physics.bem import Bem
 from ..physics.state import Command, State
 from ..physics.vehicle import small
-from ..presets import Preset
 from ..testbed import Setting, disturbance
+from .bench_timing import Work, compiled, timed
+from .bench_training import pretrain, see_and_pretrain
 from .session import Stopwatch
-from .training import nominal_error, train
-
-
-@dataclass(frozen=True)
-class Work:
-    """One row of the bench."""
-
-    title: str
-    goal: str
-    do: Callable[[], dict[str, Any]]
-    """Returns compile_s, run_s and remarks."""
-    paper: str = "-"
-    """What the paper reports, on an RTX 4090."""
-    authors: str = "-"
-    """What the authors' code took on two CPU cores, compiling in brackets."""
-    cached: bool = False
-    """Uses the bench's own persistent compile cache, empty at first."""
-
-
-def _timed(compile_s: float, run: Callable[[], Any], runs: int) -> dict[str, Any]:
-    seconds = []
-    for _ in range(runs):
-        began = time.perf_counter()
-        jax.block_until_ready(run())
-        seconds.append(time.perf_counter() - began)
-    spread = f"{min(seconds):.3g} to {max(seconds):.3g} s in {runs} runs" if runs > 1 else "1 run"
-    return {"compile_s": compile_s, "run_s": statistics.median(seconds), "remarks": spread}
-
-
-def _compiled(jitted: Any, *arguments: Any) -> tuple[Any, float]:
-    began = time.perf_counter()
-    program = jitted.lower(*arguments).compile()
-    return program, time.perf_counter() - began
-
-
-def _pretrain(preset: Preset, runs: int) -> dict[str, Any]:
-    p, key = preset.pretrain, random.key(0)
-    optimiser = build.optimiser(preset)
-    policy = build.policy(preset, key)
-    state = PolicyState(policy, optimiser.init(policy.layers))
-    fixed = build.nominal(preset), build.task(preset)
-    sizes = optimiser, 10, p.envs, preset.delay
-    program, compile_s = _compiled(train_chunk, state, *fixed, key, *sizes)
-
-    def run(seed: int = 0) -> PolicyState:
-        trained = state
-        for k in random.split(random.key(seed), p.epochs // 10):
-            trained, _ = program(trained, *fixed, k, *sizes)
-        return trained
-
-    row = _timed(compile_s, run, runs)
-    errors = (
-        [nominal_error(preset, run(seed).policy.plain()) for seed in range(1, 4)]
-        if runs > 1
-        else [nominal_error(preset, run().policy.plain())]
-    )
-    row["remarks"] += "; hover error " + ", ".join(f"{1000 * e:.1f}" for e in errors) + " mm"
-    return row
-
-
-def _see_and_pretrain(name: str) -> dict[str, Any]:
-    """Representation, then policy, of a preset for vision."""
-    preset, watch = presets.load(name), Stopwatch()
-    policy, _, _ = train(preset, 0)
-    row = {"compile_s": watch.compile_s, "run_s": watch.total_s - watch.compile_s}
-    return row | {"remarks": f"hover error {1000 * nominal_error(preset, policy):.1f} mm"}
 
 
 def _learner() -> tuple[Adapter, AdaptState, Window]:
@@ -121,14 +52,14 @@ def _burst() -> dict[str, Any]:
     adapter, state, window = _learner()
     fitted, _, _ = adapter.refine(state.residual, window)
     arguments = adapter, state.policy, fitted.residual, window, random.key(0)
-    program, compile_s = _compiled(Adapter.improve, *arguments)
-    return _timed(compile_s, lambda: program(*arguments), 9)
+    program, compile_s = compiled(Adapter.improve, *arguments)
+    return timed(compile_s, lambda: program(*arguments), 9)
 
 
 def _residual() -> dict[str, Any]:
     adapter, state, window = _learner()
-    program, compile_s = _compiled(Adapter.refine, adapter, state.residual, window)
-    return _timed(compile_s, lambda: program(adapter, state.residual, window), 9)
+    program, compile_s = compiled(Adapter.refine, adapter, state.residual, window)
+    return timed(compile_s, lambda: program(adapter, state.residual, window), 9)
 
 
 def _programs() -> dict[str, Any]:
@@ -151,7 +82,7 @@ def _tick() -> dict[str, Any]:
     began = time.perf_counter()
     fly(plant, ControllerPilot(controller), x0, ticks=2)
     compile_s = time.perf_counter() - began
-    row = _timed(compile_s, lambda: fly(plant, ControllerPilot(controller), x0, ticks=1500).p, 5)
+    row = timed(compile_s, lambda: fly(plant, ControllerPilot(controller), x0, ticks=1500).p, 5)
     row["remarks"] = f"{1000 * row['run_s'] / 1500:.2f} ms a tick; " + row["remarks"]
     return row
 
@@ -167,10 +98,10 @@ def _eight() -> dict[str, Any]:
     def four(controller: PolicyController, x0s: State) -> State:
         return lax.map(lambda x0: closed_loop(model, around, controller, x0, ticks=1500)[0], x0s)  # type: ignore[no-any-return]
 
-    program, compile_s = _compiled(four, controller, halves[0])
+    program, compile_s = compiled(four, controller, halves[0])
     with ThreadPoolExecutor(2) as pool:
         fly_all = lambda: list(pool.map(lambda x0s: jax.block_until_ready(program(controller, x0s)), halves))  # noqa: E731
-        return _timed(compile_s, fly_all, 3)
+        return timed(compile_s, fly_all, 3)
 
 
 def _bem_tick() -> dict[str, Any]:
@@ -186,7 +117,7 @@ def _bem_tick() -> dict[str, Any]:
             sample = plant.exchange(u)
         return sample.x.p
 
-    row = _timed(compile_s, ticks, 5)
+    row = timed(compile_s, ticks, 5)
     return row | {"run_s": row["run_s"] / 500, "remarks": f"500 ticks: {row['remarks']}"}
 
 
@@ -203,7 +134,7 @@ def _fleet(how: str) -> dict[str, Any]:
     if how == "threads":
         jax.block_until_ready(one(state, window, keys[0]))
         with ThreadPoolExecutor(2) as pool:
-            row = _timed(0.0, lambda: list(pool.map(lambda k: jax.block_until_ready(one(state, window, k)), keys)), 3)
+            row = timed(0.0, lambda: list(pool.map(lambda k: jax.block_until_ready(one(state, window, k)), keys)), 3)
         return row | {"compile_s": None, "remarks": row["remarks"] + "; compiled as one update"}
 
     @jax.jit
@@ -212,8 +143,8 @@ def _fleet(how: str) -> dict[str, Any]:
             return lax.map(lambda key: one(state, window, key), keys)  # type: ignore[no-any-return]
         return jax.vmap(lambda key: one(state, window, key))(keys)
 
-    program, compile_s = _compiled(fleet, state, window, keys)
-    return _timed(compile_s, lambda: program(state, window, keys), 3)
+    program, compile_s = compiled(fleet, state, window, keys)
+    return timed(compile_s, lambda: program(state, window, keys), 3)
 
 
 def _demo() -> dict[str, Any]:
@@ -230,22 +161,22 @@ def _demo() -> dict[str, Any]:
 
 WORKS: dict[str, Work] = {
     "pretrain-paper": Work(
-        "pretrain 300 x 100 x 150", "40 s", lambda: _pretrain(presets.load("paper"), 1), "15 s", "50.6 s (5.1 s)"
+        "pretrain 300 x 100 x 150", "40 s", lambda: pretrain(presets.load("paper"), 1), "15 s", "50.6 s (5.1 s)"
     ),
-    "pretrain-fast": Work("pretrain 150 x 16 x 150, to 5 mm", "6 s", lambda: _pretrain(presets.load("fast"), 3)),
+    "pretrain-fast": Work("pretrain 150 x 16 x 150, to 5 mm", "6 s", lambda: pretrain(presets.load("fast"), 3)),
     "pretrain-track-paper": Work(
-        "pretrain tracking 300 x 100 x 150", "45 s", lambda: _pretrain(presets.load("track-paper"), 1)
+        "pretrain tracking 300 x 100 x 150", "45 s", lambda: pretrain(presets.load("track-paper"), 1)
     ),
     "pretrain-track": Work(
-        "pretrain tracking 600 x 32 x 100, three references", "-", lambda: _pretrain(presets.load("track"), 1)
+        "pretrain tracking 600 x 32 x 100, three references", "-", lambda: pretrain(presets.load("track"), 1)
     ),
     "pretrain-vision": Work(
-        "learn to see, and pretrain 300 x 16 x 150", "30 s, to 0.02 m", lambda: _see_and_pretrain("vision")
+        "learn to see, and pretrain 300 x 16 x 150", "30 s, to 0.02 m", lambda: see_and_pretrain("vision")
     ),
     "pretrain-vision-paper": Work(
         "learn to see, and pretrain 500 x 300 x 150",
         "360 s",
-        lambda: _see_and_pretrain("vision-paper"),
+        lambda: see_and_pretrain("vision-paper"),
         authors="433 s",
     ),
     "burst": Work("policy update 30 x 10 x 150, with residual", "0.8 s", _burst, "1.5 s", "2.5 s (6.1 s, each call)"),

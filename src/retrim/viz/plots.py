@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 
 # Okabe and Ito's colours, distinguishable with any colour vision.
 BASE, ADAPTED, UPDATE, PUSH, INK = "#D55E00", "#0072B2", "#009E73", "#E69F00", "#333333"
+ASPECT = 720 / 1280  # of a camera's image, whose axes both run from -1 to 1
 
 
 @dataclass(frozen=True)
@@ -158,5 +159,6 @@ def camera(axes: Axes, base: list[Sighting], adapted: list[Sighting], wanted: np
             axes.plot(first[:, 0], first[:, 1], ".", color="#999999", label="at the start" if color == BASE else None)
     axes.plot(wanted[:, 0], wanted[:, 1], "+", color=INK, markersize=14, markeredgewidth=1.6, label="at the target")
     axes.set(xlabel="image, across", ylabel="image, down", title="what the camera saw of the seven points")
-    axes.set(xlim=(-1, 1), ylim=(1, -1))
+    ticks = (-1.0, -0.5, 0.0, 0.5, 1.0)
+    axes.set(xlim=(-1, 1), ylim=(1, -1), xticks=ticks, yticks=ticks, aspect=ASPECT)
     axes.spines[["top", "right"]].set_visible(True)

@@ -28,7 +28,7 @@ ABOUT = (
 
 def vision(
     plant: PlantName = "bem",
-    preset: tuple[str, ...] = ("vision", "vision-honest"),
+    preset: tuple[str, ...] = tuple(TITLES),
     seconds: float = 30.0,
     starts: int = 8,
     seed: int = 0,
