@@ -4,6 +4,7 @@ from pathlib import Path
 
 from ... import presets
 from ...testbed import PlantName
+from ..flights import Method
 from ..session import run_folder
 from .task_table import Block, table
 
@@ -44,6 +45,12 @@ def vision(
         seed: Seed of training, starts and learners.
         out: Folder for vision.md, vision.json and pictures; a new one under runs/ by default.
     """
-    blocks = [Block(TITLES.get(name, name), presets.load(name), paper=PAPER) for name in preset]
+    blocks = [_block(name) for name in preset]
     folder = run_folder(out, "reproduce")
     return table("vision", ABOUT, blocks, plant=plant, seconds=seconds, starts=starts, seed=seed, folder=folder)
+
+
+def _block(name: str) -> Block:
+    """An update of the paper's size takes seconds; its preset adapts all weights only."""
+    methods: tuple[Method, ...] = ("base", "full") if name == "vision-paper" else ("base", "full", "lora")
+    return Block(TITLES.get(name, name), presets.load(name), methods=methods, paper=PAPER)
