@@ -32,9 +32,9 @@ from .bench_training import pretrain, see_and_pretrain
 from .session import Stopwatch
 
 
-def _learner() -> tuple[Adapter, AdaptState, Window]:
+def _learner(name: str = "paper") -> tuple[Adapter, AdaptState, Window]:
     """Adapter, its state with a residual that is not zero, and a full window of flight under the large disturbance."""
-    preset = presets.load("paper")
+    preset = presets.load(name)
     policy = build.policy(preset, random.key(0))
     adapter = build.adapter(preset)
     plant = Setting().make("large")
@@ -48,8 +48,8 @@ def _learner() -> tuple[Adapter, AdaptState, Window]:
     return adapter, state, window
 
 
-def _burst() -> dict[str, Any]:
-    adapter, state, window = _learner()
+def _burst(name: str) -> dict[str, Any]:
+    adapter, state, window = _learner(name)
     fitted, _, _ = adapter.refine(state.residual, window)
     arguments = adapter, state.policy, fitted.residual, window, random.key(0)
     program, compile_s = compiled(Adapter.improve, *arguments)
@@ -179,7 +179,18 @@ WORKS: dict[str, Work] = {
         lambda: see_and_pretrain("vision-paper"),
         authors="433 s",
     ),
-    "burst": Work("policy update 30 x 10 x 150, with residual", "0.8 s", _burst, "1.5 s", "2.5 s (6.1 s, each call)"),
+    "burst": Work(
+        "policy update 30 x 10 x 150, with residual",
+        "0.8 s",
+        lambda: _burst("paper"),
+        "1.5 s",
+        "2.5 s (6.1 s, each call)",
+    ),
+    "burst-track": Work("policy update 30 x 10 x 100, preset track", "1 s, its charge", lambda: _burst("track")),
+    "burst-vision": Work("policy update 30 x 10 x 150, preset vision", "1 s, its charge", lambda: _burst("vision")),
+    "burst-vision-paper": Work(
+        "policy update 50 x 30 x 150, preset vision-paper", "4 s, its charge", lambda: _burst("vision-paper")
+    ),
     "residual": Work("residual, 3 nets x 100 iterations x 100 samples", "0.1 s", _residual, "2 s", "0.53 s (1.1 s)"),
     "programs-cold": Work("all programs of a flight, empty cache", "compile 60 s", _programs, cached=True),
     "programs-warm": Work("all programs of a flight, from the cache", "compile 5 s", _programs, cached=True),
