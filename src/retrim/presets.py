@@ -176,7 +176,7 @@ PRESETS: dict[str, Preset] = {
         delay=1,
         represent=3000,
         pretrain=Pretrain(epochs=500, envs=300, rate=1e-3, heading=TILT),
-        adapt=Adapt(epochs=50, envs=30, improve_charge=4.0),
+        adapt=Adapt(epochs=50, envs=30, improve_charge=5.0),
     ),
 }
 
