@@ -21,12 +21,8 @@ class PolicyError(ValueError):
 
 def save_policy(path: str | Path, policy: Policy, preset: Preset) -> None:
     """Write ``policy`` and the preset it was trained with to ``path``; the folder is made if need be."""
-    path = Path(path)
     about = {"preset": presets.dump(preset), "task": preset.task, "architecture": _architecture(policy)}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
-    partial.write_bytes(wire.pack(policy, kind="policy", about=about))
-    partial.replace(path)  # an interrupted write leaves the old file
+    _write(Path(path), wire.pack(policy, kind="policy", about=about))
 
 
 def load_policy(path: str | Path) -> tuple[Policy, Preset]:
@@ -37,12 +33,8 @@ def load_policy(path: str | Path) -> tuple[Policy, Preset]:
     """
     path = Path(path)
     file = path / "policy.safetensors" if path.is_dir() else path
-    if not file.is_file():
-        raise PolicyError(f"{file}: no such file; `retrim pretrain hover --out DIR` makes one")
     try:
-        if (size := file.stat().st_size) > wire.MAX_BYTES:
-            raise PolicyError(f"{file}: {size} bytes, more than the {wire.MAX_BYTES} that are accepted")
-        data = file.read_bytes()
+        data = _read(file, "`retrim pretrain hover --out DIR` makes one")
         header = wire.describe(data, kind="policy", source=str(file))
         preset = presets.parse(header.get("preset", ""), source=f"{file}, header, preset")
         like = jax.eval_shape(lambda: build.policy(preset, random.key(0)))
@@ -67,13 +59,9 @@ def fingerprint(policy: Policy) -> str:
 
 def save_delta(path: str | Path, policy: LoraPolicy) -> None:
     """Write what a low-rank policy has learnt, without its base: about 50 kB for the paper's network."""
-    path = Path(path)
     ranks = "-".join(str(thin.down.shape[0]) for thin in policy.delta)
     about = {"base": fingerprint(policy.base), "ranks": ranks, "scale": repr(float(policy.scale))}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
-    partial.write_bytes(wire.pack(policy.delta, kind="delta", about=about))
-    partial.replace(path)
+    _write(Path(path), wire.pack(policy.delta, kind="delta", about=about))
 
 
 def load_delta(path: str | Path, base: Policy) -> LoraPolicy:
@@ -82,12 +70,8 @@ def load_delta(path: str | Path, base: Policy) -> LoraPolicy:
     Raises :class:`PolicyError` for a file that is missing, damaged or of another kind, and for another base.
     """
     path = Path(path)
-    if not path.is_file():
-        raise PolicyError(f"{path}: no such file; `retrim fly --adapt lora --out DIR` makes a delta.safetensors")
     try:
-        if (size := path.stat().st_size) > wire.MAX_BYTES:
-            raise PolicyError(f"{path}: {size} bytes, more than the {wire.MAX_BYTES} that are accepted")
-        data = path.read_bytes()
+        data = _read(path, "`retrim fly --adapt lora --out DIR` makes a delta.safetensors")
         header = wire.describe(data, kind="delta", source=str(path))
         if header.get("base") != fingerprint(base):
             raise PolicyError(f"{path}: made for another base policy, {header.get('base', 'unnamed')[:12]}..., not for "
@@ -98,6 +82,21 @@ def load_delta(path: str | Path, base: Policy) -> LoraPolicy:
         return LoraPolicy(base, delta, jnp.asarray(scale, dtype=base.layers[0].weight.dtype))
     except (wire.WireError, OSError, KeyError, ValueError) as error:
         raise error if isinstance(error, PolicyError) else PolicyError(f"{path}: {error}") from error
+
+
+def _write(path: Path, data: bytes) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(path.name + ".partial")
+    partial.write_bytes(data)
+    partial.replace(path)  # an interrupted write leaves the old file
+
+
+def _read(file: Path, advice: str) -> bytes:
+    if not file.is_file():
+        raise PolicyError(f"{file}: no such file; {advice}")
+    if (size := file.stat().st_size) > wire.MAX_BYTES:
+        raise PolicyError(f"{file}: {size} bytes, more than the {wire.MAX_BYTES} that are accepted")
+    return file.read_bytes()
 
 
 def _architecture(policy: Policy) -> str:

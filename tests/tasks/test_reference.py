@@ -314,7 +314,7 @@ def test_the_end_is_held():
 
 def written(tmp_path, text):
     file = tmp_path / "path.csv"
-    file.write_text(text)
+    file.write_text(text, encoding="utf-8")
     return file
 
 
@@ -325,7 +325,7 @@ def helix_csv(tmp_path, header):
     return written(tmp_path, header + text + "\n\n")
 
 
-@pytest.mark.parametrize("header", ["t,x,y,z,yaw\n", "Time, x [m], y, z, yaw\n", ""])
+@pytest.mark.parametrize("header", ["t,x,y,z,yaw\n", "\ufeffTimestamp [s], x [m], y, z, yaw\n", ""])
 def test_helix_from_csv(header, tmp_path):
     """Through its points, at their times; away from the ends, where it must come to rest, its derivative too."""
     reference = from_csv(helix_csv(tmp_path, header))

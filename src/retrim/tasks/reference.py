@@ -170,13 +170,13 @@ REFERENCES: dict[str, Callable[[], Reference]] = {"circle": circle, "figure8": f
 def from_csv(file: Path) -> Reference:
     """A reference through the points of a CSV file with columns t, x, y, z and, if wanted, yaw ([s], [m], [rad]).
 
-    A cubic spline, starting and ending at rest; a header line is skipped. Raises ``ValueError`` with the line for what
-    is not a number, for times that do not rise, and for fewer than two points.
+    A cubic spline, starting and ending at rest; a header line, whose first word starts with t, is skipped. Raises
+    ``ValueError`` with the line for what is not a number, for times that do not rise, and for fewer than two points.
     """
     rows = list[list[float]]()
-    for number, line in enumerate(file.read_text().splitlines(), start=1):
+    for number, line in enumerate(file.read_text(encoding="utf-8-sig").splitlines(), start=1):
         words = [word.strip() for word in line.split(",")]
-        if not line.strip() or (not rows and words[0].lower() in ("t", "time")):
+        if not line.strip() or (not rows and words[0].lower().startswith("t")):
             continue
         try:
             row = [float(word) for word in words]
