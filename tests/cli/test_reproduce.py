@@ -42,7 +42,7 @@ def test_a_table_of_tracking(tmp_path):
     assert found == [(d, m, 2, "circle") for d in ("none", "small", "large") for m in ("base", "lora")]
     for row in results["rows"]:
         assert row["crashes"] == 2 or f"{row['mean']:.3f} ± {row['std']:.3f}" in text
-    assert (tmp_path / "tracking_track_circle.png").stat().st_size > 10_000
+    assert (tmp_path / "tracking_track_circle_circle.png").stat().st_size > 10_000
 
 
 def test_errors_are_read_around_reversals_and_updates():

@@ -30,6 +30,12 @@ class Block:
     methods: tuple[Method, ...] = ("base", "full", "lora")
     paper: tuple[tuple[str, tuple[str, str, str]], ...] = ()
 
+    @property
+    def stem(self) -> str:
+        """Of the name of its picture: no other block of a table has the same."""
+        trained_on = self.preset.reference.replace("+", "-") if self.preset.task == "track" else None
+        return "_".join(filter(None, (self.preset.name, self.reference, trained_on)))
+
 
 def table(
     name: str, about: Sequence[str], blocks: Sequence[Block], *, plant: PlantName, seconds: float, starts: int,
@@ -99,8 +105,8 @@ def _picture(block: Block, flights: list[Flight], plant: PlantName, name: str, f
     if not large:
         return []
     flown = None if block.reference is None else build.reference(block.reference)
-    stem = f"{name}_{block.preset.name}" + (f"_{block.reference}" if block.reference else "")
-    path, _ = picture(large, block.preset, "large", setting_for(block.preset, plant), folder, flown, stem=stem)
+    setting = setting_for(block.preset, plant)
+    path, _ = picture(large, block.preset, "large", setting, folder, flown, stem=f"{name}_{block.stem}")
     return [f"![large disturbance]({path.name})", ""]
 
 
