@@ -155,7 +155,7 @@ def test_the_readme_example_runs(folder, monkeypatch, capsys):
     text = (Path(__file__).parents[2] / "README.md").read_text()
     (code,) = re.findall(r"```python\n(.*?)```", text, re.S)
     monkeypatch.chdir(folder)
-    exec(code.replace("ticks=1500", "ticks=100"), {})
+    exec(code.replace("ticks=1500", "ticks=175"), {})  # past the first fit of the residual
     assert "Event(" in capsys.readouterr().out
 
 
