@@ -46,7 +46,7 @@ def table(
     lines, found, interrupted = list[str](), list[dict[str, Any]](), False
     for block in blocks:
         if block.preset not in trained:
-            console.print(f"preset [bold]{block.preset.name}[/], {block.preset.reference}")
+            console.print(f"preset [bold]{block.preset.name}[/]: {block.title}")
             policy, _, interrupted = train(block.preset, seed)
             if interrupted:
                 break
