@@ -14,7 +14,7 @@ from .training import nominal_error, train
 
 
 def pretrain(preset: Preset, runs: int) -> dict[str, Any]:
-    """Pretraining without seeing; and the errors of policies of three seeds, or of one where ``runs`` is one."""
+    """Pretraining without seeing, each run with a seed of its own; and the errors of their policies."""
     p, key = preset.pretrain, random.key(0)
     optimiser = build.optimiser(preset)
     policy = build.policy(preset, key)
@@ -23,18 +23,17 @@ def pretrain(preset: Preset, runs: int) -> dict[str, Any]:
     sizes = optimiser, 10, p.envs, preset.delay
     program, compile_s = compiled(train_chunk, state, *fixed, key, *sizes)
 
-    def run(seed: int = 0) -> PolicyState:
+    kept = list[PolicyState]()
+
+    def run() -> PolicyState:
         trained = state
-        for k in random.split(random.key(seed), p.epochs // 10):
+        for k in random.split(random.key(len(kept) + 1), p.epochs // 10):
             trained, _ = program(trained, *fixed, k, *sizes)
+        kept.append(trained)
         return trained
 
     row = timed(compile_s, run, runs)
-    errors = (
-        [nominal_error(preset, run(seed).policy.plain()) for seed in range(1, 4)]
-        if runs > 1
-        else [nominal_error(preset, run().policy.plain())]
-    )
+    errors = [nominal_error(preset, trained.policy.plain()) for trained in kept]
     row["remarks"] += "; error " + ", ".join(f"{1000 * e:.1f}" for e in errors) + " mm"
     return row
 
