@@ -13,6 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
 from ..physics.state import STANDARD_GRAVITY
@@ -76,7 +77,8 @@ class Reference(eqx.Module):
         where = jnp.clip(t / self.every, 0.0, self.rows.shape[0] - 1.0)
         i = jnp.clip(jnp.floor(where), 0, self.rows.shape[0] - 2).astype(jnp.int32)
         part = (where - i.astype(where.dtype)).astype(self.rows.dtype)
-        row = (1.0 - part) * self.rows[i] + part * self.rows[i + 1]
+        before, after = lax.dynamic_slice_in_dim(self.rows, i, 2)  # one gather under vmap
+        row = (1.0 - part) * before + part * after
         over = (length <= 0) & (t >= end)  # at rest, where the end is held
         hover = jnp.zeros(4, dtype=row.dtype).at[0].set(STANDARD_GRAVITY)
         v, u = jnp.where(over, jnp.zeros_like(row[3:6]), row[3:6]), jnp.where(over, hover, row[6:10])
