@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import math
+from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -147,7 +148,8 @@ def pretraining(preset: Preset, seed: int = 0) -> Iterator[tuple[Policy, Float[A
 
 def pretrained(preset: Preset, seed: int = 0) -> Policy:
     """A policy trained from scratch, in silence; :func:`pretraining` shows progress."""
-    return list(pretraining(preset, seed))[-1][0]
+    ((last, _),) = deque(pretraining(preset, seed), maxlen=1)
+    return last
 
 
 def adapter(preset: Preset, flown: Reference | None = None) -> Adapter:

@@ -8,15 +8,15 @@ from retrim.cli.session import Stopwatch, said
 @pytest.mark.parametrize(
     ("words", "kept"),
     [
-        (["reproduce", "plants", "--out", "/somewhere/of/mine", "--starts", "2"], "reproduce plants --starts 2"),
-        (["demo", "--out=/somewhere/of/mine", "--seed=3"], "demo --seed=3"),
-        (["fly", "--policy", "/home/me/p", "--config=/home/me/a.toml"], "fly --policy p --config=a.toml"),
-        (["fly", "--policy", "runs/h", "--reference", "circle"], "fly --policy runs/h --reference circle"),
-        (["demo", "--out"], "demo"),
+        ("reproduce plants --out {here}/results --starts 2", "reproduce plants --starts 2"),
+        ("demo --out={here}/d --seed=3", "demo --seed=3"),
+        ("fly --policy {here}/p --config={here}/a.toml", "fly --policy p --config=a.toml"),
+        ("fly --policy runs/h --reference circle", "fly --policy runs/h --reference circle"),
+        ("demo --out", "demo"),
     ],
 )
-def test_no_place_on_this_machine_is_recorded(words, kept):
-    assert said(words) == f"retrim {kept}"
+def test_no_place_on_this_machine_is_recorded(words, kept, tmp_path):
+    assert said(words.format(here=tmp_path).split()) == f"retrim {kept}"
 
 
 def test_programs_traced_inside_others_count_once():

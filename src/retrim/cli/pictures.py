@@ -8,11 +8,13 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from .. import build, testbed
 from ..physics.conditions import Conditions
 from ..physics.state import State
 from ..presets import Preset
+from ..tasks.keypoints import Keypoints
 from ..tasks.reference import Reference
 from ..testbed import Setting
 from ..viz import plots
@@ -29,7 +31,7 @@ def picture(
     *,
     stem: str | None = None,
 ) -> list[Path]:
-    """``hover_<disturbance>.png`` and ``.svg`` of the flights under one disturbance; returns their paths."""
+    """``<task>_<disturbance>`` (or ``stem``) as PNG and SVG, of the flights under one disturbance; returns their paths."""
     shown = [f for f in flights if f.plan.disturbance == disturbance]
     before = [f for f in shown if f.plan.method == "base"]
     after = [f for f in shown if f.plan.method != "base"]
@@ -89,5 +91,9 @@ def _track(flight: Flight) -> plots.Track:
 
 
 def _sighting(preset: Preset, x: State) -> plots.Sighting:
-    pixel, visible = jax.jit(jax.vmap(build.keypoints(preset).pixels))(x)
-    return plots.Sighting(np.asarray(pixel), np.asarray(visible))
+    return plots.Sighting(*map(np.asarray, _pixels(build.keypoints(preset), x)))
+
+
+@jax.jit
+def _pixels(observation: Keypoints, x: State) -> tuple[Array, Array]:
+    return jax.vmap(observation.pixels)(x)

@@ -57,6 +57,9 @@ def reversing(
     campaign = Campaign(settings, policy, setting=setting, seconds=seconds, starts=starts, seed=seed)
     campaign.warm_up(["reversing"])
     flights, interrupted = campaign.fly([Plan("reversing", m, i) for m in METHODS for i in range(starts)])
+    if not flights:
+        console.print("interrupted before the first flight was over; nothing was saved")
+        return 130
     moments = _moments(settings.adapt, seconds)
     errors = {m: [_errors(f, moments) for f in flights if f.plan.method == m and not f.log.crashed] for m in METHODS}
     table = _lines(errors, moments)
@@ -102,7 +105,7 @@ def _lines(errors: dict[Method, list[np.ndarray]], moments: np.ndarray) -> list[
     for i, reversal in enumerate(moments[:, 0]):
         for method, name in METHODS.items():
             table = [found[i] for found in errors[method]]
-            columns = np.array(table).T  # empty where all crashed
-            cells = [f"{c.mean():.3f} ± {c.std(ddof=len(table) > 1):.3f}" for c in columns] or ["crashed"]
+            columns = np.array(table).T  # empty where none was flown to its end
+            cells = [f"{c.mean():.3f} ± {c.std(ddof=len(table) > 1):.3f}" for c in columns] or ["-"]
             lines.append("| " + " | ".join([f"reversed at {reversal:g} s, {name}", *cells]) + " |")
     return lines
