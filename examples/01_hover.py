@@ -8,8 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from retrim import ControllerPilot, Log, PolicyController, SimPlant, build, fly, presets
-from retrim.physics import Bem, Push, small
+from retrim import ControllerPilot, Log, PolicyController, SimPlant, fly
+from retrim.config import factory as build
+from retrim.config import presets
+from retrim.physics import BemQuadrotor, Push, small
 
 QUICK = {
     "pretrain": {"epochs": 100, "envs": 8, "horizon": 100, "hidden": [32, 32]},
@@ -34,7 +36,7 @@ def main(*, quick: bool = False) -> None:
     print()
 
     # A realistic plant, pushed by 2 m/s² along each axis: any function of time and state will do.
-    plant = SimPlant(Bem.of(small(), presets.DT), Push(lambda t, x: jnp.full_like(x.p, 2.0)))
+    plant = SimPlant(BemQuadrotor.of(small(), presets.DT), Push(lambda t, x: jnp.full_like(x.p, 2.0)))
     x0 = build.flight_starts(preset, 1)[0]
 
     base = ControllerPilot(PolicyController(build.seen_in_flight(preset), policy))

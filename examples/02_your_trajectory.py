@@ -12,10 +12,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from retrim import ControllerPilot, Log, PolicyController, SimPlant, build, fly, presets
-from retrim.physics import Bem, SteadyWind, small
+from retrim import ControllerPilot, Log, PolicyController, SimPlant, fly
+from retrim.config import factory as build
+from retrim.config import presets
+from retrim.physics import BemQuadrotor, SteadyWind, small
 from retrim.tasks import Reference, from_csv
-from retrim.tasks.reference import spun_up
+from retrim.tasks.reference import smooth_start
 
 QUICK = {
     "reference": "circle",
@@ -26,7 +28,7 @@ QUICK = {
 
 def climb(t: float) -> list[float]:
     """A Lissajous figure that rises by 1 m and comes down again, the nose swaying: x, y, z [m], heading [rad]."""
-    phase = 2.0 * math.pi * spun_up(t) / 8.0  # a lap of 8 s, after a smooth start
+    phase = 2.0 * math.pi * smooth_start(t) / 8.0  # a lap of 8 s, after a smooth start
     return [math.sin(phase), 0.7 * math.sin(2.0 * phase), 1.5 - 0.5 * math.cos(phase), 0.5 * math.sin(phase)]
 
 
@@ -49,7 +51,7 @@ def main(*, quick: bool = False) -> None:
         print(f"pretraining: loss {float(losses[-1]):.3f}", end="\r")
     print()
 
-    plant = SimPlant(Bem.of(small(), presets.DT), SteadyWind(jnp.array([3.0, 0.0, 0.0])))
+    plant = SimPlant(BemQuadrotor.of(small(), presets.DT), SteadyWind(jnp.array([3.0, 0.0, 0.0])))
     ticks = 250 if quick else 1500
     x0 = build.flight_starts(preset, 1, flown=mine)[0]
     pilot = ControllerPilot(PolicyController(build.seen_in_flight(preset, mine), policy))

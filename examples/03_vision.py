@@ -9,8 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from retrim import ControllerPilot, Log, PolicyController, SimPlant, build, fly, presets
-from retrim.physics import Bem, SteadyWind, small
+from retrim import ControllerPilot, Log, PolicyController, SimPlant, fly
+from retrim.config import factory as build
+from retrim.config import presets
+from retrim.physics import BemQuadrotor, SteadyWind, small
 
 QUICK = {
     "represent": 100,
@@ -36,7 +38,7 @@ def main(*, quick: bool = False) -> None:
 
     # In flight only what the camera sees is observed; a filter of the pose fills in the rest.
     honest = build.seen_in_flight(preset)
-    plant = SimPlant(Bem.of(small(), presets.DT), SteadyWind(jnp.array([2.0, 2.0, 0.0])))
+    plant = SimPlant(BemQuadrotor.of(small(), presets.DT), SteadyWind(jnp.array([2.0, 2.0, 0.0])))
     x0, ticks = build.flight_starts(preset, 1)[0], 150 if quick else 1500
     base = ControllerPilot(PolicyController(honest, policy))
     print(f"in 2.8 m/s of wind, not adapted: {error(fly(plant, base, x0, ticks=ticks), preset.goal):.3f} m off")

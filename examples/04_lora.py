@@ -8,8 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from retrim import AdaptivePilot, ControllerPilot, LoraPolicy, PolicyController, SimPlant, build, fly, presets
-from retrim.physics import Bem, Constant, small
+from retrim import AdaptivePilot, ControllerPilot, LoraPolicy, PolicyController, SimPlant, fly
+from retrim.config import factory as build
+from retrim.config import presets
+from retrim.physics import BemQuadrotor, Constant, small
 
 QUICK = {
     "pretrain": {"epochs": 100, "envs": 8, "horizon": 100, "hidden": [32, 32]},
@@ -35,7 +37,7 @@ def main(*, quick: bool = False) -> None:
     lora = LoraPolicy.of(policy, key=jax.random.key(1))  # ranks 4, 10, 1; it starts as a delta of zero
     print(f"trained in flight: {numbers(lora.trained)} numbers instead of {numbers(policy.trained)}")
 
-    plant = SimPlant(Bem.of(small(), presets.DT), Constant(jnp.full(3, 2.0)))
+    plant = SimPlant(BemQuadrotor.of(small(), presets.DT), Constant(jnp.full(3, 2.0)))
     x0, ticks = build.flight_starts(preset, 1)[0], 250 if quick else 1500
 
     def error(pilot: ControllerPilot | AdaptivePilot) -> float:
@@ -49,7 +51,7 @@ def main(*, quick: bool = False) -> None:
     print(f"adapted, low rank:      {error(pilot):.3f} m off")
 
     learnt = pilot.state.policy.policy  # the LoraPolicy that flies now
-    merged = learnt.plain()  # an ordinary Policy: save_policy keeps it, save_delta the thin part alone
+    merged = learnt.merged()  # an ordinary Policy: save_policy keeps it, save_delta the thin part alone
     print(f"merged, from the start: {error(ControllerPilot(PolicyController(seen, merged))):.3f} m off")
     print(f"base weights moved by {moved(policy, learnt.base)}, merged ones by up to {moved(policy, merged):.4f}")
 

@@ -12,10 +12,12 @@ import numpy as np
 import optax
 from jaxtyping import Array
 
-from retrim import ControllerPilot, PolicyController, SimPlant, build, fly, presets
+from retrim import ControllerPilot, PolicyController, SimPlant, fly
+from retrim.config import factory as build
+from retrim.config import presets
 from retrim.learn import PolicyState, bptt, residual_targets
 from retrim.learn.pretrain import starts
-from retrim.physics import Bem, Command, Constant, Hybrid, State, small
+from retrim.physics import BemQuadrotor, Command, Constant, Hybrid, State, small
 
 QUICK = {"pretrain": {"epochs": 100, "envs": 8, "horizon": 100, "hidden": [32, 32]}}
 
@@ -35,7 +37,7 @@ def main(*, quick: bool = False) -> None:
     preset = presets.changed(presets.load("fast"), **(QUICK if quick else {}))
     policy = build.pretrained(preset)
     task, nominal = build.task(preset), build.nominal(preset)
-    plant = SimPlant(Bem.of(small(), presets.DT), Constant(jnp.array([2.0, 2.0, 2.0])))
+    plant = SimPlant(BemQuadrotor.of(small(), presets.DT), Constant(jnp.array([2.0, 2.0, 2.0])))
     pilot = ControllerPilot(PolicyController(task.observation, policy))
     x0, goal, ticks = build.flight_starts(preset, 1)[0], np.array(preset.goal), 200 if quick else 500
 
@@ -50,7 +52,7 @@ def main(*, quick: bool = False) -> None:
     # Thirty steps of back-propagation through the corrected model.
     epochs, envs = (5, 4) if quick else (30, 10)
     optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(optax.cosine_decay_schedule(1e-3, epochs)))
-    before = PolicyState(policy, optimiser.init(policy.trained))
+    before = PolicyState(policy, optimiser.init(policy.params))
     x0s = starts(task, jax.random.key(1), epochs, envs)
     improve = eqx.filter_jit(bptt)
     after, losses = improve(before, Hybrid(nominal, bias), task, x0s, optimiser=optimiser, delay=preset.delay)

@@ -10,8 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from retrim import ControllerPilot, PolicyController, SimPlant, build, fly, presets
-from retrim.physics import STANDARD_GRAVITY, Bem, Command, Constant, State, Vehicle, small
+from retrim import ControllerPilot, PolicyController, SimPlant, fly
+from retrim.config import factory as build
+from retrim.config import presets
+from retrim.physics import STANDARD_GRAVITY, BemQuadrotor, Command, Constant, State, Vehicle, small
 
 QUICK = {
     "pretrain": {"epochs": 100, "envs": 8, "horizon": 100, "hidden": [32, 32]},
@@ -22,13 +24,13 @@ CALM = Constant(jnp.zeros(3))
 
 def mine() -> Vehicle:
     """A third heavier, with arms half as long again; every other constant stays."""
-    car = small()
-    return dataclasses.replace(car, mass=jnp.array(0.25), arm=1.5 * car.arm, inertia=2.5 * car.inertia)
+    vehicle = small()
+    return dataclasses.replace(vehicle, mass=jnp.array(0.25), arm=1.5 * vehicle.arm, inertia=2.5 * vehicle.inertia)
 
 
 def check(name: str, vehicle: Vehicle) -> None:
     """Hold hover thrust, level, for half a second: the vehicle should neither rise nor fall by much."""
-    plant = SimPlant(Bem.of(vehicle, presets.DT), CALM)
+    plant = SimPlant(BemQuadrotor.of(vehicle, presets.DT), CALM)
     log = fly(plant, lambda sample: Command.hover(), State.at(jnp.array([0.0, 0.0, 1.0])), ticks=25)
     ratio = float(vehicle.command_max.c) / STANDARD_GRAVITY
     rise = log.v[-1, 2] / log.t[-1]
@@ -42,7 +44,7 @@ def main(*, quick: bool = False) -> None:
 
     preset = presets.changed(presets.load("fast"), **(QUICK if quick else {}))
     policy = build.pretrained(preset)  # for the small quadrotor
-    plant = SimPlant(Bem.of(mine(), presets.DT), CALM)
+    plant = SimPlant(BemQuadrotor.of(mine(), presets.DT), CALM)
     x0, goal, ticks = build.flight_starts(preset, 1)[0], np.array(preset.goal), 250 if quick else 1500
 
     base = ControllerPilot(PolicyController(build.seen_in_flight(preset), policy))

@@ -9,8 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from retrim import Command, ControllerPilot, PolicyController, Sample, State, build, fly, presets
-from retrim.adapt.plant import PlantError, refuse_unsound
+from retrim import Command, ControllerPilot, Measurement, PolicyController, State, fly
+from retrim.config import factory as build
+from retrim.config import presets
+from retrim.plants.plant import PlantError, check_command
 
 QUICK = {
     "pretrain": {"epochs": 100, "envs": 8, "horizon": 100, "hidden": [32, 32]},
@@ -26,16 +28,16 @@ class Toy:
     def __init__(self) -> None:
         self._flying = False
 
-    def reset(self, x0: State | None) -> Sample:
+    def reset(self, x0: State | None) -> Measurement:
         """At rest at ``x0``; the first sample has the time zero, by which pilots know that a flight begins."""
         x = State.at(jnp.array([0.0, 0.0, 1.0])) if x0 is None else x0
         self._p, self._R, self._v = (np.array(leaf, dtype=float) for leaf in (x.p, x.R, x.v))
         self._rates, self._ticks, self._flying = np.zeros(3), 0, True
-        return Sample(0.0, x, Command.hover())
+        return Measurement(0.0, x, Command.hover())
 
-    def exchange(self, u: Command) -> Sample:
+    def step(self, u: Command) -> Measurement:
         """One tick. On hardware: send ``u``, wait for the next measurement."""
-        refuse_unsound(u, "Toy")  # a command that is not finite never reaches the vehicle
+        check_command(u, "Toy")  # a command that is not finite never reaches the vehicle
         if not self._flying:
             raise PlantError("Toy: not flying; call reset first")
         h, c, commanded = 0.002, float(u.c), np.asarray(u.omega)
@@ -45,7 +47,7 @@ class Toy:
             a = self._R[:, 2] * c + np.array([1.0, -1.5, -9.81 + 0.5]) - 0.3 * self._v
             self._p, self._v = self._p + h * self._v, self._v + h * a
         self._ticks += 1
-        return Sample(self._ticks * self.dt, State(*map(jnp.array, (self._p, self._R, self._v))), u)
+        return Measurement(self._ticks * self.dt, State(*map(jnp.array, (self._p, self._R, self._v))), u)
 
     def stop(self) -> None:
         """Leave the vehicle safe; called at the end of every flight, also after an error."""

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jax import random
 
-from retrim import presets
+from retrim.config import presets
 from retrim.physics import Command, State, small, so3
 from retrim.tasks import Hover, StateObs
 

@@ -8,15 +8,16 @@ import pytest
 from jax import random
 
 from helpers import hover_task, tiny_preset
-from retrim import build, presets
-from retrim.adapt import AdaptivePilot, ControllerPilot, Sample, Schedule, fly
-from retrim.adapt.adapter import Adapter
+from retrim.adapt import AdaptivePilot, ControllerPilot, Measurement, Schedule, fly
 from retrim.adapt.buffer import RollingBuffer
 from retrim.adapt.gate import judge
+from retrim.adapt.learner import OnlineLearner
+from retrim.config import factory as build
+from retrim.config import presets
+from retrim.config.registry import Scenario
 from retrim.control import Policy, PolicyController
 from retrim.learn import PolicyState, pretrain
 from retrim.physics import Command, State, small
-from retrim.testbed import Setting
 
 pytestmark = pytest.mark.usefixtures("optax_promotion")
 
@@ -62,7 +63,7 @@ def test_a_log_gives_the_window_that_was_seen_in_flight(trained):
         buffer.push(sample.t, sample.x, u)
         return u
 
-    log = fly(Setting("simple").make("small"), pilot, build.flight_starts(preset, 1)[0], ticks=15)
+    log = fly(Scenario("simple").make("small"), pilot, build.flight_starts(preset, 1)[0], ticks=15)
     seen, kept = buffer.window(), log.window(10)
     for a, b in zip(jax.tree.leaves(seen), jax.tree.leaves(kept), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-12)
@@ -135,8 +136,8 @@ def test_gate_admits_an_equal_and_replaces_a_broken_incumbent(trained):
 def test_impossible_sizes_are_refused_at_construction(field, value):
     adapter = build.adapter(tiny_preset())
     fields = {name: getattr(adapter, name) for name in adapter.__dataclass_fields__}
-    with pytest.raises(ValueError, match=rf"Adapter\.{field} = {value}"):
-        Adapter(**(fields | {field: value}))
+    with pytest.raises(ValueError, match=rf"OnlineLearner\.{field} = {value}"):
+        OnlineLearner(**(fields | {field: value}))
 
 
 def pilot(preset, policy, *, schedule=None, sinks=()):
@@ -155,7 +156,7 @@ def pilot(preset, policy, *, schedule=None, sinks=()):
 
 def adaptive_flight(preset, policy, seconds, **options):
     flying = pilot(preset, policy, **options)
-    plant = Setting("simple").make("large")
+    plant = Scenario("simple").make("large")
     log = fly(plant, flying, build.flight_starts(preset, 1)[0], ticks=round(seconds / presets.DT))
     return log, flying
 
@@ -187,7 +188,7 @@ def test_commands_are_the_old_policys_until_the_swap(trained):
     """The flight equals an unadapted one up to the tick at which the first policy appears, and differs after it."""
     preset, _, policy = trained
     log, flown = adaptive_flight(preset, policy, 2.4, schedule=BRISK)
-    plant = Setting("simple").make("large")
+    plant = Scenario("simple").make("large")
     base = ControllerPilot(PolicyController(build.task(preset).observation, policy))
     plain = fly(plant, base, build.flight_starts(preset, 1)[0], ticks=120)
     swap = next(round(e.t / presets.DT) for e in flown.events if e.kind == "policy")
@@ -225,7 +226,7 @@ def test_one_trace_over_many_cycles(trained):
     adapter = eqx.tree_at(lambda a: a.task, build.adapter(preset), Counting(**fields))
     state = adapter.init(policy, build.residual(preset, random.key(2)))
     flying = AdaptivePilot(adapter, state, BRISK, random.key(3), dt=presets.DT, window=preset.adapt.window)
-    plant = Setting("simple").make("large")
+    plant = Scenario("simple").make("large")
     x0 = build.flight_starts(preset, 1)[0]
     fly(plant, flying, x0, ticks=60)
     compiled = len(traces)
@@ -255,7 +256,7 @@ def test_adaptation_cuts_the_error_under_the_large_disturbance():
     )
     *_, (state, _) = run
     x0 = build.flight_starts(preset, 1)[0]
-    plant = Setting("simple").make("large")
+    plant = Scenario("simple").make("large")
     base = fly(plant, ControllerPilot(PolicyController(build.task(preset).observation, state.policy)), x0, ticks=500)
     adapted = fly(plant, pilot(preset, state.policy), x0, ticks=500)
     before, after = (np.linalg.norm(log.p[-50:] - preset.goal, axis=1).mean() for log in (base, adapted))
@@ -269,7 +270,7 @@ def test_a_fit_that_is_not_finite_is_dropped(trained):
     buffer = RollingBuffer(preset.adapt.window)
     for i in range(10):
         buffer.push(0.0, at(0.0, 0.0, 1.0 + float("nan") * (i == 5)), Command.hover())
-    kept, _, sound = adapter.refine(state.residual, buffer.window())
+    kept, _, sound = adapter.fit_residual(state.residual, buffer.window())
     assert not sound
     jax.tree.map(np.testing.assert_array_equal, kept, state.residual)
 
@@ -284,9 +285,9 @@ def broken_improve(self, s, residual, window, key):
 
 def test_a_refused_policy_is_logged_and_never_flies(trained, monkeypatch):
     preset, _, policy = trained
-    monkeypatch.setattr(Adapter, "improve", broken_improve)
+    monkeypatch.setattr(OnlineLearner, "improve", broken_improve)
     log, flown = adaptive_flight(preset, policy, 3.0, schedule=BRISK)
-    plant = Setting("simple").make("large")
+    plant = Scenario("simple").make("large")
     base = ControllerPilot(PolicyController(build.task(preset).observation, policy))
     plain = fly(plant, base, build.flight_starts(preset, 1)[0], ticks=150)
     np.testing.assert_array_equal(log.u, plain.u)
@@ -300,7 +301,7 @@ def test_a_second_flight_keeps_what_was_learnt_and_forgets_what_was_seen(trained
     preset, _, policy = trained
     _, flying = adaptive_flight(preset, policy, 1.5, schedule=BRISK)
     learnt = flying.state
-    plant = Setting("simple").make("large")
+    plant = Scenario("simple").make("large")
     fly(plant, flying, build.flight_starts(preset, 1)[0], ticks=10)
     assert len(flying._buffer) == 10
     jax.tree.map(np.testing.assert_array_equal, flying.state, learnt)
@@ -310,7 +311,7 @@ def test_pilot_starts_its_memory_anew_at_time_zero(key):
     task = hover_task(history=2)
     policy = jax.tree.map(lambda leaf: leaf + 0.1, Policy.of(task.observation.size, small(), key=key, hidden=(8,)))
     flying = ControllerPilot(PolicyController(task.observation, policy))
-    start = Sample(0.0, at(0.5, 0.0, 1.0), Command.hover())
+    start = Measurement(0.0, at(0.5, 0.0, 1.0), Command.hover())
     first = flying(start).vector()
-    flying(Sample(0.02, at(0.4, 0.0, 1.0), Command.hover()))
+    flying(Measurement(0.02, at(0.4, 0.0, 1.0), Command.hover()))
     np.testing.assert_array_equal(flying(start).vector(), first)

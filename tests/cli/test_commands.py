@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from retrim import presets
 from retrim.adapt import Log
-from retrim.cli.flights import Flight, Plan
-from retrim.cli.pictures import picture, spans
-from retrim.cli.scores import cell, rows
-from retrim.testbed import Setting
+from retrim.config import presets
+from retrim.config.registry import Scenario
+from retrim.experiments.figures import picture, spans
+from retrim.experiments.fleet import Flight, Plan
+from retrim.experiments.metrics import cell, rows
 
 SMALL = "[pretrain]\nhidden = [64, 64]\nepochs = 150\n[adapt]\nepochs = 4\nenvs = 4\niters = 20\nrefine_every = 1.0\nimprove_every = 1.5\nrefine_charge = 0.1\nimprove_charge = 0.3\n"  # noqa: E501
 ENVIRONMENT = {**os.environ, "COLUMNS": "160", "NO_COLOR": "1"}
@@ -135,18 +135,18 @@ def test_crashes_are_counted_and_left_out_of_the_mean():
         flight(1, crashed=False, error=0.3),
         flight(2, crashed=True, error=9.0),
     ]
-    (row,) = rows(found, task="hover", setting=Setting())
+    (row,) = rows(found, task="hover", setting=Scenario())
     assert (row["n"], row["crashes"]) == (3, 1)
     assert row["mean"] == pytest.approx(0.2)
     assert row["std"] == pytest.approx(np.std([0.1, 0.3], ddof=1))
     assert cell(row) == "0.200 ± 0.141, 1 of 3 crashed"
-    (row,) = rows(found[2:], task="hover", setting=Setting())
+    (row,) = rows(found[2:], task="hover", setting=Scenario())
     assert (row["mean"], row["std"], cell(row)) == (None, None, "crashed, 1 of 1")
 
 
 def test_a_picture_with_crashes_and_without_adapted_flights(tmp_path):
     found = [flight(0, crashed=False, error=0.1), flight(1, crashed=True, error=3.0)]
-    assert all(path.exists() for path in picture(found, presets.load("fast"), "large", Setting(), tmp_path))
+    assert all(path.exists() for path in picture(found, presets.load("fast"), "large", Scenario(), tmp_path))
 
 
 @pytest.mark.usefixtures("optax_promotion")

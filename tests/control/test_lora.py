@@ -9,12 +9,12 @@ import pytest
 from jax import random
 
 from helpers import hover_task, tiny_preset
-from retrim import build
-from retrim.adapt import adapter as adapter_module
+from retrim.adapt import learner as adapter_module
 from retrim.adapt.buffer import RollingBuffer
 from retrim.adapt.gate import judge
+from retrim.config import factory as build
 from retrim.control import LoraPolicy, Policy
-from retrim.control.lora import Thin
+from retrim.control.lora import LowRankFactors
 from retrim.learn import PolicyState, bptt, policy_gradient, policy_loss
 from retrim.learn.pretrain import starts
 from retrim.physics import Command, PointMass, State, small
@@ -30,7 +30,7 @@ def moved(lora, key):
     """With a delta that changes something."""
     leaves, shape = jax.tree.flatten(lora.delta)
     keys = random.split(key, len(leaves))
-    return lora.retrained(
+    return lora.with_params(
         shape.unflatten([l + 0.2 * random.normal(k, l.shape) for k, l in zip(keys, leaves, strict=True)])
     )
 
@@ -55,16 +55,16 @@ def lora(base, key):
 
 def test_parameter_count_of_the_paper(key):
     lora = LoraPolicy.of(Policy.of(15, small(), key=key), key=key)
-    assert [thin.down.shape[0] for thin in lora.trained] == [4, 10, 1]
-    assert size(lora.trained) == 12_864
+    assert [thin.down.shape[0] for thin in lora.params] == [4, 10, 1]
+    assert size(lora.params) == 12_864
     assert size(lora.base.layers) == 272_900
 
 
 def test_a_fresh_delta_changes_nothing(base, lora, key):
-    same(lora.plain(), base)
+    same(lora.merged(), base)
     for k in random.split(key, 3):
         o = random.normal(k, (15,))
-        np.testing.assert_array_equal(lora.plain()(o).vector(), base(o).vector())
+        np.testing.assert_array_equal(lora.merged()(o).vector(), base(o).vector())
     for thin in lora.delta:
         np.testing.assert_array_equal(thin.up, 0.0)
         bound = thin.down.shape[1] ** -0.5
@@ -74,7 +74,7 @@ def test_a_fresh_delta_changes_nothing(base, lora, key):
 def test_merged_by_hand(base, lora, key):
     """W + scale up down in NumPy, bias as it was; and the commands of y = W x + scale B (A x) + b."""
     trained = moved(lora, key)
-    plain = trained.plain()
+    plain = trained.merged()
     for layer, frozen, thin in zip(plain.layers, base.layers, trained.delta, strict=True):
         merged = np.asarray(frozen.weight) + 4.0 * np.asarray(thin.up) @ np.asarray(thin.down)
         np.testing.assert_allclose(layer.weight, merged, rtol=1e-12, atol=1e-13)
@@ -92,12 +92,12 @@ def test_merged_by_hand(base, lora, key):
 def test_merging_twice_and_forgetting(base, lora, key):
     """Plain is plain; and with the fresh delta put back, it is the base again."""
     trained = moved(lora, key)
-    same(trained.plain().plain(), trained.plain())
-    same(trained.retrained(lora.delta).plain(), base)
+    same(trained.merged().merged(), trained.merged())
+    same(trained.with_params(lora.delta).merged(), base)
 
 
 def test_scale_counts(base, key):
-    one, two = (moved(LoraPolicy.of(base, key=key, ranks=RANKS, scale=s), key).plain() for s in (1.0, 2.0))
+    one, two = (moved(LoraPolicy.of(base, key=key, ranks=RANKS, scale=s), key).merged() for s in (1.0, 2.0))
     for frozen, a, b in zip(base.layers, one.layers, two.layers, strict=True):
         np.testing.assert_allclose(b.weight - frozen.weight, 2.0 * (a.weight - frozen.weight), atol=1e-13)
 
@@ -111,9 +111,9 @@ def test_gradient_through_the_pull_is_exact(touched, lora, key):
 
     @eqx.filter_jit
     def both(lora):
-        layers, pull = jax.vjp(lambda delta: lora.retrained(delta).plain().layers, lora.trained)
-        value, by_layers = policy_gradient(lora.plain().retrained(layers), model, task, x0, delay=1)
-        loss = lambda delta: policy_loss(lora.retrained(delta).plain(), model, task, x0, delay=1)  # noqa: E731
+        layers, pull = jax.vjp(lambda delta: lora.with_params(delta).merged().layers, lora.params)
+        value, by_layers = policy_gradient(lora.merged().with_params(layers), model, task, x0, delay=1)
+        loss = lambda delta: policy_loss(lora.with_params(delta).merged(), model, task, x0, delay=1)  # noqa: E731
         return (value, pull(by_layers)[0]), jax.value_and_grad(loss)(lora.delta)
 
     (value, found), (expected, wanted) = both(lora)
@@ -129,7 +129,7 @@ def test_gradient_through_the_pull_is_exact(touched, lora, key):
 def test_no_gradient_reaches_the_base(lora, key):
     lora = moved(lora, key)
     o = random.normal(key, (15,))
-    slope = jax.jit(jax.grad(lambda p: jnp.sum(p.plain()(o).vector())))(lora)
+    slope = jax.jit(jax.grad(lambda p: jnp.sum(p.merged()(o).vector())))(lora)
     for leaf in jax.tree.leaves((slope.base, slope.scale)):
         np.testing.assert_array_equal(leaf, 0.0)
     assert all(float(jnp.abs(thin.up).max()) > 0.0 for thin in slope.delta)
@@ -143,7 +143,7 @@ def test_training_moves_the_delta_only_and_lowers_the_loss(key):
     before = jax.tree.map(np.array, base)
     optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(3e-2))
     train = eqx.filter_jit(lambda s, x0: bptt(s, model, task, x0, optimiser=optimiser))
-    state, losses = train(PolicyState(lora, optimiser.init(lora.trained)), starts(task, key, 40, 8))
+    state, losses = train(PolicyState(lora, optimiser.init(lora.params)), starts(task, key, 40, 8))
     assert losses.shape == (40,)
     trained = state.policy
     same(trained.base, before)
@@ -153,13 +153,13 @@ def test_training_moves_the_delta_only_and_lowers_the_loss(key):
         assert float(jnp.abs(thin.down - fresh.down).max()) > 1e-4
     x0 = jax.vmap(task.reset)(random.split(random.key(9), 32))
     loss = eqx.filter_jit(lambda policy: policy_loss(policy, model, task, x0))
-    assert float(loss(trained.plain())) < 0.9 * float(loss(base))
+    assert float(loss(trained.merged())) < 0.9 * float(loss(base))
 
 
 @pytest.mark.usefixtures("optax_promotion")
 def test_a_gradient_that_is_not_finite_changes_nothing(lora, key):
     task, optimiser = hover_task(horizon=3), optax.adam(1e-2)
-    state = PolicyState(lora, optimiser.init(lora.trained))
+    state = PolicyState(lora, optimiser.init(lora.params))
     x0 = starts(task, key, 1, 2)
     broken = eqx.tree_at(lambda s: s.x.v, x0, x0.x.v.at[0, 0, 0].set(jnp.nan))
     after, losses = eqx.filter_jit(lambda s, x: bptt(s, PointMass(0.02), task, x, optimiser=optimiser))(state, broken)
@@ -185,7 +185,7 @@ def test_the_learner_beside_the_flight_takes_it(key, monkeypatch):
     for i in range(20):
         buffer.push(0.02 * i, State.at(jnp.array([0.3, 0.0, 1.0])), Command.hover())
     k = random.key(3)
-    after, verdict = adapter.improve(state.policy, state.residual.residual, buffer.window(), k)
+    after, verdict = adapter.update_policy(state.policy, state.residual.residual, buffer.window(), k)
     assert isinstance(after.policy, LoraPolicy)
     same(after.policy.base, base)
     assert any(float(jnp.abs(thin.up).max()) > 0.0 for thin in after.policy.delta)
@@ -196,7 +196,7 @@ def test_the_learner_beside_the_flight_takes_it(key, monkeypatch):
     task = build.task(preset)
     x0 = jax.vmap(task.reset)(random.split(key, 2))
     bad = eqx.tree_at(lambda p: p.delta[0].up, after.policy, jnp.full_like(after.policy.delta[0].up, jnp.nan))
-    found = judge(bad.plain(), base, build.nominal(preset), task, x0)
+    found = judge(bad.merged(), base, build.nominal(preset), task, x0)
     assert found.reason() == "a weight is not finite"
 
 
@@ -242,6 +242,6 @@ def test_a_delta_must_fit(base, lora, key):
     with pytest.raises(ValueError, match=r"layer 0 has weights \(8, 15\), the delta \(9, 3\) x \(3, 15\)"):
         LoraPolicy(base, wider.delta, lora.scale)
     with pytest.raises(ValueError, match="layer 0"):
-        lora.retrained(wider.delta)
+        lora.with_params(wider.delta)
     with pytest.raises(TypeError, match="rank"):  # by the shape check, which tests switch on
-        Thin(jnp.zeros((2, 8)), jnp.zeros((4, 1)))
+        LowRankFactors(jnp.zeros((2, 8)), jnp.zeros((4, 1)))

@@ -28,12 +28,12 @@ def test_parameter_count_of_the_residual(key):
 
 @pytest.mark.parametrize("make", [small, large])
 def test_output_is_bounded_and_centred(make, key):
-    car = make()
-    policy = Policy.of(15, car, key=key, hidden=(8,))
+    vehicle = make()
+    policy = Policy.of(15, vehicle, key=key, hidden=(8,))
     np.testing.assert_allclose(policy.bounded(jnp.zeros(4)).vector(), [9.81, 0, 0, 0], atol=1e-12)
     for y in (jnp.full(4, 1e3), jnp.full(4, -1e3)):
         u = policy.bounded(y).vector()
-        limit = (car.command_max if y[0] > 0 else car.command_min).vector()
+        limit = (vehicle.command_max if y[0] > 0 else vehicle.command_min).vector()
         np.testing.assert_allclose(u, limit, rtol=1e-12)
 
 
@@ -55,6 +55,6 @@ def test_zero_taps_change_nothing(key):
     policy: PolicyType = Policy.of(15, small(), key=key, hidden=(8, 8))
     policy = jax.tree.map(lambda leaf: leaf + 0.2, policy)
     o = random.normal(key, (15,))
-    u, inputs = policy.tapped(o, tuple(jnp.zeros(n) for n in (8, 8, 4)))
+    u, inputs = policy.perturbed(o, tuple(jnp.zeros(n) for n in (8, 8, 4)))
     np.testing.assert_array_equal(u.vector(), policy(o).vector())
     assert [len(h) for h in inputs] == [15, 8, 8]

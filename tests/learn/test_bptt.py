@@ -12,7 +12,7 @@ from helpers import GOAL, hover_task
 from retrim.control import Policy
 from retrim.learn import EnsembleResidual, PolicyState, bptt, policy_gradient, policy_loss, pretrain, rollout
 from retrim.learn.pretrain import starts
-from retrim.physics import Hybrid, PointMass, Rotors, State, StraightThrough, small
+from retrim.physics import Hybrid, LinearDragQuadrotor, PointMass, State, StraightThrough, small
 from retrim.tasks import Start
 
 
@@ -37,7 +37,7 @@ def models(key):
         "simple": simple,
         "hybrid": Hybrid(simple, r),
         "through residual": Hybrid(simple, r, backprop=True),
-        "straight through": StraightThrough(Hybrid(Rotors.of(small(), 0.02), r), simple),
+        "straight through": StraightThrough(Hybrid(LinearDragQuadrotor.of(small(), 0.02), r), simple),
     }
 
 
@@ -49,7 +49,7 @@ def test_taps_equal_plain_gradient(which, delay, key):
     x0 = jax.vmap(task.reset)(random.split(key, 3))
     value, gradient = policy_gradient(policy, model, task, x0, delay=delay)
 
-    def plain(layers):
+    def merged(layers):
         return policy_loss(eqx.tree_at(lambda p: p.layers, policy, layers), model, task, x0, delay=delay)
 
     expected_value, expected = jax.value_and_grad(plain)(policy.layers)

@@ -2,8 +2,9 @@
 
 import pytest
 
-from retrim import build, presets
-from retrim.cli.training import nominal_error
+from retrim.config import factory as build
+from retrim.config import presets
+from retrim.experiments.training import nominal_error
 
 
 @pytest.mark.usefixtures("optax_promotion")

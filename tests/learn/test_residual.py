@@ -10,7 +10,7 @@ from jax import random
 
 from helpers import GOAL, random_command, random_state, stacked
 from retrim.learn import EnsembleResidual, ResidualState, Window, ZeroResidual, fit_residual, residual_targets
-from retrim.learn.residual import _spectral
+from retrim.learn.residuals.ensemble import _spectral
 from retrim.physics import Command, PointMass, State, small
 
 OPTIMISER = optax.adam(1e-2)

@@ -8,24 +8,26 @@ from jax import lax, random
 
 from helpers import random_command, random_state, replaced
 from retrim.physics import (
-    Bem,
+    BemQuadrotor,
     Command,
-    Conditions,
+    ExternalEffects,
     Hybrid,
     PointMass,
     RotorState,
     State,
     StraightThrough,
     betaflight,
-    highrate,
     kingfisher,
     large,
     small,
     so3,
 )
 from retrim.physics import bem as bem_module
-from retrim.physics.highrate import SIGNS, SUBSTEP, rigid_body
+from retrim.physics import (
+    substep as highrate,
+)
 from retrim.physics.propeller import BladeForces, Inflow
+from retrim.physics.substep import SIGNS, SUBSTEP, rigid_body
 
 VEHICLES = {"small": small, "large": large, "kingfisher": kingfisher}
 G, ZERO = 9.81, np.zeros(3)
@@ -39,11 +41,11 @@ def strong(tree):
 @pytest.fixture(params=list(VEHICLES))
 def bem(request):
     """No thrust error."""
-    return strong(Bem.of(VEHICLES[request.param](), 0.02, thrust_error=0.0))
+    return strong(BemQuadrotor.of(VEHICLES[request.param](), 0.02, thrust_error=0.0))
 
 
-def around(**given):
-    return Conditions.of(jnp.dtype(float), **strong(given))
+def effects(**given):
+    return ExternalEffects.of(jnp.dtype(float), **strong(given))
 
 
 def command(c=G, omega=ZERO):
@@ -65,11 +67,11 @@ def start(model, x):
 
 
 @jax.jit
-def path(model, s, u, around):
+def path(model, s, u, effects):
     """Every millisecond of two seconds."""
 
     def millisecond(s, _):
-        after = model.substep(s, u, around)
+        after = model.substep(s, u, effects)
         return after, after
 
     return lax.scan(millisecond, s, length=2000)[1]
@@ -80,24 +82,24 @@ def at(path, ms):
 
 
 @jax.jit
-def loads(model, b, motors, around):
+def loads(model, b, motors, effects):
     """Steady loads at rotor speeds ``motors``, and what the blades give."""
     above = jax.tree.map(lambda leaf: jnp.full(4, leaf), Inflow.above(motors.dtype))
-    settled = lax.fori_loop(0, 9, lambda _, inflow: model.rotors(b, motors, inflow, around.wind)[1], above)
-    blades, _ = model.rotors(b, motors, settled, around.wind)
-    return model.loads(b, motors, blades, around), blades
+    settled = lax.fori_loop(0, 9, lambda _, inflow: model.rotors(b, motors, inflow, effects.wind)[1], above)
+    blades, _ = model.rotors(b, motors, settled, effects.wind)
+    return model.loads(b, motors, blades, effects), blades
 
 
 def hovering(model, x=None, **given):
     motors = start(model, state()).body.motors
-    return loads(model, body(x or state(), motors), motors, around(**given))[0]
+    return loads(model, body(x or state(), motors), motors, effects(**given))[0]
 
 
 # ---- balance
 
 
 def test_hover_balance(bem):
-    p = path(bem, start(bem, state()), command(), around())
+    p = path(bem, start(bem, state()), command(), effects())
     np.testing.assert_allclose(p.body.x.p, 0.0, atol=1e-9)
     np.testing.assert_allclose(p.body.x.R[-1], np.eye(3), atol=1e-12)
     force, torque = hovering(bem)
@@ -107,9 +109,9 @@ def test_hover_balance(bem):
 
 @pytest.mark.parametrize("error", [-0.035, 0.035])
 def test_thrust_error_is_the_stated_acceleration(bem, error):
-    wrong = strong(Bem.of(bem.vehicle, 0.02, thrust_error=error))
+    wrong = strong(BemQuadrotor.of(bem.vehicle, 0.02, thrust_error=error))
     assert float(hovering(wrong).force[2] / bem.vehicle.mass) == pytest.approx((1 + error) * G, rel=1e-9)
-    v = path(wrong, start(wrong, state()), command(), around()).body.x.v
+    v = path(wrong, start(wrong, state()), command(), effects()).body.x.v
     assert float(v[19, 2]) == pytest.approx(error * G * 0.02, rel=0.02)
 
 
@@ -118,8 +120,8 @@ def test_mirror_symmetry(bem, key):
     M = jnp.diag(jnp.array([1.0, -1.0, 1.0]))
     x, u, wind = random_state(key, 0.3), random_command(key), jnp.array([1.0, 2.0, 0.5])
     mirrored = State(M @ x.p, M @ x.R @ M, M @ x.v)
-    s = at(path(bem, start(bem, x), u, around(wind=wind)), 300).body.x
-    t = at(path(bem, start(bem, mirrored), Command(u.c, -M @ u.omega), around(wind=M @ wind)), 300).body.x
+    s = at(path(bem, start(bem, x), u, effects(wind=wind)), 300).body.x
+    t = at(path(bem, start(bem, mirrored), Command(u.c, -M @ u.omega), effects(wind=M @ wind)), 300).body.x
     np.testing.assert_allclose(t.p, M @ s.p, atol=1e-10)
     np.testing.assert_allclose(t.R, M @ s.R @ M, atol=1e-10)
 
@@ -132,8 +134,8 @@ def test_only_the_motion_through_the_air_counts(bem):
         hovering(bem, state(ZERO, turned), wind=-v),
     )
     u, s = command(10.0, [1.0, 0.5, -0.5]), start(bem, state(v, turned))
-    flying = path(bem, s, u, around()).body.x
-    held = path(bem, bem.with_state(s, state(ZERO, turned)), u, around(wind=-v)).body.x
+    flying = path(bem, s, u, effects()).body.x
+    held = path(bem, bem.with_state(s, state(ZERO, turned)), u, effects(wind=-v)).body.x
     t = SUBSTEP * np.arange(1, 301)[:, None]
     np.testing.assert_allclose(flying.p[:300] - held.p[:300], t * np.asarray(v), atol=1e-10)
     np.testing.assert_allclose(flying.R[:300], held.R[:300], atol=1e-10)
@@ -143,10 +145,10 @@ def test_terminal_velocity(bem):
     """A fall with idling rotors approaches the speed at which drag and idle thrust carry the weight."""
     s, speeds = start(bem, state()), []
     for _ in range(5):
-        s = at(path(bem, s, command(0.0), around()), 2000)
+        s = at(path(bem, s, command(0.0), effects()), 2000)
         speeds.append(-float(s.body.x.v[2]))
     weight, idling = float(bem.vehicle.mass) * G, s.body.motors
-    lift = lambda v: float(loads(bem, body(state([0.0, 0.0, -v]), idling), idling, around())[0].force[2])  # noqa: E731
+    lift = lambda v: float(loads(bem, body(state([0.0, 0.0, -v]), idling), idling, effects())[0].force[2])  # noqa: E731
     assert lift(0.999 * speeds[-1]) < weight < lift(1.001 * speeds[-1])
     assert 8.0 < speeds[0] < speeds[-1] < 20.0
 
@@ -160,8 +162,8 @@ def test_air_takes_energy(bem, key):
         x, omega = random_state(k, 5.0), random.normal(k, (3,))
         b, through = body(x, 1000.0 * np.ones(4), omega), x.R.T @ x.v
         of_body = float(bem.body_drag(b, jnp.zeros(3)) @ through)
-        _, blades = loads(bem, b, b.motors, around())
-        force, torque = bem.loads(b, b.motors, blades._replace(thrust=jnp.zeros(4), torque=jnp.zeros(4)), around())
+        _, blades = loads(bem, b, b.motors, effects())
+        force, torque = bem.loads(b, b.motors, blades._replace(thrust=jnp.zeros(4), torque=jnp.zeros(4)), effects())
         hubs = np.asarray(through) + np.cross(omega, bem.places())
         of_rotors = -bem_module.IN_PLANE_GAIN * float(blades.in_plane @ np.linalg.norm(hubs[:, :2], axis=1))
         assert of_body < 0.0
@@ -175,7 +177,7 @@ def test_air_takes_energy(bem, key):
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_rate_step_response(bem, axis):
     """Reaches 63 % within 60 ms (yaw 200 ms), overshoots by less than 25 %, holds the other rates."""
-    rates = path(bem, start(bem, state()), command(G, np.eye(3)[axis]), around()).body.omega
+    rates = path(bem, start(bem, state()), command(G, np.eye(3)[axis]), effects()).body.omega
     assert rates[200 if axis == 2 else 60, axis] > 0.63
     assert rates[:, axis].max() < 1.25
     assert rates[-1, axis] == pytest.approx(1.0, abs=0.15)
@@ -183,14 +185,14 @@ def test_rate_step_response(bem, axis):
 
 
 def test_commands_are_limited(bem):
-    car = bem.vehicle
-    p = path(bem, start(bem, state()), command(1e4, [1e3, 0.0, 0.0]), around()).body
-    assert (p.motors <= car.motor_max).all()
-    assert (p.motors >= car.motor_min).all()
-    assert jnp.abs(p.omega[:, 0]).max() < 1.5 * car.omega_max[0]
-    full = path(bem, start(bem, state()), command(1e4), around()).body.motors[-1]
-    wanted = jnp.sqrt(car.thrust_max / (4.0 * bem.loop.thrust_map))  # the small one's controllers end below it
-    np.testing.assert_allclose(full, min(wanted, car.esc.speed(jnp.array(1.0))), rtol=1e-6)
+    vehicle = bem.vehicle
+    p = path(bem, start(bem, state()), command(1e4, [1e3, 0.0, 0.0]), effects()).body
+    assert (p.motors <= vehicle.motor_max).all()
+    assert (p.motors >= vehicle.motor_min).all()
+    assert jnp.abs(p.omega[:, 0]).max() < 1.5 * vehicle.omega_max[0]
+    full = path(bem, start(bem, state()), command(1e4), effects()).body.motors[-1]
+    wanted = jnp.sqrt(vehicle.thrust_max / (4.0 * bem.loop.thrust_map))  # the small one's controllers end below it
+    np.testing.assert_allclose(full, min(wanted, vehicle.esc.speed(jnp.array(1.0))), rtol=1e-6)
 
 
 @pytest.mark.parametrize("rotor", range(4))
@@ -205,36 +207,36 @@ def test_a_weak_rotor_lets_its_corner_sink(bem, rotor):
 
 def test_payload_slows_the_climb(bem):
     m, dm = float(bem.vehicle.mass), 0.07
-    s = path(bem, start(bem, state()), command(15.0), around())
-    gained = [path(bem, at(s, 20), command(15.0), around(mass=k)).body.x.v[0] - s.body.x.v[19] for k in (0.0, dm)]
+    s = path(bem, start(bem, state()), command(15.0), effects())
+    gained = [path(bem, at(s, 20), command(15.0), effects(mass=k)).body.x.v[0] - s.body.x.v[19] for k in (0.0, dm)]
     thrusts = [g[2] / SUBSTEP + G for g in gained]
     assert float(thrusts[1] / thrusts[0]) == pytest.approx(m / (m + dm), rel=1e-9)
 
 
 def test_angular_momentum_is_kept(bem):
     """Rotors that give no force: gyroscopic torque and yaw reaction only pass momentum between body and rotors."""
-    car, yaw = bem.vehicle, jnp.array(SIGNS[2], dtype=float)
+    vehicle, yaw = bem.vehicle, jnp.array(SIGNS[2], dtype=float)
     none = BladeForces(*(jnp.zeros(4) for _ in range(3)))
-    still = replaced(bem, vehicle=replaced(car, drag_area=1e-12 * jnp.ones(3)))
+    still = replaced(bem, vehicle=replaced(vehicle, drag_area=1e-12 * jnp.ones(3)))
 
     def momentum(b):
-        rotors = -car.rotor_inertia * jnp.sum(yaw * b.motors)  # the front-right one turns towards +z
-        return b.x.R @ (car.inertia * b.omega + jnp.array([0.0, 0.0, 1.0]) * rotors)
+        rotors = -vehicle.rotor_inertia * jnp.sum(yaw * b.motors)  # the front-right one turns towards +z
+        return b.x.R @ (vehicle.inertia * b.omega + jnp.array([0.0, 0.0, 1.0]) * rotors)
 
     def millisecond(b, i):
         motors = b.motors + jnp.array([30.0, 10.0, -2.0, 5.0])
-        force, torque = still.loads(b, motors, none, around())
-        return rigid_body(b, motors, b.integral, force, torque, car.mass, car.inertia, b.integral), momentum(b)
+        force, torque = still.loads(b, motors, none, effects())
+        return rigid_body(b, motors, b.integral, force, torque, vehicle.mass, vehicle.inertia, b.integral), momentum(b)
 
     b = body(state(), [900.0, 1000.0, 1100.0, 1000.0], [1.0, -0.5, 0.3])
     L = jax.jit(lambda b: lax.scan(millisecond, b, length=100))(b)[1]
-    scale = float(car.rotor_inertia) * 4000.0  # gained by the rotors
+    scale = float(vehicle.rotor_inertia) * 4000.0  # gained by the rotors
     np.testing.assert_allclose(L, np.tile(L[0], (100, 1)), atol=0.05 * scale)
-    gyro = still.loads(b, b.motors, none, around()).torque
+    gyro = still.loads(b, b.motors, none, effects()).torque
     assert float(gyro @ b.omega) == pytest.approx(0.0, abs=1e-15)
     assert float(jnp.linalg.norm(gyro)) > 0.0
-    spun_up = still.loads(b, b.motors + jnp.array([9.0, 0.0, 0.0, 0.0]), none, around()).torque - gyro
-    assert float(spun_up[2]) < 0.0
+    smooth_start = still.loads(b, b.motors + jnp.array([9.0, 0.0, 0.0, 0.0]), none, effects()).torque - gyro
+    assert float(smooth_start[2]) < 0.0
 
 
 # ---- as a model
@@ -242,8 +244,8 @@ def test_angular_momentum_is_kept(bem):
 
 def test_loads_may_be_held_over_a_millisecond(monkeypatch):
     """Half the step moves a 10 s hover in wind, from half a metre away, by less than a millimetre."""
-    model = strong(Bem.of(small(), 0.02))
-    windy = around(wind=[2.0, 1.0, 0.0])
+    model = strong(BemQuadrotor.of(small(), 0.02))
+    windy = effects(wind=[2.0, 1.0, 0.0])
 
     def tick(s, _, *, n):
         x = model.state(s)
@@ -276,10 +278,10 @@ def tick(model, s, x, u, weights):
 
 def test_gradients_over_the_envelope(bem, key):
     """Finite, and equal to differences: fast and slow, in all attitudes, from idle to full thrust, and at rest."""
-    car = bem.vehicle
+    vehicle = bem.vehicle
     for k in random.split(key, 8):
         x, weights = random_state(k, 6.0), random.normal(k, (15,))
-        u = command(random.uniform(k) * car.command_max.c, random.uniform(k, (3,), minval=-1.0) * car.omega_max)
+        u = command(random.uniform(k) * vehicle.command_max.c, random.uniform(k, (3,), minval=-1.0) * vehicle.omega_max)
         s, d = start(bem, x), 1e-5 * random.normal(k, (3,))
         _, (dx, du) = tick(bem, s, x, u, weights)
         high, low = (
@@ -295,7 +297,7 @@ def test_gradients_over_the_envelope(bem, key):
 def test_hybrid_and_straight_through(key):
     """The value of the blade-element model with a residual, the gradient of Eq. (1)."""
     x, u, push = random_state(key, 0.3), random_command(key), jnp.array([0.5, 0.0, -1.0])
-    model, weights = strong(Bem.of(small(), 0.02)), jnp.arange(15.0)
+    model, weights = strong(BemQuadrotor.of(small(), 0.02)), jnp.arange(15.0)
     s = start(model, x)
 
     def slope(model, s):
@@ -303,12 +305,12 @@ def test_hybrid_and_straight_through(key):
 
     both = StraightThrough(Hybrid(model, lambda x, u: 2.0 * x.v), PointMass(0.02))
     value, gradient = jax.jit(lambda s: slope(both, s))(s)
-    flown = at(path(model, s, u, around(push=push + 2.0 * x.v)), 20)
+    flown = at(path(model, s, u, effects(push=push + 2.0 * x.v)), 20)
     assert float(value) == pytest.approx(float(weights @ flown.body.x.vector()), rel=1e-12)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12), gradient, slope(both.backward, x)[1])
 
 
 @pytest.mark.parametrize("dt", [0.0005, 0.0205, 0.0])
 def test_tick_must_be_whole_milliseconds(dt):
-    with pytest.raises(ValueError, match=r"Bem\.dt"):
-        Bem.of(small(), dt)
+    with pytest.raises(ValueError, match=r"BemQuadrotor\.dt"):
+        BemQuadrotor.of(small(), dt)

@@ -7,13 +7,14 @@ import pytest
 from jax import lax, random
 
 from helpers import random_state
+from retrim.config.registry import DISTURBANCES
 from retrim.physics import (
     BatterySag,
-    Bem,
-    Conditions,
+    BemQuadrotor,
     Constant,
     Disturbance,
     Dryden,
+    ExternalEffects,
     Fan,
     Payload,
     Push,
@@ -29,7 +30,6 @@ from retrim.physics import (
 from retrim.physics.propeller import Inflow
 from retrim.physics.vehicle import payload_inertia
 from retrim.physics.wind import FEET
-from retrim.testbed import DISTURBANCES
 
 SHAPES = {"push": (3,), "wind": (3,), "gain": (4,), "mass": (), "inertia": (3,)}
 
@@ -61,7 +61,7 @@ def test_all(name, double):
             assert value.shape == (5, *shape)
             assert value.dtype == (jnp.float64 if double else jnp.float32)
             assert np.isfinite(value).all()
-        calm = Conditions.calm(found.push.dtype)
+        calm = ExternalEffects.calm(found.push.dtype)
         quiet = jax.tree.map(lambda leaf, calm: bool((leaf == calm[None]).all()), found, calm)
         assert all(jax.tree.leaves(quiet)) == (name == "none")
 
@@ -82,13 +82,13 @@ def test_together_adds_and_gains_multiply(key):
     np.testing.assert_allclose(both.gain, [0.45, 1.0, 1.0, 1.0])
     np.testing.assert_allclose(both.inertia, payload_inertia(0.07))
     same(Together(parts[::-1])(t, x), both)
-    same(Together(())(t, x), Conditions.calm(x.p.dtype))
+    same(Together(())(t, x), ExternalEffects.calm(x.p.dtype))
 
 
 def test_push_lifts_a_function(key):
     x = random_state(key)
     found = Push(lambda t, x: t * x.v)(jnp.array(2.0), x)
-    same(found, Conditions.of(x.p.dtype, push=2.0 * x.v))
+    same(found, ExternalEffects.of(x.p.dtype, push=2.0 * x.v))
 
 
 # ---- random walk
@@ -217,22 +217,22 @@ def test_impossible_fans(bad, key):
 
 
 @jax.jit
-def acceleration(model, around):
+def acceleration(model, effects):
     """Of a hovering vehicle, when the inflow has settled."""
     x, zero = at(0.0, 0.0, 1.0), jnp.zeros(3)
     motors = jnp.sqrt(model.vehicle.mass * 9.81 / (4.0 * model.loop.thrust_map)) * jnp.ones(4)
     body = RotorState(x, zero, motors, zero, zero)
     inflow = jax.tree.map(lambda leaf: jnp.full(4, leaf), Inflow.above(motors.dtype))
-    inflow = lax.fori_loop(0, 8, lambda _, inflow: model.rotors(body, motors, inflow, around.wind)[1], inflow)
-    blades, _ = model.rotors(body, motors, inflow, around.wind)
-    return model.loads(body, motors, blades, around).force / model.vehicle.mass
+    inflow = lax.fori_loop(0, 8, lambda _, inflow: model.rotors(body, motors, inflow, effects.wind)[1], inflow)
+    blades, _ = model.rotors(body, motors, inflow, effects.wind)
+    return model.loads(body, motors, blades, effects).force / model.vehicle.mass
 
 
 def test_wind_pushes_through_the_aerodynamics():
     """Downwind, with 0.3 to 1 m/s^2 for every m/s; the model learns of it in no other way."""
-    around = SteadyWind(jnp.array([2.0, -1.0, 0.0]))(jnp.array(0.0), at(0.0, 0.0, 1.0))
-    np.testing.assert_array_equal(around.push, 0.0)
-    rate = np.asarray(acceleration(Bem.of(small(), 0.02), around)[:2]) / np.array([2.0, -1.0])
+    effects = SteadyWind(jnp.array([2.0, -1.0, 0.0]))(jnp.array(0.0), at(0.0, 0.0, 1.0))
+    np.testing.assert_array_equal(effects.push, 0.0)
+    rate = np.asarray(acceleration(BemQuadrotor.of(small(), 0.02), effects)[:2]) / np.array([2.0, -1.0])
     assert (rate > 0.3).all()
     assert (rate < 1.0).all()
 

@@ -11,9 +11,9 @@ from retrim.physics import (
     Command,
     Constant,
     Hybrid,
+    LinearDragQuadrotor,
     PointMass,
     Reversing,
-    Rotors,
     State,
     StraightThrough,
     f_a,
@@ -151,7 +151,7 @@ def test_backprop_option_differentiates_the_residual(key):
 def test_straight_through_has_one_models_value_and_the_others_gradient(key):
     """Across different state types: forward a rotor-level model, backward Eq. (1)."""
     x, u, a_ext = random_state(key, 0.3), random_command(key), jnp.array([0.5, 0.0, 0.0])
-    rotors, simple = Rotors.of(small(), 0.02), PointMass(0.02)
+    rotors, simple = LinearDragQuadrotor.of(small(), 0.02), PointMass(0.02)
     model = StraightThrough(rotors, simple)
     y = jnp.concatenate([x.vector(), u.vector()])
     np.testing.assert_array_equal(flat_step(model, a_ext)(y), flat_step(rotors, a_ext)(y))
@@ -180,7 +180,7 @@ def test_straight_through_refuses_two_rates():
 
 
 def test_hybrid_accepts_any_base(key):
-    hybrid = Hybrid(Rotors.of(small(), 0.02), lambda x, u: jnp.array([0.0, 0.0, 3.0]))
+    hybrid = Hybrid(LinearDragQuadrotor.of(small(), 0.02), lambda x, u: jnp.array([0.0, 0.0, 3.0]))
     x = State.at(jnp.zeros(3))
     plain = hybrid.base.step(hybrid.init(x), Command.hover(), jnp.array([0.0, 0.0, 3.0]))
     np.testing.assert_allclose(hybrid.state(hybrid.step(hybrid.init(x), Command.hover(), jnp.zeros(3))).v, plain.x.v)
@@ -198,7 +198,7 @@ def test_new_values_do_not_retrace(key):
 
     heavy = jax.tree.map(lambda leaf: 1.1 * leaf, small())
     for vehicle in (small(), heavy):
-        step(Rotors.of(vehicle, 0.02), random_state(key), random_command(key), jnp.ones(3))
+        step(LinearDragQuadrotor.of(vehicle, 0.02), random_state(key), random_command(key), jnp.ones(3))
     assert traces == 1
 
 

@@ -7,8 +7,8 @@ import pytest
 from jax import random
 
 from helpers import random_command, random_state, replaced
-from retrim.physics import Command, Conditions, Rotors, State, large, small, so3
-from retrim.physics.highrate import RotorState
+from retrim.physics import Command, ExternalEffects, LinearDragQuadrotor, State, large, small, so3
+from retrim.physics.substep import RotorState
 
 VEHICLES = {"small": small, "large": large}
 
@@ -16,7 +16,7 @@ VEHICLES = {"small": small, "large": large}
 @pytest.fixture(params=list(VEHICLES))
 def exact(request):
     """No thrust error, no drag."""
-    model = Rotors.of(VEHICLES[request.param](), 0.02, thrust_error=0.0)
+    model = LinearDragQuadrotor.of(VEHICLES[request.param](), 0.02, thrust_error=0.0)
     return replaced(model, drag=jnp.zeros(3))
 
 
@@ -37,7 +37,7 @@ def test_hover_balance(exact):
 
 
 def test_thrust_error_is_the_stated_acceleration():
-    model = replaced(Rotors.of(small(), 0.02, thrust_error=0.035), drag=jnp.zeros(3))
+    model = replaced(LinearDragQuadrotor.of(small(), 0.02, thrust_error=0.035), drag=jnp.zeros(3))
     s = flown(model, model.init(State.at(jnp.zeros(3))), Command.hover(), 1.0)
     assert s.x.v[2] == pytest.approx(0.035 * 9.81 * 1.0, rel=1e-6)
 
@@ -65,7 +65,7 @@ def test_rate_step_response(exact, axis):
     """Reaches 63 % within 150 ms (yaw 300 ms), overshoots by less than 25 %, settles on the command."""
     u = Command(jnp.array(9.81), 1.0 * jnp.eye(3)[axis])
     s, rates = exact.init(State.at(jnp.zeros(3))), []
-    step = jax.jit(lambda s: exact.substep(s, u, Conditions.calm(jnp.dtype(float))))
+    step = jax.jit(lambda s: exact.substep(s, u, ExternalEffects.calm(jnp.dtype(float))))
     for _ in range(1500):
         s = step(s)
         rates.append(float(s.omega[axis]))
@@ -86,7 +86,7 @@ def test_mirror_symmetry(exact, key):
 
 
 def test_drag_takes_energy_and_thrustless_flight_creates_none():
-    model = Rotors.of(small(), 0.02)
+    model = LinearDragQuadrotor.of(small(), 0.02)
     v = jnp.array([3.0, -2.0, 1.0])
     x, zero = State(jnp.zeros(3), so3.exp(jnp.array([0.3, 0.2, 0.1])), v), jnp.zeros(3)
     s = RotorState(x, zero, jnp.zeros(4), zero, zero)
@@ -99,10 +99,10 @@ def test_drag_takes_energy_and_thrustless_flight_creates_none():
 def test_commands_are_limited(exact):
     wild = Command(jnp.array(1e4), jnp.array([1e3, 0.0, 0.0]))
     s = flown(exact, exact.init(State.at(jnp.zeros(3))), wild, 0.5)
-    car = exact.vehicle
-    thrusts = car.thrust_coefficient * s.motors**2
-    assert float(jnp.sum(thrusts)) <= float(car.thrust_max) * (1 + 1e-9)
-    assert float(jnp.max(jnp.abs(s.omega))) < 1.5 * float(car.omega_max[0])
+    vehicle = exact.vehicle
+    thrusts = vehicle.thrust_coefficient * s.motors**2
+    assert float(jnp.sum(thrusts)) <= float(vehicle.thrust_max) * (1 + 1e-9)
+    assert float(jnp.max(jnp.abs(s.omega))) < 1.5 * float(vehicle.omega_max[0])
 
 
 def test_gradients_are_finite(exact, key):
@@ -122,15 +122,17 @@ def test_lift_and_project(exact, key):
 @pytest.mark.parametrize("dt", [0.0005, 0.0205, 0.0])
 def test_tick_must_be_whole_milliseconds(dt):
     with pytest.raises(ValueError, match=r"Rotors\.dt"):
-        Rotors.of(small(), dt)
+        LinearDragQuadrotor.of(small(), dt)
 
 
 @pytest.mark.parametrize("make", VEHICLES.values(), ids=VEHICLES)
 def test_vehicles(make):
-    car = make()
-    assert float(car.mass) * 9.81 < float(car.thrust_max)
-    assert float(car.command_min.c) < 9.81 < float(car.command_max.c)
-    assert 4 * float(car.thrust_coefficient) * float(car.hover_speed) ** 2 == pytest.approx(float(car.mass) * 9.81)
+    vehicle = make()
+    assert float(vehicle.mass) * 9.81 < float(vehicle.thrust_max)
+    assert float(vehicle.command_min.c) < 9.81 < float(vehicle.command_max.c)
+    assert 4 * float(vehicle.thrust_coefficient) * float(vehicle.hover_speed) ** 2 == pytest.approx(
+        float(vehicle.mass) * 9.81
+    )
 
 
 def test_vehicles_can_be_made_under_a_transformation():

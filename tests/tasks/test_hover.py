@@ -9,8 +9,9 @@ import pytest
 from jax import random
 
 from helpers import GOAL, hover_task, random_command, random_state, replaced
-from retrim import build, presets
-from retrim.adapt import ControllerPilot, Sample
+from retrim.adapt import ControllerPilot, Measurement
+from retrim.config import factory as build
+from retrim.config import presets
 from retrim.control import Policy, PolicyController
 from retrim.learn import rollout
 from retrim.physics import Command, PointMass, State, small, so3
@@ -101,7 +102,7 @@ def test_simulation_and_flight_see_the_same(key):
     pilot = ControllerPilot(PolicyController(task.observation, policy))
     for k in range(task.horizon):
         x = jax.tree.map(lambda leaf, k=k: leaf[k], simulated.x)
-        u = pilot(Sample(k * 0.02, x, Command.hover()))
+        u = pilot(Measurement(k * 0.02, x, Command.hover()))
         np.testing.assert_allclose(u.vector(), Command(simulated.u.c[k], simulated.u.omega[k]).vector(), rtol=1e-12)
 
 

@@ -12,7 +12,7 @@ from jax import random
 from helpers import replaced
 from retrim.physics import Command, PointMass, State, small, with_payload
 from retrim.tasks import REFERENCES, Reference, from_csv, joined
-from retrim.tasks.reference import POINTS, circle, figure8, spun_up, star
+from retrim.tasks.reference import POINTS, circle, figure8, smooth_start, star
 
 PERIODS = {"circle": 3.0, "figure8": 5.0, "star": 6.0}
 RAMP = 3.0
@@ -121,7 +121,7 @@ def test_speeds_after_spin_up(tables):
 
 def test_the_start_is_smooth():
     times = np.linspace(0.0, 4.0, 4001)
-    path = np.array([spun_up(float(t)) for t in times])
+    path = np.array([smooth_start(float(t)) for t in times])
     assert (np.diff(path) >= 0.0).all()
     rate = np.gradient(path, times)
     assert path[0] == 0.0

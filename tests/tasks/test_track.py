@@ -10,7 +10,7 @@ import pytest
 from jax import random
 
 from helpers import GOAL, random_command, random_state, replaced
-from retrim.adapt import ControllerPilot, Sample
+from retrim.adapt import ControllerPilot, Measurement
 from retrim.control import Policy, PolicyController
 from retrim.learn import rollout
 from retrim.physics import Command, PointMass, State, small, so3
@@ -198,7 +198,7 @@ def test_simulation_and_flight_see_the_same(t0, preview, loop, key):
     pilot = ControllerPilot(PolicyController(task.observation, policy))
     for k in range(task.horizon):
         x = jax.tree.map(lambda leaf, k=k: leaf[k], simulated.x)
-        u = pilot(Sample(t0 + k * 0.02, x, Command.hover()))
+        u = pilot(Measurement(t0 + k * 0.02, x, Command.hover()))
         np.testing.assert_allclose(u.vector(), Command(simulated.u.c[k], simulated.u.omega[k]).vector(), rtol=1e-10)
     assert np.ptp(np.asarray(simulated.u.c)) > 1e-4
 
@@ -225,7 +225,7 @@ def test_gradient_through_a_rollout_is_finite(make, loop, key):
 
     @eqx.filter_jit
     def slope(layers, start):
-        cost = lambda layers: -jnp.mean(rollout(PointMass(0.02), task, policy.retrained(layers), start).reward)  # noqa: E731
+        cost = lambda layers: -jnp.mean(rollout(PointMass(0.02), task, policy.with_params(layers), start).reward)  # noqa: E731
         return jax.grad(cost)(layers)
 
     for start in (task.reset(key), Start(jnp.array(4.0), on(loop, 4.0))):

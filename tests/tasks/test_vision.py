@@ -10,15 +10,15 @@ import pytest
 from jax import lax, random
 
 from helpers import GOAL, random_command, replaced
-from retrim.adapt import ControllerPilot, Sample
+from retrim.adapt import ControllerPilot, Measurement
 from retrim.control import Policy, PolicyController
+from retrim.estimation.camera import in_camera
+from retrim.estimation.pose_filter import PoseFilter
 from retrim.learn import rollout
-from retrim.learn.represent import represent
+from retrim.learn.encoder import represent
 from retrim.physics import Command, PointMass, State, small, so3
 from retrim.tasks import Camera, Hover, Keypoints, Start
-from retrim.tasks.camera import in_camera
 from retrim.tasks.keypoints import STRANGE, random_motion
-from retrim.tasks.sight import Sight
 
 PUBLISHED = [
     (-0.427, -0.474), (0.402, -0.474), (0.402, 0.631), (-0.427, 0.631), (-0.012, 0.665), (-0.452, 0.078),
@@ -36,7 +36,7 @@ def near():
 
 
 @pytest.fixture(scope="module")
-def plain():
+def merged():
     return keypoints()
 
 
@@ -329,7 +329,7 @@ def stacked_commands(us):
 @pytest.mark.parametrize("seed", range(3))
 def test_converges_from_its_hand_over(seed, plain):
     x = State.at(jnp.array(GOAL))
-    start = Sight.near(x, random.key(seed))
+    start = PoseFilter.near(x, random.key(seed))
     assert float(jnp.linalg.norm(start.x.p - x.p)) > 0.01
     _, _, gaps, _ = tracked(start, x, stacked_commands(hovering(40)), jnp.ones((40, 7), dtype=bool), plain)
     assert float(gaps[15:, 0].max()) < 2e-3  # m
@@ -339,7 +339,7 @@ def test_converges_from_its_hand_over(seed, plain):
 
 def test_hand_over_is_as_uncertain_as_it_says():
     x = State.at(jnp.array(GOAL))
-    starts = jax.jit(jax.vmap(lambda k: Sight.near(x, k)))(random.split(random.key(8), 2000))
+    starts = jax.jit(jax.vmap(lambda k: PoseFilter.near(x, k)))(random.split(random.key(8), 2000))
     np.testing.assert_allclose((starts.x.p - x.p[None]).std(axis=0), 0.1, rtol=0.08)
     np.testing.assert_allclose(jax.vmap(so3.log)(starts.x.R).std(axis=0), 0.05, rtol=0.08)
     np.testing.assert_allclose(starts.x.v.std(axis=0), 0.2, rtol=0.08)
@@ -351,7 +351,7 @@ def test_predicts_through_the_dark(plain, key):
     us = stacked_commands(hovering(25) + [random_command(k) for k in random.split(key, 15)])
     dark = jnp.arange(40)[:, None] < jnp.full((1, 7), 25)
     x0 = State.at(jnp.array(GOAL))
-    _, x, gaps, P = tracked(Sight.near(x0, key), x0, us, dark, plain)
+    _, x, gaps, P = tracked(PoseFilter.near(x0, key), x0, us, dark, plain)
     assert float(jnp.linalg.norm(x.v)) > 0.1  # it has moved
     assert float(gaps[-1, 0]) < 5e-3
     assert float(gaps[-1, 1]) < 5e-3
@@ -363,7 +363,7 @@ def test_predicts_through_the_dark(plain, key):
 def test_one_point_corrects(plain, key):
     """Of whichever point: less doubt than without it; a hidden one changes nothing."""
     x = State.at(jnp.array(GOAL))
-    sight = Sight.near(x, key)
+    sight = PoseFilter.near(x, key)
     pixels, _ = plain.pixels(x)
     for i in range(7):
         after = corrected(sight, plain, pixels, jnp.arange(7) == i)
@@ -381,7 +381,7 @@ def test_covariance_stays_one(plain, key):
     us = stacked_commands(gentle(ku, 40))
     seen = random.uniform(kv, (40, 7)) < 0.3
     x0 = State.at(jnp.array(GOAL))
-    _, _, gaps, P = tracked(Sight.near(x0, ks), x0, us, seen, plain)
+    _, _, gaps, P = tracked(PoseFilter.near(x0, ks), x0, us, seen, plain)
     np.testing.assert_allclose(P, np.swapaxes(P, 1, 2), atol=1e-15)
     assert np.linalg.eigvalsh(P).min() > 0.0
     assert float(gaps[20:, 0].max()) < 0.02
@@ -389,7 +389,9 @@ def test_covariance_stays_one(plain, key):
 
 def test_a_stray_point_does_not_throw_it(plain, key):
     x = State.at(jnp.array(GOAL))
-    sight, *_ = tracked(Sight.near(x, key), x, stacked_commands(hovering(40)), jnp.ones((40, 7), dtype=bool), plain)
+    sight, *_ = tracked(
+        PoseFilter.near(x, key), x, stacked_commands(hovering(40)), jnp.ones((40, 7), dtype=bool), plain
+    )
     pixels = plain.pixels(x)[0].at[2].set(jnp.array([-0.9, -0.9]))
     after = corrected(sight, plain, pixels, jnp.ones(7, dtype=bool))
     assert float(jnp.linalg.norm(after.x.p - x.p)) < 0.02
@@ -428,6 +430,6 @@ def test_simulation_and_flight_see_the_same(honest, white, key):
     pilot = ControllerPilot(PolicyController(seen, policy))
     for k in range(task.horizon):
         x = jax.tree.map(lambda leaf, k=k: leaf[k], simulated.x)
-        u = pilot(Sample(k * 0.02, x, Command.hover()))
+        u = pilot(Measurement(k * 0.02, x, Command.hover()))
         np.testing.assert_allclose(u.vector(), Command(simulated.u.c[k], simulated.u.omega[k]).vector(), rtol=1e-7)
     assert np.ptp(np.asarray(simulated.u.c)) > 1e-3

@@ -1,15 +1,18 @@
-"""The loop: the only place with time, processes, input and output."""
+"""Adaptation as pure functions and messages; :mod:`retrim.runtime` gives them a clock."""
 
-from .adapter import Adapter as Adapter
-from .adapter import AdaptState as AdaptState
-from .lockstep import AdaptivePilot as AdaptivePilot
-from .lockstep import Event as Event
-from .lockstep import Schedule as Schedule
-from .plant import ControllerPilot as ControllerPilot
-from .plant import Log as Log
-from .plant import Plant as Plant
-from .plant import PlantError as PlantError
-from .plant import Sample as Sample
-from .plant import fly as fly
-from .plants import SimPlant as SimPlant
-from .sensing import Sensing as Sensing
+from .buffer import RollingBuffer as RollingBuffer
+from .gate import Verdict as Verdict
+from .gate import judge as judge
+from .learner import FitReport as FitReport
+from .learner import LearnerState as LearnerState
+from .learner import OnlineLearner as OnlineLearner
+from .updates import PolicyUpdate as PolicyUpdate
+from .updates import Rejection as Rejection
+from .updates import ResidualUpdate as ResidualUpdate
+from .updates import Skip as Skip
+from .updates import Update as Update
+from .updates import pack_update as pack_update
+from .updates import unpack_update as unpack_update
+from .workers import PolicyWorker as PolicyWorker
+from .workers import ResidualWorker as ResidualWorker
+from .workers import Worker as Worker

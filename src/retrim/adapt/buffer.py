@@ -1,4 +1,4 @@
-"""The last seconds of flight."""
+"""Rolling buffer of the last seconds of flight."""
 
 from collections import deque
 
@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..learn.residual import Window
+from ..learn.window import Window
 from ..physics.state import Command, State
 
 
@@ -23,7 +23,12 @@ class RollingBuffer:
         return len(self._rows)
 
     def push(self, t: float, x: State, u: Command) -> None:
-        """Append the state at the tick of time ``t`` [s] and the command issued at it."""
+        """Append the measured state at the tick of time ``t`` [s] and the command issued at it."""
+        self._rows.append((t, x, u))
+
+    def accepted(self, u: Command) -> None:
+        """Replace the last command by the one that the plant accepted."""
+        t, x, _ = self._rows.pop()
         self._rows.append((t, x, u))
 
     def clear(self) -> None:
@@ -31,9 +36,10 @@ class RollingBuffer:
         self._rows.clear()
 
     def window(self) -> Window:
-        """A snapshot of fixed shape; while it fills, the oldest tick is repeated in front and marked invalid.
+        """Return a snapshot of fixed shape; while it fills, the oldest tick is repeated in front and marked invalid.
 
-        Raises ``ValueError`` if nothing was pushed yet.
+        Raises:
+            ValueError: Nothing was pushed yet.
         """
         if not self._rows:
             raise ValueError("RollingBuffer: no tick was pushed yet")

@@ -1,4 +1,4 @@
-"""Admission: what was learnt must be finite, and no worse than what flies, before anyone sees it."""
+"""The gate: a re-trained policy must be finite, and no worse than the flying one, before it may fly."""
 
 from typing import Any
 
@@ -9,45 +9,48 @@ from jaxtyping import Array, Bool, Float
 
 from ..control.policy import Policy
 from ..learn.bptt import policy_loss
-from ..physics.dynamics import AbstractDynamics
-from ..tasks.task import AbstractTask, Start
+from ..learn.env import Env
+from ..tasks.task import Start
 
 
 class Verdict(eqx.Module):
-    """What the gate found."""
+    """The gate's decision and its grounds."""
 
     admitted: Bool[Array, ""]
     finite: Bool[Array, ""]
     """No weight of the candidate is NaN or infinite."""
     candidate: Float[Array, ""]
-    """Its cost: minus the mean reward of the roll-outs; a crash is charged to the end."""
+    """Cost of the candidate: minus the mean reward of its roll-outs."""
     incumbent: Float[Array, ""]
+    """Cost of the policy that flies."""
 
     def reason(self) -> str:
-        """In words, for the log."""
+        """Return the grounds in words, for the log."""
         if not self.finite:
             return "a weight is not finite"
         costs = f"{float(self.candidate):.4f} against {float(self.incumbent):.4f}"
         return f"cost {costs}" if self.admitted else f"worse than the incumbent: cost {costs}"
 
 
-def finite(tree: Any) -> Bool[Array, ""]:
-    """Whether every number in ``tree`` is finite."""
+def all_finite(tree: Any) -> Bool[Array, ""]:
+    """Return whether every number in ``tree`` is finite."""
     return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(tree)]))
 
 
-def judge(
-    candidate: Policy,
-    incumbent: Policy,
-    dynamics: AbstractDynamics[Any],
-    task: AbstractTask,
-    x0: Start,
-    *,
-    delay: int = 0,
-) -> Verdict:
-    """Fly both from the same starts ``x0`` (leading axis) through ``dynamics``, the current hybrid model."""
-    new = policy_loss(candidate, dynamics, task, x0, delay=delay)
-    old = policy_loss(incumbent, dynamics, task, x0, delay=delay)
-    sound = finite(candidate.layers)
+def judge(candidate: Policy, incumbent: Policy, env: Env, x0: Start) -> Verdict:
+    """Compare two policies on the same roll-outs.
+
+    Args:
+        candidate: The re-trained policy.
+        incumbent: The policy that flies.
+        env: Task and current hybrid model.
+        x0: Starts (leading axis) on which the candidate was not trained.
+
+    Returns:
+        The verdict; the candidate is admitted if it is finite and its cost is not higher.
+    """
+    new = policy_loss(candidate, env, x0)
+    old = policy_loss(incumbent, env, x0)
+    sound = all_finite(candidate.layers)
     better = (new <= old) | ~jnp.isfinite(old)
     return Verdict(sound & jnp.isfinite(new) & better, sound, new, old)

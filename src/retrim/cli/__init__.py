@@ -1,3 +1,3 @@
-"""The command ``retrim``: one file per command."""
+"""The command ``retrim``: one file per command. Commands parse, call the library, print, and return an exit code."""
 
 from .main import main as main

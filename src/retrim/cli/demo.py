@@ -1,79 +1,90 @@
 """``retrim demo``: the whole loop in two minutes."""
 
 import sys
+import threading
 import webbrowser
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
-from .. import presets
-from ..checkpoint import save_policy
-from ..testbed import ABOUT, PlantName
-from .fly import setting_for, write_events
-from .hover_table import fly_table, hover_table
-from .pictures import picture
-from .session import Stopwatch, console, run_folder, write_results
-from .training import nominal_error, train
+from ..config.loading import load
+from ..config.presets import PRESETS
+from ..config.scenario import Scenario
+from ..config.setup import Setup
+from ..errors import ConfigError
+from ..experiments.figures import picture
+from ..experiments.metrics import rows
+from ..experiments.outputs import write_events
+from ..experiments.run import INTERRUPTED, Run
+from ..experiments.tables.hover import PAPER
+from ..experiments.tables.study import LEVELS, Study, fly_all, level_table
+from ..experiments.training import nominal_error, train
+from ..io.trained import save_policy
+from .console import RichReporter, console, show_paths, show_table
+from .pretrain import checked_seed
 
 WHY = {
-    "fast": "trains in seconds, and its model has a command delay, as plants have (others: --preset paper, released)",
-    "released": "the delay, observation and training size of the authors' code",
-    "paper": "as printed: no delay in the model, no past commands in the observation",
+    "hover/fast": "trains in seconds, and its model has a command delay, as plants have",
+    "hover/released": "the delay, observation and training size of the authors' code",
+    "hover/paper": "as printed: no delay in the model, no past commands in the observation",
 }
 
 
 def demo(
-    preset: Literal["fast", "released", "paper"] = "fast",
-    plant: PlantName = "simple",
+    preset: str = "hover/fast",
+    plant: str = "simple",
     seconds: float = 30.0,
     starts: int = 8,
     seed: int = 0,
     out: Path | None = None,
-) -> int:
+) -> Callable[[threading.Event], int]:
     """Pretrain a hover policy, push it with disturbances that it never saw, and re-train it while it flies.
 
     Args:
-        preset: fast trains in seconds and has the plant's delay in its model; paper and released take about a minute.
+        preset: hover/fast trains in seconds; hover/paper and hover/released take about a minute.
         plant: simple: rotors with linear drag, the quickest; bem: blade-element rotors; the others are extras.
         seconds: Length of a flight.
         starts: Flights per disturbance and method, each from another start.
         seed: Seed of everything.
         out: Folder for the policy, results.json and the pictures; a new one under runs/ by default.
     """
-    watch = Stopwatch()
-    if seconds < 3.0 or starts < 1:
-        raise presets.PresetError(f"--seconds {seconds:g} --starts {starts}: at least 3 s and 1 start are needed")
-    folder = run_folder(out, "demo")
-    settings = presets.load(preset)
-    console.print(f"preset [bold]{preset}[/]: {WHY[preset]}")
-    setting = setting_for(settings, plant)
-    console.print(f"{setting.flown} quadrotor on plant [bold]{plant}[/]: {ABOUT[plant]}")
-    policy, losses, interrupted = train(settings, seed)
-    if losses:
-        save_policy(folder / "policy.safetensors", policy, settings)
-    if interrupted:
-        console.print(f"interrupted while pretraining, after {len(losses)} epochs; what there is lies in {folder}")
-        return 130
-    console.print(f"hover error in its own model: {1000 * nominal_error(settings, policy):.1f} mm")
-    flights, interrupted = fly_table(settings, policy, setting, seconds=seconds, starts=starts, seed=seed)
-    table = hover_table(flights, settings, setting)
-    write_results(
-        folder,
-        seeds=[seed],
-        watch=watch,
-        rows=table.rows,
-        interrupted=interrupted,
-        preset=presets.values(settings),
-        losses=losses,
+    return lambda stop: _demo(preset, plant, seconds, starts, checked_seed(seed), out, stop)
+
+
+def _demo(
+    name: str, plant: str, seconds: float, starts: int, seed: int, out: Path | None, stop: threading.Event
+) -> int:
+    if not 3.0 <= seconds <= 36_000.0 or not 1 <= starts <= 100_000:
+        raise ConfigError(f"--seconds {seconds:g} --starts {starts}: 3 to 36000 s and 1 to 100000 starts can be flown")
+    preset = load(f"hover/{name}" if f"hover/{name}" in PRESETS else name)
+    if preset.task != "hover":
+        raise ConfigError(f"preset {name!r} is for {preset.task}; the demo hovers")
+    scenario, setup, reporter = Scenario("large", plant=plant), Setup.of(preset), RichReporter()
+    run = Run("demo", out, stop=stop)
+    console.print(f"[bold]{len(LEVELS) * 2 * starts} flights of {seconds:g} s[/]; two to three minutes on two cores")
+    console.print(f"preset [bold]{preset.name}[/]: {WHY.get(preset.name, 'your choice')}")
+    console.print(
+        f"{scenario.vehicle_name(preset.vehicle)} quadrotor on plant [bold]{plant}[/]: {scenario.entry.about}"
     )
-    write_events(flights, folder)
-    console.print(table.shown)
-    console.print(f"compiling {watch.compile_s:.0f} s, all else {watch.total_s - watch.compile_s:.0f} s")
-    flown = dict.fromkeys(f.plan.disturbance for f in flights)
-    pictures = [path for name in flown for path in picture(flights, settings, name, setting, folder)]
-    for path in pictures:
-        if path.suffix == ".png":
-            console.print(f"[bold]{path}[/]", soft_wrap=True)
-    best = folder / "hover_large.png"
+    policy, losses = train(setup, seed, reporter=reporter, stop=stop)
+    if losses:
+        save_policy(run.folder / "policy.safetensors", policy, preset)
+    if run.interrupted:
+        console.print(f"interrupted while pretraining, after {len(losses)} steps; what there is lies in {run.folder}")
+        return INTERRUPTED
+    study = Study(preset, {seed: policy}, (nominal_error(setup, policy),))
+    console.print(f"hover error in its own model: {1000 * study.errors[0]:.1f} mm")
+    scenarios = [replace(scenario, disturbance=level) for level in LEVELS]
+    flights = fly_all(study, scenarios, run, reporter, starts=starts, seconds=seconds).flown
+    found = rows(flights)
+    run.write_results(found, seeds=[seed], preset=preset.name, losses=losses)
+    write_events(flights, run.folder)
+    title = f"steady-state hover error [m]: mean ± std over {starts} starts, last 2 s of {seconds:g} s"
+    show_table(level_table(found, ("base", "full"), PAPER, title))
+    console.print(run.watch.sentence())
+    pictures = [path for each in scenarios for path in picture(flights, setup, each, run.folder)]
+    show_paths([path for path in pictures if path.suffix == ".png"])
+    best = run.folder / "hover_large.png"
     if best in pictures and sys.stdout.isatty():
         webbrowser.open(best.resolve().as_uri())
-    return 130 if interrupted else 0
+    return run.exit_code

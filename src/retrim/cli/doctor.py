@@ -1,7 +1,7 @@
 """``retrim doctor``: is this installation fit to fly?"""
 
-import platform
-from importlib.metadata import version
+import threading
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -9,13 +9,18 @@ import numpy as np
 from jaxtyping import Array, Float
 from rich.table import Table
 
-from .session import commit, console, machine
+from ..experiments.provenance import commit, describe_hardware, versions
+from .console import console
 
 EXCLUDED = "0.10.2"
 
 
-def doctor() -> int:
+def doctor() -> Callable[[threading.Event], int]:
     """Print versions, device and cache, and look for the known faults of dependencies; exit code 1 if one is there."""
+    return lambda stop: _doctor()
+
+
+def _doctor() -> int:
     wrong = sum(wrong_rows(n, jnp.float32) for n in (1_000, 16_385, 32_769))
     if wrong:
         verdict = f"[bold red]wrong[/]: {wrong} rows of a batched product; another version of jax is needed"
@@ -23,10 +28,9 @@ def doctor() -> int:
         verdict = "[green]right[/]"
     shown = Table(show_header=False)
     for name, value in (
-        ("retrim", f"{version('retrim')}, commit {commit()}"),
-        ("python", platform.python_version()),
-        *((name, version(name)) for name in ("jax", "jaxlib", "equinox", "optax", "numpy")),
-        ("machine", machine()),
+        ("commit", commit()),
+        *versions().items(),
+        ("machine", describe_hardware()),
         ("compile cache", str(jax.config.values["jax_compilation_cache_dir"])),
         ("batched products (jax-ml/jax#39103)", verdict),
     ):

@@ -1,172 +1,206 @@
 """``retrim fly``."""
 
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from rich.table import Table
-
-from .. import build, presets, testbed
-from ..adapt.sink import JsonlSink
-from ..checkpoint import load_delta, load_policy, save_delta, save_policy
-from ..control.lora import LoraPolicy
-from ..presets import Preset
+from ..adapt.learner import LearnerState
+from ..config.loading import changed, overlaid
+from ..config.presets import Preset
+from ..config.scenario import Scenario
+from ..config.setup import Latency, Method, Setup
+from ..control.policy import Policy
+from ..errors import ConfigError
+from ..experiments.figures import picture
+from ..experiments.fleet import Fleet
+from ..experiments.metrics import cell, rows
+from ..experiments.outputs import write_events, write_learnt, write_logs
+from ..experiments.run import INTERRUPTED, Run
+from ..experiments.tables.document import TableSection
+from ..io.checkpoint import load_delta
+from ..io.trained import load_learnt, load_policy
 from ..tasks.reference import Reference
-from ..testbed import PlantName, SensingName, Setting, VehicleName
-from .flights import STEADY, Campaign, Flight, Method, Plan
-from .pictures import picture
-from .scores import cell, rows
-from .session import Stopwatch, console, run_folder, write_results
+from .console import RichReporter, console, show_paths, show_table
+from .pretrain import checked_seed
 
-SECONDS = {"hover": 30.0, "vision": 30.0, "track": 60.0}  # of a flight, as in the paper
+
+@dataclass(frozen=True)
+class Order:
+    """What was asked for, checked."""
+
+    preset: Preset
+    policy: Policy
+    scenario: Scenario
+    methods: tuple[Method, ...]
+    seconds: float
+    starts: int
+    seed: int
+    latency: Latency
+    state: LearnerState | None
+    out: Path | None
 
 
 def fly(
-    policy: Path,
+    policy: Path | None = None,
+    resume: Path | None = None,
     delta: Path | None = None,
     disturbance: str = "large",
-    plant: PlantName = "bem",
+    plant: str = "bem",
     adapt: Literal["none", "full", "lora"] = "full",
     reference: str | None = None,
-    vehicle: VehicleName | None = None,
-    sensing: SensingName = "ideal",
+    vehicle: str | None = None,
+    sensors: str = "ideal",
     thrust_error: float = 0.035,
+    residual: str | None = None,
     config: Path | None = None,
-    charge: Literal["fixed", "measured"] = "fixed",
+    latency: Latency = "fixed",
     seconds: float | None = None,
     starts: int = 1,
     seed: int = 0,
     out: Path | None = None,
-) -> int:
+) -> Callable[[threading.Event], int]:
     """Fly a policy on a plant, as it is and, with --adapt full or lora, adapting as it flies.
 
     Args:
         policy: A policy.safetensors, or the folder that holds one.
+        resume: Instead of a policy: a learnt.safetensors of an earlier flight (policy, residual, optimiser states),
+            to go on from.
         delta: A low-rank delta.safetensors of an earlier flight, to put on the policy.
-        disturbance: What disturbs the flight: none, small, large, reversing, walk, wind, gusts, fan, payload, pickup,
-            battery, weak-rotor, or several at once, as wind+payload.
-        adapt: full: re-train all weights in flight; lora: a low-rank delta (ranks 4, 10, 1); none: fly as it is.
-        reference: What a tracking policy follows: circle, figure8, star or a CSV file of t, x, y, z[, yaw]; what it was
-            trained on by default. Another one needs a policy that sees its reference (preset track).
+        disturbance: What disturbs the flight: none, small, large, push, reversing, walk, wind, gusts, fan, payload,
+            pickup, battery, weak-rotor, with a size, as wind=6 [m/s] or payload=0.2 [kg], several at once, as
+            wind+payload=0.1, or module:name.
         plant: bem: blade-element rotors; simple: rotors with linear drag; rotorpy, mujoco, crazyflow: independent
-            simulators, each an extra to install.
-        vehicle: Quadrotor that the plant simulates; that which the policy was trained for by default. rotorpy and
-            crazyflow fly their own.
-        sensing: What the policy sees of the state: ideal, mocap (0.3 mm, 3 mm/s, 1 mrad) or rough (1 mm, 10 mm/s,
-            3 mrad, 10 ms late, 5 % of the samples lost).
+            simulators, each an extra to install; or module:name.
+        adapt: full: re-train all weights in flight; lora: a low-rank delta (ranks 4, 10, 1); none: fly as it is.
+        reference: What a tracking policy follows: circle, figure8, star, a CSV file of t, x, y, z[, yaw], or
+            module:name; what it was trained on by default. Another one needs a policy that sees its reference.
+        vehicle: Vehicle that the plant simulates: small, large, kingfisher, a vehicle file or module:name; that which
+            the policy was trained for by default. rotorpy and crazyflow fly their own.
+        sensors: What the policy is shown of the state: ideal, mocap (0.3 mm, 3 mm/s, 1 mrad), rough (1 mm, 10 mm/s,
+            3 mrad, 10 ms late, 5 % of the samples lost), or module:name.
         thrust_error: By how much more than commanded the rotors give, as a share (bem and simple).
+        residual: Residual model: ensemble, or module:name.
         config: TOML file that overlays the policy's own preset, for example with a table [adapt].
-        charge: fixed: learning costs the preset's flight time, so that a run repeats bit for bit; measured: what the
+        latency: fixed: learning costs the preset's flight time, so that a run repeats bit for bit; measured: what the
             clock says.
         seconds: Length of a flight; 30 s for hover, 60 s for tracking by default.
         starts: Number of flights, each from another start.
-        seed: Seed of the starts and of the learners.
-        out: Folder for results.json, events.jsonl, what was learnt and the picture; a new one under runs/ by default.
+        seed: Seed of the starts, of the learners and of what is random in the scenario, 0 to 4294967295.
+        out: Folder for results.json, events.jsonl, logs/, what was learnt and the picture; a new one under runs/ by
+            default.
     """
-    watch = Stopwatch()
-    weights, preset = load_policy(policy)
-    if delta is not None:
-        weights = load_delta(delta, weights).plain()
-    if config is not None:
-        preset = _same_policy(preset, presets.overlaid(preset, config), config)
-    seconds = seconds or SECONDS[preset.task]
-    if seconds < 3.0 or starts < 1:
-        raise presets.PresetError(f"--seconds {seconds:g} --starts {starts}: at least 3 s and 1 start are needed")
-    setting = setting_for(preset, plant, vehicle, sensing, thrust_error)
-    testbed.disturbance(disturbance)  # a wrong name is refused before anything else happens
-    flown = followed(preset, reference)
-    folder = run_folder(out, "fly")
-    campaign = Campaign(
-        preset,
-        weights,
-        setting=setting,
-        seconds=seconds,
-        starts=starts,
-        seed=seed,
-        measured=charge == "measured",
-        flown=flown,
+
+    def ordered(stop: threading.Event) -> int:
+        weights, preset, state = _loaded(policy, resume, delta)
+        if config is not None:
+            preset = _same_policy(preset, overlaid(preset, config), config)
+        if residual is not None:
+            if state is not None:
+                raise ConfigError(f"--residual {residual}: a resumed flight goes on with its own residual")
+            preset = changed(preset, adapt={"residual": residual})
+        follows = _flown_reference(preset, reference)
+        scenario = Scenario(disturbance, plant, vehicle, sensors, thrust_error, follows)
+        methods: tuple[Method, ...] = ("base",) if adapt == "none" else ("base", adapt)
+        setup = Setup.of(preset, follows)
+        length = setup.flown.flight_seconds if seconds is None else seconds
+        if not 3.0 <= length <= 36_000.0 or not 1 <= starts <= 100_000:
+            raise ConfigError(
+                f"--seconds {length:g} --starts {starts}: 3 to 36000 s and 1 to 100000 starts can be flown"
+            )
+        _warn(setup, follows)
+        order = Order(preset, weights, scenario, methods, length, starts, checked_seed(seed), latency, state, out)
+        return _fly(order, setup, stop)
+
+    return ordered
+
+
+def _fly(order: Order, setup: Setup, stop: threading.Event) -> int:
+    policies = {order.seed: order.policy}
+    fleet = Fleet(
+        order.preset,
+        policies,
+        [order.scenario],
+        methods=order.methods,
+        starts=order.starts,
+        seconds=order.seconds,
+        latency=order.latency,
+        state=order.state,
     )
-    methods: tuple[Method, ...] = ("base",) if adapt == "none" else ("base", adapt)
-    campaign.warm_up([disturbance], methods)
-    plans = [Plan(disturbance, method, i) for method in methods for i in range(starts)]
-    flights, interrupted = campaign.fly(plans)
+    run = Run("fly", order.out, stop=stop)
+    with RichReporter().progress("flying") as advance:
+        advance(0.0, "compiling the programs of a flight (kept in a cache for the next time)")
+        fleet.warm_up()
+        flights = fleet.run(stop=stop, progress=lambda done, n: advance(done / n, f"{done} of {n} flights")).flown
     if not flights:
         console.print("interrupted before the first flight was over; nothing was saved")
-        return 130
-    write_events(flights, folder)
-    save_learnt(flights, preset, folder)
-    table = rows(flights, task=preset.task, setting=setting)
-    write_results(folder, seeds=[seed], watch=watch, rows=table, interrupted=interrupted, preset=presets.values(preset))
-    many = f"{starts} start{'s' * (starts > 1)}"
-    shown = Table(title=f"{preset.task} error \\[m], last {STEADY[preset.task]:g} s of {seconds:g} s, {many}")
-    for heading in ("disturbance", "method", "error"):
-        shown.add_column(heading)
-    for row in table:
-        shown.add_row(row["disturbance"], row["method"], cell(row))
-    console.print(shown)
-    for path in picture(flights, preset, disturbance, setting, folder, flown):
-        console.print(f"[bold]{path}[/]", soft_wrap=True)
-    return 130 if interrupted else 0
+        return INTERRUPTED
+    found = rows(flights)
+    run.write_results(found, seeds=[order.seed], preset=order.preset.name)
+    write_events(flights, run.folder)
+    write_logs(flights, run.folder)
+    write_learnt(flights, order.preset, run.folder)
+    many = f"{order.starts} start{'s' * (order.starts > 1)}"
+    kind = order.preset.task.rpartition(":")[2]
+    title = f"{kind} error [m], last {flights[0].steady_seconds:g} s of {order.seconds:g} s, {many}"
+    lines = tuple((row["disturbance"], row["method"], cell(row)) for row in found)
+    show_table(TableSection(("disturbance", "method", "error"), lines, title))
+    show_paths([*picture(flights, setup, order.scenario, run.folder), run.folder / "results.json"])
+    return run.exit_code
 
 
-def followed(preset: Preset, name: str | None) -> Reference | None:
-    """The reference of a tracking flight, with a warning for what the vehicle cannot fly; None for other tasks.
+def _loaded(policy: Path | None, resume: Path | None, delta: Path | None) -> tuple[Policy, Preset, LearnerState | None]:
+    """Weights, preset, and what an earlier flight learnt."""
+    if (policy is None) == (resume is None):
+        raise ConfigError("give either --policy FILE or --resume FILE; `retrim pretrain hover --out h` makes h")
+    if resume is not None:
+        if delta is not None:
+            raise ConfigError("--delta goes with --policy; --resume holds its own")
+        state, preset = load_learnt(resume)
+        return state.policy.policy.merged(), preset, state
+    assert policy is not None
+    weights, preset = load_policy(policy)
+    return (load_delta(delta, weights).merged() if delta is not None else weights), preset, None
 
-    Raises :class:`PresetError` where a policy cannot follow another reference than that of its training.
+
+def _flown_reference(preset: Preset, name: str | None) -> str | None:
+    """The reference of a tracking flight.
+
+    Raises:
+        ConfigError: The policy cannot follow it.
     """
-    if preset.task != "track":
+    if preset.track is None:
         if name is not None:
-            raise presets.PresetError(f"--reference {name}: a {preset.task} policy follows none")
+            raise ConfigError(f"--reference {name}: a {preset.task} policy follows none")
         return None
-    if name is None and "+" in preset.reference:
-        raise presets.PresetError(f"trained on {preset.reference}: say which to fly, as --reference circle")
-    if name is not None and name != preset.reference and preset.observation == "state":
-        raise presets.PresetError(
-            f"--reference {name}: this policy does not see its reference, and was trained for {preset.reference}"
+    trained_on = preset.track.reference
+    if name is None and "+" in trained_on:
+        raise ConfigError(f"the policy was trained on {trained_on}: say which to fly, as --reference circle")
+    if name is not None and name != trained_on and preset.track.observation == "state":
+        raise ConfigError(
+            f"--reference {name}: this policy does not see its reference, and was trained on {trained_on}"
         )
-    flown = build.reference(name or preset.reference)
-    if wrong := flown.worst_violation(build.vehicle(preset)):
-        console.print(f"[yellow]warning:[/] reference {name or preset.reference}: {wrong}")
-    return flown
+    return name or trained_on
 
 
-def setting_for(
-    preset: Preset,
-    plant: PlantName,
-    vehicle: VehicleName | None = None,
-    sensing: SensingName = "ideal",
-    thrust_error: float = 0.035,
-) -> Setting:
-    """Where a policy flies: on the vehicle of its training, unless another is asked for or the plant has its own."""
-    own = plant in testbed.OWN_VEHICLE
-    return Setting(plant, vehicle if own else vehicle or preset.vehicle, sensing, thrust_error)
+def _warn(setup: Setup, name: str | None) -> None:
+    followed = getattr(setup.flown, "reference", None)
+    if isinstance(followed, Reference) and (wrong := followed.infeasibility(setup.vehicle)):
+        console.print(f"[yellow]warning:[/] reference {name}: {wrong}")
 
 
-def _same_policy(trained: Preset, overlaid: Preset, config: Path) -> Preset:
-    """``overlaid``, unless it changes what the weights were trained for."""
-    for name in ("task", "vehicle", "history", "observation"):
-        before, after = getattr(trained, name), getattr(overlaid, name)
+def _same_policy(trained: Preset, changed_one: Preset, config: Path) -> Preset:
+    """``changed_one``, unless it changes what the weights were trained for."""
+    for name in ("task", "vehicle", "dt", "command_history", "pretrain"):
+        before, after = getattr(trained, name), getattr(changed_one, name)
         if before != after:
-            raise presets.PresetError(f"{config}: {name} = {after!r}, but the policy was trained with {before!r}")
-    if trained.pretrain != overlaid.pretrain:
-        raise presets.PresetError(f"{config}: [pretrain] cannot change for a policy that is trained")
-    return overlaid
-
-
-def save_learnt(flights: list[Flight], preset: Preset, folder: Path) -> None:
-    """What the first whole flight learnt: ``adapted.safetensors``, or of a low-rank policy ``delta.safetensors``."""
-    learnt = next((f.learnt for f in flights if f.learnt is not None and not f.log.crashed), None)
-    if isinstance(learnt, LoraPolicy):
-        save_delta(folder / "delta.safetensors", learnt)
-    elif learnt is not None:
-        save_policy(folder / "adapted.safetensors", learnt, preset)
-
-
-def write_events(flights: list[Flight], folder: Path) -> None:
-    """``events.jsonl``: what adaptation did, flight by flight."""
-    sink = JsonlSink(folder / "events.jsonl")
-    for flight in flights:
-        for event in flight.events:
-            sink.event(
-                event.kind, disturbance=flight.plan.disturbance, start=flight.plan.start, t=event.t, note=event.note
-            )
-    sink.close()
+            shown = (f"{name} = {after!r}, but the policy was trained with {before!r}"
+                     if name != "pretrain" else "[pretrain] cannot change for a policy that is trained")  # fmt: skip
+            raise ConfigError(f"{config}: {shown}")
+    before_sees, after_sees = (p.track and p.track.observation for p in (trained, changed_one))
+    if before_sees != after_sees:
+        raise ConfigError(
+            f"{config}: track.observation = {after_sees!r}, but the policy was trained with {before_sees!r}"
+        )
+    return changed_one

@@ -1,47 +1,123 @@
-"""The command line: picks the command, sets up JAX, turns errors into one clear line and an exit code."""
+"""The command line: picks the command, turns errors into one clear line and an exit code.
 
+Modules of commands are imported when they are needed, so that help is quick.
+"""
+
+import os
+import signal
 import sys
-from collections.abc import Callable
+import threading
+from collections.abc import Sequence
+from types import FrameType
 
-import tyro
-from rich.markup import escape
-
-from ..adapt.plant import PlantError
-from ..checkpoint import PolicyError
-from ..presets import PresetError
-from . import bench, demo, doctor, fly, pretrain, reproduce
-from .session import console, enable_compile_cache
-
-COMMANDS: dict[str, Callable[..., int]] = {
-    "pretrain": pretrain.pretrain,
-    "fly": fly.fly,
-    "demo": demo.demo,
-    "bench": bench.bench,
-    "reproduce": reproduce.reproduce,
-    "doctor": doctor.doctor,
+PACKAGE = __name__.rpartition(".")[0]
+COMMANDS = {
+    "pretrain": "Train a policy from scratch in the nominal model and save it.",
+    "fly": "Fly a policy on a plant, as it is and adapting as it flies.",
+    "demo": "The whole loop: pretrain, fly, adapt; a table and pictures.",
+    "sweep": "Presets x scenarios x seeds from a TOML file, to one table and one picture.",
+    "reproduce": "Make a table of the paper again: hover, tracking, vision, reversing, plants, model.",
+    "bench": "How long each piece of work takes on this machine.",
+    "doctor": "Versions, device and cache, and known faults of dependencies.",
 }
+WIDTH = max(map(len, COMMANDS)) + 2
+HELP = "\n".join(
+    [
+        "usage: retrim COMMAND [--help] [options]",
+        "",
+        "Re-train neural flight policies in seconds, in flight.",
+        "",
+        *(f"  {name:<{WIDTH}}{text}" for name, text in COMMANDS.items()),
+        "",
+        "  --version, --help",
+        "",
+        "Ctrl-C stops a command and keeps what is done.",
+    ]
+)
 
 
-def main() -> None:
-    """Run ``sys.argv``.
+def main(words: Sequence[str] | None = None) -> None:
+    """Run a command and exit.
 
     Exit codes: 0 done, 1 refused with a message, 2 wrong usage, 130 interrupted, with what was done kept.
+
+    Args:
+        words: Command and options; ``sys.argv`` by default.
     """
-    enable_compile_cache()
+    arguments = list(sys.argv[1:] if words is None else words)
+    sys.exit(_run(arguments))
+
+
+def _run(words: list[str]) -> int:
+    if not words or words[0] in ("--help", "-h"):
+        print(HELP)
+        return 0 if words else 2
+    if words[0] == "--version":
+        from importlib.metadata import version
+
+        print(f"retrim {version('retrim')}")
+        return 0
+    if words[0] not in COMMANDS:
+        import difflib
+
+        near = difflib.get_close_matches(words[0], COMMANDS, n=1)
+        hint = f"did you mean {near[0]!r}? " if near else ""
+        print(f"retrim: no command {words[0]!r}; {hint}there are {', '.join(COMMANDS)}", file=sys.stderr)
+        return 2
+    stop = threading.Event()
+    _stop_on_interrupt(stop)
     try:
-        code: int
-        if sys.argv[1:2] == ["reproduce"]:
-            code = tyro.extras.subcommand_cli_from_dict(
-                reproduce.TABLES, prog="retrim reproduce", description="Make a table again.", args=sys.argv[2:]
+        return _command(words[0], words[1:], stop)
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nobody reads any more; say nothing at exit
+        return 1
+
+
+def _command(name: str, words: list[str], stop: threading.Event) -> int:
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # before jax: its cache otherwise reports every program it loads
+    import importlib
+
+    import tyro
+
+    from ..errors import RetrimError
+    from ..experiments.compile_cache import enable_compile_cache
+    from .console import console, refuse
+
+    enable_compile_cache()
+    command = importlib.import_module(f".{name}", PACKAGE)
+    try:
+        if hasattr(command, "COMMANDS"):
+            call = tyro.extras.subcommand_cli_from_dict(
+                {n: tyro.conf.configure(tyro.conf.AvoidSubcommands)(f) for n, f in command.COMMANDS.items()},
+                prog=f"retrim {name}",
+                description=COMMANDS[name],
+                args=words,
             )
         else:
-            code = tyro.extras.subcommand_cli_from_dict(
-                COMMANDS, prog="retrim", description="Re-train neural flight policies in seconds, in flight."
-            )
-    except (PolicyError, PresetError, PlantError, OSError) as error:
-        console.print(f"[bold red]retrim:[/] {escape(str(error))}", soft_wrap=True)
-        code = 1
-    except KeyboardInterrupt:
+            call = tyro.cli(getattr(command, name), prog=f"retrim {name}", args=words)
+        code: int = call(stop)
+    except RetrimError as error:
+        return refuse(str(error))
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        return refuse(f"{where}{error.strerror or error}")
+    except MemoryError:
+        return refuse("out of memory; use fewer --starts, smaller networks or a shorter horizon")
+    if stop.is_set() and code == 0:
         console.print("interrupted")
-        code = 130
-    sys.exit(code)
+        return 130
+    return code
+
+
+def _stop_on_interrupt(stop: threading.Event) -> None:
+    """Let Ctrl-C set the stop token and raise: a KeyboardInterrupt that JAX swallows is not lost."""
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        stop.set()
+        raise KeyboardInterrupt
+
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, handle)

@@ -1,4 +1,4 @@
-"""Who decides: policies and other controllers."""
+"""Controllers: policies and others."""
 
 from .controller import AbstractController as AbstractController
 from .controller import PolicyController as PolicyController

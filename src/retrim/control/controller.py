@@ -1,4 +1,4 @@
-"""Whatever flies: a function from time and state to a command, with a memory of fixed shape."""
+"""Controllers: functions from time and state to a command, with a memory of fixed shape."""
 
 import abc
 from typing import Any, Generic, TypeVar
@@ -18,28 +18,37 @@ class AbstractController(eqx.Module, Generic[M]):
 
     @abc.abstractmethod
     def init(self, x: State) -> M:
-        """Memory at take-off in the state ``x``."""
+        """Return the memory at the start of a flight in the state ``x``."""
 
     @abc.abstractmethod
     def __call__(self, memory: M, t: Float[Array, ""], x: State) -> tuple[Command, M]:
-        """The command at time ``t`` [s], and the new memory."""
+        """Return the command at time ``t`` [s] since the start of the flight, and the new memory."""
+
+    def accepted(self, memory: M, u: Command) -> M:
+        """Return the memory after the plant accepted ``u`` instead of the command that was issued last."""
+        del u
+        return memory
 
 
 class PolicyController(AbstractController[tuple[Any, Command]]):
-    """Observation, then policy. It remembers what the observation remembers, and its last command."""
+    """A policy behind its observation. The memory is that of the observation, and the last command."""
 
     observation: AbstractObservation[Any]
     policy: Policy
 
     def init(self, x: State) -> tuple[Any, Command]:
-        """As if the vehicle had hovered until now."""
+        """Return the memory of a vehicle that has hovered until now."""
         return self.observation.init(x), self.policy.u_hover
 
     def __call__(
         self, memory: tuple[Any, Command], t: Float[Array, ""], x: State
     ) -> tuple[Command, tuple[Any, Command]]:
-        """One observation, one forward pass."""
-        seen, last = memory
-        o, seen = self.observation(seen, t, x, last)
+        """Evaluate observation and policy once."""
+        remembered, last = memory
+        o, remembered = self.observation(remembered, t, x, last)
         u = self.policy(o)
-        return u, (seen, u)
+        return u, (remembered, u)
+
+    def accepted(self, memory: tuple[Any, Command], u: Command) -> tuple[Any, Command]:
+        """Remember ``u`` as the last command."""
+        return memory[0], u

@@ -15,7 +15,7 @@ RANKS = (4, 10, 1)
 SCALE = 4.0
 
 
-class Thin(eqx.Module):
+class LowRankFactors(eqx.Module):
     """What is added to one weight matrix: ``scale * up @ down``."""
 
     down: Float[Array, "rank fan_in"]
@@ -25,10 +25,10 @@ class Thin(eqx.Module):
 
 
 class LoraPolicy(eqx.Module):
-    """A frozen policy and a delta. Trains like a :class:`Policy`; flies once it is :meth:`plain`."""
+    """A frozen policy and a delta. Trains like a :class:`Policy`; flies once it is :meth:`merged`."""
 
     base: Policy
-    delta: tuple[Thin, ...]
+    delta: tuple[LowRankFactors, ...]
     scale: Float[Array, ""]
 
     def __check_init__(self) -> None:
@@ -57,23 +57,23 @@ class LoraPolicy(eqx.Module):
                 raise ValueError(f"LoRA: rank {rank} for weights {fan_out} x {fan_in}")
             dtype, bound = layer.weight.dtype, fan_in**-0.5
             down = random.uniform(k, (rank, fan_in), dtype, minval=-bound, maxval=bound)
-            thin.append(Thin(down, jnp.zeros((fan_out, rank), dtype=dtype)))
+            thin.append(LowRankFactors(down, jnp.zeros((fan_out, rank), dtype=dtype)))
         return cls(base, tuple(thin), jnp.array(scale, dtype=base.layers[0].weight.dtype))
 
     @property
-    def trained(self) -> tuple[Thin, ...]:
+    def params(self) -> tuple[LowRankFactors, ...]:
         """What an optimiser may move."""
         return self.delta
 
-    def retrained(self, delta: tuple[Thin, ...]) -> "LoraPolicy":
+    def with_params(self, delta: tuple[LowRankFactors, ...]) -> "LoraPolicy":
         """The same base with another delta."""
         return LoraPolicy(self.base, delta, self.scale)
 
-    def plain(self) -> Policy:
+    def merged(self) -> Policy:
         """The delta merged into plain weights; no gradient flows to the base."""
         base, scale = lax.stop_gradient((self.base, self.scale))
         layers: Layers = tuple(
             eqx.tree_at(lambda l: l.weight, layer, layer.weight + scale * thin.up @ thin.down)
             for layer, thin in zip(base.layers, self.delta, strict=True)
         )
-        return base.retrained(layers)
+        return base.with_params(layers)

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, Key
 from ..physics.state import Command
 from ..physics.vehicle import Vehicle
 
-Taps = tuple[Float[Array, "... _"], ...]
+Perturbations = tuple[Float[Array, "... _"], ...]
 """One vector per layer (in :mod:`retrim.learn` with rows in front), added to the pre-activation."""
 Layers = tuple[eqx.nn.Linear, ...]
 """The layers of a policy, or a gradient with respect to them."""
@@ -49,15 +49,15 @@ class Policy(eqx.Module):
         return cls(tuple(layers), Command.hover(), vehicle.command_min, vehicle.command_max)
 
     @property
-    def trained(self) -> Layers:
+    def params(self) -> Layers:
         """What an optimiser may move."""
         return self.layers
 
-    def retrained(self, layers: Layers) -> "Policy":
+    def with_params(self, layers: Layers) -> "Policy":
         """The same policy with other layers."""
         return Policy(layers, self.u_hover, self.u_min, self.u_max)
 
-    def plain(self) -> "Policy":
+    def merged(self) -> "Policy":
         """Itself: what flies. A low-rank policy merges its delta here."""
         return self
 
@@ -68,15 +68,15 @@ class Policy(eqx.Module):
             h = jax.nn.relu(layer(h))
         return self.bounded(self.layers[-1](h))
 
-    def tapped(self, observation: Float[Array, " o"], taps: Taps) -> tuple[Command, Inputs]:
-        """The same command, with ``taps[l]`` added to the output of layer l and no gradient to any weight.
+    def perturbed(self, observation: Float[Array, " o"], perturbations: Perturbations) -> tuple[Command, Inputs]:
+        """The same command, with ``perturbations[l]`` added to the output of layer l and no gradient to any weight.
 
-        Also returns each layer's input: with the taps' cotangents they give every weight gradient.
+        Also returns each layer's input: with the perturbations' cotangents they give every weight gradient.
         """
         h, inputs = observation, []
-        for i, (layer, tap) in enumerate(zip(self.layers, taps, strict=True)):
+        for i, (layer, perturbation) in enumerate(zip(self.layers, perturbations, strict=True)):
             inputs.append(h)
-            y = lax.stop_gradient(layer)(h) + tap
+            y = lax.stop_gradient(layer)(h) + perturbation
             h = jax.nn.relu(y) if i < len(self.layers) - 1 else y
         return self.bounded(h), tuple(inputs)
 

@@ -1,7 +1,5 @@
 """Policy optimisation by back-propagation through time (paper, Sec. III-C, Eq. (2) and (3))."""
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -10,75 +8,77 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ..control.lora import LoraPolicy
-from ..control.policy import Inputs, Policy, Taps
-from ..physics.dynamics import AbstractDynamics
-from ..tasks.task import AbstractTask, Start
-from . import taps
-from .rollout import Trajectory, rollout, tapped_rollout
+from ..control.policy import Inputs, Layers, Perturbations, Policy
+from ..tasks.task import Start
+from . import weight_gradients
+from .env import Env
+from .rollout import Trajectory, perturbed_rollout, rollout
 
 
 class PolicyState(eqx.Module):
-    """A policy, plain or low-rank, and the state of its optimiser, which knows ``policy.trained`` only."""
+    """A policy, plain or low-rank, and the state of its optimiser, which holds moments of ``policy.params`` only."""
 
     policy: Policy | LoraPolicy
     optimiser: optax.OptState
 
 
-def policy_loss(
-    policy: Policy, dynamics: AbstractDynamics[Any], task: AbstractTask, x0: Start, *, delay: int = 0
-) -> Float[Array, ""]:
-    """Minus the reward, averaged over ticks and over the batch of starts ``x0``. The plain form of the objective."""
+def policy_loss(policy: Policy, env: Env, x0: Start) -> Float[Array, ""]:
+    """Return minus the reward, averaged over ticks and over the batch of starts ``x0`` (leading axis)."""
 
     def fly(start: Start) -> Trajectory:
-        return rollout(dynamics, task, policy, start, delay=delay)
+        return rollout(env, policy, start)
 
     flown = jax.vmap(fly)(x0)
     return -jnp.mean(flown.reward)
 
 
-def policy_gradient(
-    policy: Policy, dynamics: AbstractDynamics[Any], task: AbstractTask, x0: Start, *, delay: int = 0
-) -> tuple[Float[Array, ""], tuple[eqx.nn.Linear, ...]]:
-    """:func:`policy_loss` and its gradient with respect to ``policy.layers``, by taps."""
+def policy_gradient(policy: Policy, env: Env, x0: Start) -> tuple[Float[Array, ""], Layers]:
+    """Return :func:`policy_loss` and its gradient with respect to ``policy.layers``.
 
-    def loss(zeros: Taps) -> tuple[Float[Array, ""], Inputs]:
-        def fly(start: Start, z: Taps) -> tuple[Trajectory, Inputs]:
-            return tapped_rollout(dynamics, task, policy, start, z, delay=delay)
+    The gradient is formed from perturbations of the layers' outputs; see :mod:`retrim.learn.weight_gradients`.
+    """
 
-        # Ticks in front, as the scan lays them out: no transposition of what is as large as all activations.
+    def loss(zeros: Perturbations) -> tuple[Float[Array, ""], Inputs]:
+        def fly(start: Start, z: Perturbations) -> tuple[Trajectory, Inputs]:
+            return perturbed_rollout(env, policy, start, z)
+
+        # Keep time as the leading axis, as the scan lays it out, to avoid transposing activations.
         flown, inputs = jax.vmap(fly, in_axes=(0, 1), out_axes=(0, 1))(x0, zeros)
         return -jnp.mean(flown.reward), inputs
 
-    return taps.value_and_grad(loss, policy, (task.horizon, x0.t.shape[0]))
+    return weight_gradients.value_and_grad(loss, policy, (env.task.horizon, x0.t.shape[0]))
 
 
 def bptt(
-    state: PolicyState,
-    dynamics: AbstractDynamics[Any],
-    task: AbstractTask,
-    x0: Start,
-    *,
-    optimiser: optax.GradientTransformation,
-    delay: int = 0,
-) -> tuple[PolicyState, Float[Array, " epochs"]]:
-    """One optimiser step per epoch; ``x0`` holds the starts, epochs x environments. Also returns each epoch's loss.
+    state: PolicyState, env: Env, x0: Start, *, optimiser: optax.GradientTransformation
+) -> tuple[PolicyState, Float[Array, " updates"]]:
+    """Optimise a policy by one optimiser step per row of starts.
 
-    Pure and traceable: callers compile it once. A step with a gradient that is not finite is skipped, since one bad
-    start must not destroy a policy.
+    Pure and traceable: callers compile it once. A step whose gradient is not finite is skipped, since one bad start
+    must not destroy a policy.
+
+    Args:
+        state: Policy and optimiser state to start from.
+        env: Model, task and delay.
+        x0: Starts; two leading axes, updates x environments.
+        optimiser: The optimiser that made ``state.optimiser``.
+
+    Returns:
+        The new state, and the loss before each step.
     """
 
-    def epoch(state: PolicyState, starts: Start) -> tuple[PolicyState, Float[Array, ""]]:
-        # From what is trained to plain layers and, with the gradient, back; for a plain policy both are the identity.
-        layers, pull = jax.vjp(lambda trained: state.policy.retrained(trained).plain().layers, state.policy.trained)
-        plain = state.policy.plain().retrained(layers)
-        loss, by_layers = policy_gradient(plain, dynamics, task, starts, delay=delay)
+    def update(state: PolicyState, starts: Start) -> tuple[PolicyState, Float[Array, ""]]:
+        # From params to plain layers and, with the gradient, back; for a plain policy both are the identity.
+        layers, pull = jax.vjp(lambda params: state.policy.with_params(params).merged().layers, state.policy.params)
+        plain = state.policy.merged().with_params(layers)
+        loss, by_layers = policy_gradient(plain, env, starts)
         (gradient,) = pull(by_layers)
-        update, memory = optimiser.update(gradient, state.optimiser, state.policy.trained)
-        trained = optax.apply_updates(state.policy.trained, update)
+        change, memory = optimiser.update(gradient, state.optimiser, state.policy.params)
+        params = optax.apply_updates(state.policy.params, change)
         fine = jnp.isfinite(optax.tree.norm(gradient))
-        trained, memory = jax.tree.map(
-            lambda new, old: jnp.where(fine, new, old), (trained, memory), (state.policy.trained, state.optimiser)
+        params, memory = jax.tree.map(
+            lambda new, old: jnp.where(fine, new, old), (params, memory), (state.policy.params, state.optimiser)
         )
-        return PolicyState(state.policy.retrained(trained), memory), loss
+        return PolicyState(state.policy.with_params(params), memory), loss
 
-    return lax.scan(epoch, state, x0)
+    return lax.scan(update, state, x0)

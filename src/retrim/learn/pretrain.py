@@ -1,7 +1,6 @@
-"""Train a policy from scratch in the nominal model (paper, Sec. IV-A.2)."""
+"""Pretraining in the nominal model (paper, Sec. IV-A.2)."""
 
 from collections.abc import Iterator
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -10,53 +9,62 @@ from jax import random
 from jaxtyping import Array, Float, Key
 
 from ..control.policy import Policy
-from ..physics.dynamics import AbstractDynamics
 from ..tasks.task import AbstractTask, Start
 from .bptt import PolicyState, bptt
+from .env import Env
 
 
-def starts(task: AbstractTask, key: Key[Array, ""], epochs: int, envs: int) -> Start:
-    """Random starts, epochs x environments; the key is consumed."""
-    return jax.vmap(jax.vmap(task.reset))(random.split(key, (epochs, envs)))
+def random_starts(task: AbstractTask, key: Key[Array, ""], num_updates: int, num_envs: int) -> Start:
+    """Return random starts with two leading axes, updates x environments; the key is consumed."""
+    return jax.vmap(jax.vmap(task.reset))(random.split(key, (num_updates, num_envs)))
 
 
 @eqx.filter_jit
 def train_chunk(
     state: PolicyState,
-    dynamics: AbstractDynamics[Any],
-    task: AbstractTask,
+    env: Env,
     key: Key[Array, ""],
     optimiser: optax.GradientTransformation,
-    epochs: int,
-    envs: int,
-    delay: int,
-) -> tuple[PolicyState, Float[Array, " epochs"]]:
-    """Train for ``epochs`` epochs on fresh starts; compiled once for the same optimiser, sizes and shapes.
+    num_updates: int,
+    num_envs: int,
+) -> tuple[PolicyState, Float[Array, " updates"]]:
+    """Make ``num_updates`` optimiser steps on fresh starts; compiled once for the same optimiser, sizes and shapes.
 
     Training is cut into such chunks, so that progress can be shown and an interrupted run keeps what it has.
     """
-    return bptt(state, dynamics, task, starts(task, key, epochs, envs), optimiser=optimiser, delay=delay)
+    return bptt(state, env, random_starts(env.task, key, num_updates, num_envs), optimiser=optimiser)
 
 
 def pretrain(
     policy: Policy,
-    dynamics: AbstractDynamics[Any],
-    task: AbstractTask,
+    env: Env,
     key: Key[Array, ""],
     *,
     optimiser: optax.GradientTransformation,
-    epochs: int,
-    envs: int,
-    delay: int = 0,
+    num_updates: int,
+    num_envs: int,
     chunk: int = 10,
 ) -> Iterator[tuple[PolicyState, Float[Array, " chunk"]]]:
-    """Yield the trained state and the losses of each ``chunk`` epochs; the key is consumed.
+    """Train a policy from fresh starts.
 
-    Raises ``ValueError`` if ``epochs`` is not a multiple of ``chunk``, since every chunk runs the same program.
+    Args:
+        policy: Policy to start from.
+        env: Nominal model, task and delay.
+        key: Consumed.
+        optimiser: Optimiser of the policy's parameters. The same object does not compile again.
+        num_updates: Optimiser steps, a multiple of ``chunk``, since every chunk runs the same program.
+        num_envs: Starts per step.
+        chunk: Steps between two results.
+
+    Yields:
+        The state after each chunk, and the losses of its steps.
+
+    Raises:
+        ValueError: ``num_updates`` is not a positive multiple of ``chunk``.
     """
-    if epochs % chunk or epochs <= 0:
-        raise ValueError(f"epochs = {epochs} must be a positive multiple of {chunk}")
-    state = PolicyState(policy, optimiser.init(policy.trained))
-    for k in random.split(key, epochs // chunk):
-        state, losses = train_chunk(state, dynamics, task, k, optimiser, chunk, envs, delay)
+    if num_updates % chunk or num_updates <= 0:
+        raise ValueError(f"num_updates = {num_updates} must be a positive multiple of {chunk}")
+    state = PolicyState(policy, optimiser.init(policy.params))
+    for k in random.split(key, num_updates // chunk):
+        state, losses = train_chunk(state, env, k, optimiser, chunk, num_envs)
         yield state, losses

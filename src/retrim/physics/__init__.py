@@ -1,8 +1,8 @@
-"""What the world does: pure, differentiable, unbatched; no networks, no input or output, keys only at construction."""
+"""Physics: pure, differentiable, unbatched; no networks, no input or output, keys only at construction."""
 
-from .bem import Bem as Bem
+from .actuators import Lagged as Lagged
+from .bem import BemQuadrotor as BemQuadrotor
 from .betaflight import Betaflight as Betaflight
-from .conditions import Conditions as Conditions
 from .disturbance import Constant as Constant
 from .disturbance import Disturbance as Disturbance
 from .disturbance import Push as Push
@@ -15,20 +15,20 @@ from .dynamics import PointMass as PointMass
 from .dynamics import Residual as Residual
 from .dynamics import StraightThrough as StraightThrough
 from .dynamics import f_a as f_a
-from .highrate import AbstractHighRate as AbstractHighRate
-from .highrate import RotorState as RotorState
-from .lag import Lagged as Lagged
+from .effects import ExternalEffects as ExternalEffects
+from .faults import BatterySag as BatterySag
+from .faults import Payload as Payload
+from .faults import WeakRotor as WeakRotor
 from .propeller import Propeller as Propeller
 from .propeller import five_inch as five_inch
 from .propeller import three_inch as three_inch
-from .rotors import Rotors as Rotors
+from .rotors import LinearDragQuadrotor as LinearDragQuadrotor
 from .state import STANDARD_GRAVITY as STANDARD_GRAVITY
 from .state import Command as Command
 from .state import State as State
 from .state import StateDot as StateDot
-from .trouble import BatterySag as BatterySag
-from .trouble import Payload as Payload
-from .trouble import WeakRotor as WeakRotor
+from .substep import AbstractSubstepDynamics as AbstractSubstepDynamics
+from .substep import RotorState as RotorState
 from .vehicle import Esc as Esc
 from .vehicle import Vehicle as Vehicle
 from .vehicle import kingfisher as kingfisher

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .betaflight import Betaflight
-from .conditions import Conditions
-from .highrate import SUBSTEP, AbstractHighRate, RotorState, check_tick, rigid_body, signs
+from .effects import ExternalEffects
 from .propeller import AIR_DENSITY, BladeForces, Inflow, hover_coefficient, rotor
 from .state import STANDARD_GRAVITY, Command, State
+from .substep import SUBSTEP, AbstractSubstepDynamics, RotorState, check_tick, rigid_body, signs
 from .vehicle import Vehicle
 
 IN_PLANE_GAIN = 3.0  # identified in flight: blade elements alone underestimate the drag of the whole vehicle
@@ -35,7 +35,7 @@ class Loads(NamedTuple):
     """[Nm]"""
 
 
-class Bem(AbstractHighRate[BemState]):
+class BemQuadrotor(AbstractSubstepDynamics[BemState]):
     """Quadrotor with blade-element rotors under a CTBR command."""
 
     vehicle: Vehicle
@@ -44,10 +44,10 @@ class Bem(AbstractHighRate[BemState]):
 
     def __check_init__(self) -> None:
         """Raise ``ValueError`` if the tick is not a whole number of milliseconds."""
-        check_tick(self.dt, "Bem")
+        check_tick(self.dt, "BemQuadrotor")
 
     @classmethod
-    def of(cls, vehicle: Vehicle, dt: float, *, thrust_error: float = 0.035) -> "Bem":
+    def of(cls, vehicle: Vehicle, dt: float, *, thrust_error: float = 0.035) -> "BemQuadrotor":
         """With a thrust map that is wrong by ``thrust_error``: u_hover in still air gives (1 + thrust_error) m g.
 
         T / Omega^2 of a propeller in still air is constant, so one number calibrates the whole range.
@@ -57,8 +57,8 @@ class Bem(AbstractHighRate[BemState]):
 
     def init(self, x: State) -> BemState:
         """Rotors at the speed of u_hover, their inflow settled in the air that ``x`` meets, no rotation."""
-        car, zero = self.vehicle, jnp.zeros_like(x.p)
-        speed = jnp.sqrt(car.mass * STANDARD_GRAVITY / (4.0 * self.loop.thrust_map))
+        vehicle, zero = self.vehicle, jnp.zeros_like(x.p)
+        speed = jnp.sqrt(vehicle.mass * STANDARD_GRAVITY / (4.0 * self.loop.thrust_map))
         body = RotorState(x, zero, jnp.ones(4, dtype=x.p.dtype) * speed, zero, zero)
         above = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (4,)), Inflow.above(x.p.dtype))
         _, inflow = self.rotors(body, body.motors, above, zero, steps=16)
@@ -73,15 +73,24 @@ class Bem(AbstractHighRate[BemState]):
         b = s.body
         return BemState(RotorState(x, b.omega, b.motors, b.integral, b.omega_dot), s.inflow)
 
-    def substep(self, s: BemState, u: Command, around: Conditions) -> BemState:
+    @property
+    def command_limits(self) -> tuple[Command, Command]:
+        """Smallest and largest command of the vehicle."""
+        return self.vehicle.command_min, self.vehicle.command_max
+
+    def rotor_state(self, s: BemState) -> RotorState:
+        """Return body rates and rotor speeds."""
+        return s.body
+
+    def substep(self, s: BemState, u: Command, effects: ExternalEffects) -> BemState:
         """One millisecond; loads are held over it."""
-        car, b = self.vehicle, s.body
-        commanded, integral = self.loop(car, b, u)
-        motors = commanded + (b.motors - commanded) * jnp.exp(-SUBSTEP / car.motor_tau)
-        blades, inflow = self.rotors(b, motors, s.inflow, around.wind)
-        loads = self.loads(b, motors, blades, around)
-        mass, inertia = car.mass + around.mass, car.inertia + around.inertia
-        moved = rigid_body(b, motors, integral, loads.force, loads.torque, mass, inertia, around.push)
+        vehicle, b = self.vehicle, s.body
+        commanded, integral = self.loop(vehicle, b, u)
+        motors = commanded + (b.motors - commanded) * jnp.exp(-SUBSTEP / vehicle.motor_tau)
+        blades, inflow = self.rotors(b, motors, s.inflow, effects.wind)
+        loads = self.loads(b, motors, blades, effects)
+        mass, inertia = vehicle.mass + effects.mass, vehicle.inertia + effects.inertia
+        moved = rigid_body(b, motors, integral, loads.force, loads.torque, mass, inertia, effects.push)
         return BemState(moved, inflow)
 
     def rotors(
@@ -114,22 +123,22 @@ class Bem(AbstractHighRate[BemState]):
         turn = signs(arm.dtype)  # a rotor at (x, y) turns the body about x by its y, about y by -x
         return jnp.stack([-arm[0] * turn[1], arm[1] * turn[0], jnp.zeros(4, dtype=arm.dtype)], axis=1)
 
-    def loads(self, b: RotorState, motors: Float[Array, "4"], blades: BladeForces, around: Conditions) -> Loads:
+    def loads(self, b: RotorState, motors: Float[Array, "4"], blades: BladeForces, effects: ExternalEffects) -> Loads:
         """Rotors, body drag, yaw reaction of the motors and gyroscopic torque."""
-        car = self.vehicle
-        air = self.hub_velocities(b, around.wind)
+        vehicle = self.vehicle
+        air = self.hub_velocities(b, effects.wind)
         along = air[:, :2] / jnp.sqrt(air[:, :1] ** 2 + air[:, 1:2] ** 2 + 1e-12)
-        in_plane = -IN_PLANE_GAIN * (around.gain * blades.in_plane)[:, None] * along
-        forces = jnp.concatenate([in_plane, (around.gain * blades.thrust)[:, None]], axis=1)
+        in_plane = -IN_PLANE_GAIN * (effects.gain * blades.in_plane)[:, None] * along
+        forces = jnp.concatenate([in_plane, (effects.gain * blades.thrust)[:, None]], axis=1)
         yaw = signs(motors.dtype)[2]  # against the spin
         up = jnp.array([0.0, 0.0, 1.0], dtype=motors.dtype)
-        spin_up = car.rotor_inertia * jnp.sum(yaw * (motors - b.motors)) / SUBSTEP
+        spin_up = vehicle.rotor_inertia * jnp.sum(yaw * (motors - b.motors)) / SUBSTEP
         torque = jnp.sum(jnp.cross(self.places(), forces), axis=0)
-        torque = torque + (jnp.sum(yaw * around.gain * blades.torque) + spin_up) * up
-        spin = -car.rotor_inertia * jnp.sum(yaw * motors) * up  # angular momentum of the rotors
+        torque = torque + (jnp.sum(yaw * effects.gain * blades.torque) + spin_up) * up
+        spin = -vehicle.rotor_inertia * jnp.sum(yaw * motors) * up  # angular momentum of the rotors
         torque = torque - jnp.cross(b.omega, spin)
         obstruction = jnp.array([1.0, 1.0, FRAME_FACTOR], dtype=motors.dtype)
-        return Loads(obstruction * jnp.sum(forces, axis=0) + self.body_drag(b, around.wind), torque)
+        return Loads(obstruction * jnp.sum(forces, axis=0) + self.body_drag(b, effects.wind), torque)
 
     def body_drag(self, b: RotorState, wind: Float[Array, "3"]) -> Float[Array, "3"]:
         """F_k = -1/2 rho (c A)_k u_k |u_k|, body frame [N]."""

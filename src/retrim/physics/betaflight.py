@@ -4,8 +4,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .highrate import SUBSTEP, RotorState, signs
 from .state import Command
+from .substep import SUBSTEP, RotorState, signs
 from .vehicle import Vehicle
 
 # Throttle per unit of gain, and per rad/s, rad and rad/s^2: the firmware's scaling of its P, I and D settings.
@@ -34,13 +34,13 @@ class Betaflight(eqx.Module):
             thrust_map=thrust_map,
         )
 
-    def __call__(self, car: Vehicle, s: RotorState, u: Command) -> tuple[Float[Array, "4"], Float[Array, "3"]]:
+    def __call__(self, vehicle: Vehicle, s: RotorState, u: Command) -> tuple[Float[Array, "4"], Float[Array, "3"]]:
         """Rotor speeds [rad/s] to command, and the integral of the rate error [rad]."""
-        low, high = car.command_min, car.command_max
+        low, high = vehicle.command_min, vehicle.command_max
         error = jnp.clip(u.omega, low.omega, high.omega) - s.omega
         integral = jnp.clip(s.integral + SUBSTEP * error, -self.integral_max, self.integral_max)
         turn = P_SCALE * self.kp * error + I_SCALE * self.ki * integral - D_SCALE * self.kd * s.omega_dot
-        thrust = car.mass * jnp.clip(u.c, low.c, high.c)
-        throttle = car.esc.throttle(jnp.sqrt(thrust / (4.0 * self.thrust_map)))
-        mixed = jnp.clip(throttle + signs(turn.dtype).T @ turn, car.esc.idle, 1.0)
-        return jnp.clip(car.esc.speed(mixed), car.motor_min, car.motor_max), integral
+        thrust = vehicle.mass * jnp.clip(u.c, low.c, high.c)
+        throttle = vehicle.esc.throttle(jnp.sqrt(thrust / (4.0 * self.thrust_map)))
+        mixed = jnp.clip(throttle + signs(turn.dtype).T @ turn, vehicle.esc.idle, 1.0)
+        return jnp.clip(vehicle.esc.speed(mixed), vehicle.motor_min, vehicle.motor_max), integral

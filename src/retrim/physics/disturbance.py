@@ -1,4 +1,4 @@
-"""What disturbs a flight: functions (t, x) -> :class:`Conditions`. Pushes stand here; see also wind and trouble.
+"""What disturbs a flight: functions (t, x) -> :class:`ExternalEffects`. Pushes stand here; see also wind and trouble.
 
 Disturbances belong to the plant; the nominal model never hears of them. What is random about one is drawn when it is
 made, so that it is a function of time and repeats.
@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax import random
 from jaxtyping import Array, Float, Key
 
-from .conditions import Conditions
+from .effects import ExternalEffects
 from .state import State
 
 
@@ -21,7 +21,7 @@ from .state import State
 class Disturbance(Protocol):
     """Any function of time [s] and state will do."""
 
-    def __call__(self, t: Float[Array, ""], x: State, /) -> Conditions:
+    def __call__(self, t: Float[Array, ""], x: State, /) -> ExternalEffects:
         """What surrounds the vehicle at time ``t`` in the state ``x``."""
         ...
 
@@ -31,9 +31,9 @@ class Push(eqx.Module):
 
     a_ext: Callable[[Float[Array, ""], State], Float[Array, "3"]]
 
-    def __call__(self, t: Float[Array, ""], x: State) -> Conditions:
+    def __call__(self, t: Float[Array, ""], x: State) -> ExternalEffects:
         """Pushed by ``a_ext(t, x)``."""
-        return Conditions.of(x.p.dtype, push=self.a_ext(t, x))
+        return ExternalEffects.of(x.p.dtype, push=self.a_ext(t, x))
 
 
 class Together(eqx.Module):
@@ -41,9 +41,9 @@ class Together(eqx.Module):
 
     parts: tuple[Disturbance, ...]
 
-    def __call__(self, t: Float[Array, ""], x: State) -> Conditions:
+    def __call__(self, t: Float[Array, ""], x: State) -> ExternalEffects:
         """The sum of the parts; calm without any."""
-        return sum((part(t, x) for part in self.parts), start=Conditions.calm(x.p.dtype))
+        return sum((part(t, x) for part in self.parts), start=ExternalEffects.calm(x.p.dtype))
 
 
 class Constant(eqx.Module):
@@ -51,9 +51,9 @@ class Constant(eqx.Module):
 
     a: Float[Array, "3"]
 
-    def __call__(self, t: Float[Array, ""], x: State) -> Conditions:
+    def __call__(self, t: Float[Array, ""], x: State) -> ExternalEffects:
         """Pushed by ``a`` [m/s^2]."""
-        return Conditions.of(x.p.dtype, push=self.a)
+        return ExternalEffects.of(x.p.dtype, push=self.a)
 
 
 class Reversing(eqx.Module):
@@ -67,10 +67,10 @@ class Reversing(eqx.Module):
         if not isinstance(self.period, jax.core.Tracer) and not self.period > 0:
             raise ValueError(f"Reversing.period = {float(self.period)} s must be positive")
 
-    def __call__(self, t: Float[Array, ""], x: State) -> Conditions:
+    def __call__(self, t: Float[Array, ""], x: State) -> ExternalEffects:
         """``a`` in the first period, ``-a`` in the second, and so on."""
         first = jnp.floor(t / self.period) % 2.0 == 0.0
-        return Conditions.of(x.p.dtype, push=jnp.where(first, self.a, -self.a))
+        return ExternalEffects.of(x.p.dtype, push=jnp.where(first, self.a, -self.a))
 
 
 class RandomWalk(eqx.Module):
@@ -92,10 +92,10 @@ class RandomWalk(eqx.Module):
         path = path - path[:1]
         return cls(bound - jnp.abs((path + bound) % (4.0 * bound) - 2.0 * bound), jnp.array(every))
 
-    def __call__(self, t: Float[Array, ""], x: State) -> Conditions:
+    def __call__(self, t: Float[Array, ""], x: State) -> ExternalEffects:
         """Pushed by the walk's acceleration at ``t``."""
         last = self.points.shape[0] - 1
         where = last - jnp.abs((t / self.every) % (2.0 * last) - last)  # there and back again
         i = jnp.clip(jnp.floor(where), 0, last - 1).astype(jnp.int32)
         part = where - i.astype(where.dtype)
-        return Conditions.of(x.p.dtype, push=(1.0 - part) * self.points[i] + part * self.points[i + 1])
+        return ExternalEffects.of(x.p.dtype, push=(1.0 - part) * self.points[i] + part * self.points[i + 1])

@@ -34,6 +34,11 @@ class AbstractDynamics(eqx.Module, Generic[X]):
     else:
         dt: eqx.AbstractVar[float]
 
+    @property
+    def settling_ticks(self) -> int | Float[Array, ""]:
+        """Ticks after :meth:`init` until the hidden state has forgotten the hover that it assumed."""
+        return 0
+
     @abc.abstractmethod
     def init(self, x: State) -> X:
         """Lift: the model's state when the vehicle hovers in the state ``x``."""
@@ -116,16 +121,21 @@ class Hybrid(AbstractDynamics[X]):
         """Control tick of the base model [s]."""
         return self.base.dt
 
+    @property
+    def settling_ticks(self) -> int | Float[Array, ""]:
+        """Settling time of the base model [ticks]."""
+        return self.base.settling_ticks
+
     def init(self, x: State) -> X:
-        """As the base model."""
+        """Lift to the state of the base model."""
         return self.base.init(x)
 
     def state(self, s: X) -> State:
-        """As the base model."""
+        """Return the vehicle's state."""
         return self.base.state(s)
 
     def with_state(self, s: X, x: State) -> X:
-        """As the base model."""
+        """Replace (p, R, v); hidden state stays."""
         return self.base.with_state(s, x)
 
     def step(self, s: X, u: Command, a_ext: Float[Array, "3"]) -> X:
@@ -153,16 +163,21 @@ class StraightThrough(AbstractDynamics[X]):
         """Control tick of both models [s]."""
         return self.forward.dt
 
+    @property
+    def settling_ticks(self) -> int | Float[Array, ""]:
+        """Settling time of the forward model [ticks]."""
+        return self.forward.settling_ticks
+
     def init(self, x: State) -> X:
-        """As the forward model."""
+        """Lift to the state of the forward model."""
         return self.forward.init(x)
 
     def state(self, s: X) -> State:
-        """As the forward model."""
+        """Return the vehicle's state."""
         return self.forward.state(s)
 
     def with_state(self, s: X, x: State) -> X:
-        """As the forward model."""
+        """Replace (p, R, v); hidden state stays."""
         return self.forward.with_state(s, x)
 
     def step(self, s: X, u: Command, a_ext: Float[Array, "3"]) -> X:

@@ -8,9 +8,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .conditions import Conditions
-from .highrate import SUBSTEP, AbstractHighRate, RotorState, check_tick, rigid_body, signs
+from .effects import ExternalEffects
 from .state import Command, State
+from .substep import SUBSTEP, AbstractSubstepDynamics, RotorState, check_tick, rigid_body, signs
 from .vehicle import Vehicle
 
 
@@ -37,7 +37,7 @@ def default_rate_loop() -> RateLoop:
     )
 
 
-class Rotors(AbstractHighRate[RotorState]):
+class LinearDragQuadrotor(AbstractSubstepDynamics[RotorState]):
     """Rotor-level quadrotor under a CTBR command.
 
     ``thrust_gain`` multiplies the true thrust: the error of the thrust map. ``drag`` [1/s] is the linear rotor drag
@@ -52,10 +52,10 @@ class Rotors(AbstractHighRate[RotorState]):
 
     def __check_init__(self) -> None:
         """Raise ``ValueError`` if the tick is not a whole number of milliseconds."""
-        check_tick(self.dt, "Rotors")
+        check_tick(self.dt, "LinearDragQuadrotor")
 
     @classmethod
-    def of(cls, vehicle: Vehicle, dt: float, *, thrust_error: float = 0.035) -> "Rotors":
+    def of(cls, vehicle: Vehicle, dt: float, *, thrust_error: float = 0.035) -> "LinearDragQuadrotor":
         """The realistic defaults: +3.5 % thrust, rotor drag 0.3, 0.3, 0.37 1/s."""
         return cls(vehicle, default_rate_loop(), jnp.array(1.0 + thrust_error), jnp.array([0.3, 0.3, 0.37]), dt)
 
@@ -72,27 +72,36 @@ class Rotors(AbstractHighRate[RotorState]):
         """Replace (p, R, v)."""
         return RotorState(x, s.omega, s.motors, s.integral, s.omega_dot)
 
-    def substep(self, s: RotorState, u: Command, around: Conditions) -> RotorState:
+    @property
+    def command_limits(self) -> tuple[Command, Command]:
+        """Smallest and largest command of the vehicle."""
+        return self.vehicle.command_min, self.vehicle.command_max
+
+    def rotor_state(self, s: RotorState) -> RotorState:
+        """Return body rates and rotor speeds."""
+        return s
+
+    def substep(self, s: RotorState, u: Command, effects: ExternalEffects) -> RotorState:
         """One millisecond: rate loop, motors, forces, rigid body."""
-        car = self.vehicle
+        vehicle = self.vehicle
         speeds, integral = self.rate_loop(s, u)
-        motors = speeds + (s.motors - speeds) * jnp.exp(-SUBSTEP / car.motor_tau)
-        thrusts = around.gain * car.thrust_coefficient * self.thrust_gain * motors**2
-        force, torque = self.wrench(s, motors, thrusts, around.wind)
-        mass, inertia = car.mass + around.mass, car.inertia + around.inertia
-        return rigid_body(s, motors, integral, force, torque, mass, inertia, around.push)
+        motors = speeds + (s.motors - speeds) * jnp.exp(-SUBSTEP / vehicle.motor_tau)
+        thrusts = effects.gain * vehicle.thrust_coefficient * self.thrust_gain * motors**2
+        force, torque = self.wrench(s, motors, thrusts, effects.wind)
+        mass, inertia = vehicle.mass + effects.mass, vehicle.inertia + effects.inertia
+        return rigid_body(s, motors, integral, force, torque, mass, inertia, effects.push)
 
     def rate_loop(self, s: RotorState, u: Command) -> tuple[Float[Array, "4"], Float[Array, "3"]]:
         """Rotor speeds [rad/s] to command, and the integral of the rate error [rad]."""
-        car, loop = self.vehicle, self.loop
-        low, high = car.command_min, car.command_max
+        vehicle, loop = self.vehicle, self.loop
+        low, high = vehicle.command_min, vehicle.command_max
         error = jnp.clip(u.omega, low.omega, high.omega) - s.omega
         integral = jnp.clip(s.integral + SUBSTEP * error, -loop.integral_max, loop.integral_max)
         wanted = loop.kp * error + loop.ki * integral - loop.kd * s.omega_dot
-        torque = car.inertia * wanted + jnp.cross(s.omega, car.inertia * s.omega)
-        thrusts = self.mixed(car.mass * jnp.clip(u.c, low.c, high.c), torque)
-        idle = car.thrust_coefficient * car.motor_min**2
-        return jnp.sqrt(jnp.clip(thrusts, idle, car.thrust_max / 4.0) / car.thrust_coefficient), integral
+        torque = vehicle.inertia * wanted + jnp.cross(s.omega, vehicle.inertia * s.omega)
+        thrusts = self.mixed(vehicle.mass * jnp.clip(u.c, low.c, high.c), torque)
+        idle = vehicle.thrust_coefficient * vehicle.motor_min**2
+        return jnp.sqrt(jnp.clip(thrusts, idle, vehicle.thrust_max / 4.0) / vehicle.thrust_coefficient), integral
 
     def mixed(self, thrust: Float[Array, ""], torque: Float[Array, "3"]) -> Float[Array, "4"]:
         """Thrust of each rotor [N] that gives the collective ``thrust`` [N] and the ``torque`` [Nm]."""
@@ -104,9 +113,9 @@ class Rotors(AbstractHighRate[RotorState]):
         self, s: RotorState, motors: Float[Array, "4"], thrusts: Float[Array, "4"], wind: Float[Array, "3"]
     ) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
         """Force [N] and torque [Nm] of all rotors in the body frame; the inverse of the mixer, plus rotor drag."""
-        car = self.vehicle
-        levers = jnp.stack([car.arm[1], car.arm[0], car.torque_ratio])
+        vehicle = self.vehicle
+        levers = jnp.stack([vehicle.arm[1], vehicle.arm[0], vehicle.torque_ratio])
         torque = levers * (signs(thrusts.dtype) @ thrusts)
-        drag = car.mass * self.drag * (jnp.mean(motors) / car.hover_speed) * (s.x.R.T @ (s.x.v - wind))
+        drag = vehicle.mass * self.drag * (jnp.mean(motors) / vehicle.hover_speed) * (s.x.R.T @ (s.x.v - wind))
         up = jnp.array([0.0, 0.0, 1.0], dtype=thrusts.dtype)
         return jnp.sum(thrusts) * up - drag, torque

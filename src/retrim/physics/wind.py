@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import random
 from jaxtyping import Array, Float, Key
 
-from .conditions import Conditions
+from .effects import ExternalEffects
 from .state import State
 
 FEET = 0.3048  # [m]
@@ -20,9 +20,9 @@ class SteadyWind(eqx.Module):
     wind: Float[Array, "3"]
     """World [m/s]."""
 
-    def __call__(self, t: Float[Array, ""], x: State) -> Conditions:
+    def __call__(self, t: Float[Array, ""], x: State) -> ExternalEffects:
         """Blown at by ``wind``."""
-        return Conditions.of(x.p.dtype, wind=self.wind)
+        return ExternalEffects.of(x.p.dtype, wind=self.wind)
 
 
 class Turbulence(eqx.Module):
@@ -104,9 +104,9 @@ class Dryden(eqx.Module):
         length, sigma = jnp.array([scale, scale, FEET * h]), jnp.array([level, level, up])
         return cls(mean, Turbulence.of(jnp.array(speed), length, sigma, key=key))
 
-    def __call__(self, t: Float[Array, ""], x: State) -> Conditions:
+    def __call__(self, t: Float[Array, ""], x: State) -> ExternalEffects:
         """Blown at by mean and gust."""
-        return Conditions.of(x.p.dtype, wind=self.mean + self.turbulence(t) @ axes_along(self.mean))
+        return ExternalEffects.of(x.p.dtype, wind=self.mean + self.turbulence(t) @ axes_along(self.mean))
 
 
 class Fan(eqx.Module):
@@ -148,7 +148,7 @@ class Fan(eqx.Module):
         eddies = Turbulence.of(jnp.array(speed), jnp.full(3, 2.0 * width), jnp.full(3, intensity), key=key)
         return cls(outlet, direction, jnp.array(speed), jnp.array(width), eddies)
 
-    def __call__(self, t: Float[Array, ""], x: State) -> Conditions:
+    def __call__(self, t: Float[Array, ""], x: State) -> ExternalEffects:
         """Blown at by the jet where the vehicle is."""
         axes = axes_along(self.direction)
         along, *off = axes @ (x.p - self.outlet)
@@ -156,4 +156,4 @@ class Fan(eqx.Module):
         inside = jax.nn.sigmoid(along / (0.2 * self.width) + 5.0)  # no jet behind the fan
         local = self.speed * self.width / width * jnp.exp(-0.5 * (off[0] ** 2 + off[1] ** 2) / width**2) * inside
         still = jnp.array([1.0, 0.0, 0.0], dtype=x.p.dtype)
-        return Conditions.of(x.p.dtype, wind=local * (still + self.turbulence(t)) @ axes)
+        return ExternalEffects.of(x.p.dtype, wind=local * (still + self.turbulence(t)) @ axes)

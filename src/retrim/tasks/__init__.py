@@ -1,9 +1,8 @@
-"""What we want: starts, rewards, observations, errors."""
+"""Tasks: starts, rewards, observations, termination and errors."""
 
-from .camera import Camera as Camera
 from .hover import AbstractHover as AbstractHover
 from .hover import Hover as Hover
-from .hover import SharpHover as SharpHover
+from .hover import L2Hover as L2Hover
 from .keypoints import Keypoints as Keypoints
 from .observation import AbstractObservation as AbstractObservation
 from .observation import StateObs as StateObs
@@ -16,5 +15,5 @@ from .task import AbstractTask as AbstractTask
 from .task import Start as Start
 from .task import huber as huber
 from .track import AbstractTrack as AbstractTrack
-from .track import SharpTrack as SharpTrack
+from .track import L2Track as L2Track
 from .track import Track as Track

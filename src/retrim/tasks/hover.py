@@ -17,10 +17,10 @@ TILT = 0.1 * math.pi  # [rad], 18 degrees
 
 
 class AbstractHover(AbstractTask):
-    """Fly to ``goal`` and stay; what differs is the reward.
+    """Fly to ``goal`` and stay. Subclasses differ in their reward.
 
-    A vehicle farther than ``box`` [m] from the goal along any axis is lost. The box is wide, since in a tight one a
-    strong disturbance ends every flight and leaves nothing to learn from.
+    A vehicle farther than ``box`` [m] from the goal along any axis is terminated. The box is wide, since in a tight one
+    a strong disturbance ends every flight and leaves nothing to learn from.
     """
 
     goal: Float[Array, "3"]
@@ -32,6 +32,17 @@ class AbstractHover(AbstractTask):
     """Starts head within +- this angle of the x axis [rad]; pi for anywhere."""
     dt: float = eqx.field(static=True, default=0.02)
     horizon: int = eqx.field(static=True, default=150)
+    in_flight: AbstractObservation[Any] | None = None
+    """Observation in flight, where it differs from that of training."""
+
+    @property
+    def observation_in_flight(self) -> AbstractObservation[Any]:
+        """Observation used in flight."""
+        return self.observation if self.in_flight is None else self.in_flight
+
+    def home(self) -> Float[Array, "3"]:
+        """Return the goal, world [m]."""
+        return self.goal
 
     def reset(self, key: Key[Array, ""]) -> Start:
         """Goal +- 1 m per axis, yaw within ``heading``, pitch and roll within 18 degrees, 0.1 m/s of velocity noise."""
@@ -41,12 +52,12 @@ class AbstractHover(AbstractTask):
         R = so3.rotx(TILT * roll) @ so3.roty(TILT * pitch) @ so3.rotz(self.heading * turn)
         return Start(jnp.zeros_like(p[0]), State(p, R, 0.1 * random.normal(kv, (3,))))
 
-    def alive(self, t: Float[Array, ""], x: State) -> Bool[Array, ""]:
-        """Inside the box, and finite."""
-        return within(self.box, x, self.goal)
+    def terminated(self, t: Float[Array, ""], x: State) -> Bool[Array, ""]:
+        """Return whether the vehicle is outside the box, or its state not finite."""
+        return ~within(self.box, x, self.goal)
 
     def error(self, t: Float[Array, ""], x: State) -> Float[Array, ""]:
-        """Distance from the goal [m]."""
+        """Return the distance from the goal [m]."""
         return jnp.sqrt(jnp.sum((x.p - self.goal) ** 2))
 
 
@@ -58,7 +69,7 @@ class Hover(AbstractHover):
         return _printed(self.goal, x, u)
 
 
-class SharpHover(AbstractHover):
+class L2Hover(AbstractHover):
     """With a reward that has a tip at the goal: the paper's is flat there, and a policy stays centimetres off."""
 
     def reward(self, t: Float[Array, ""], x: State, u: Command) -> Float[Array, ""]:

@@ -1,5 +1,6 @@
-"""What a camera shows a policy that knows no state: seven points on the ground, five frames, the last commands."""
+"""Observation from a camera: pixels of seven keypoints on the ground in five frames, and the last commands."""
 
+import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
@@ -8,40 +9,40 @@ import jax.numpy as jnp
 from jax import lax, random
 from jaxtyping import Array, Bool, Float, Key
 
+from ..estimation.camera import Camera, in_camera
+from ..estimation.pose_filter import PoseFilter
 from ..physics import so3
 from ..physics.state import STANDARD_GRAVITY, Command, State
-from .camera import Camera, in_camera
 from .observation import AbstractObservation
-from .sight import DT, Sight
 
 PATTERN = ((0.5, 0.5), (0.5, -0.5), (-0.5, -0.5), (-0.5, 0.5), (-0.5, 0.0), (0.0, 0.5), (0.5, 0.0))
 """The points, relative to the one below the goal [m]: a square's corners and three mid-points of its sides."""
 BELOW = 1.0  # [m], from the goal to the ground
-FRAMES, STRIDE, COMMANDS = 5, 3, 3  # frames 60 ms apart, as published
-DEPTH = (FRAMES - 1) * STRIDE + 1
+FRAMES, COMMANDS = 5, 3
+FRAME_TIME = 0.06  # [s] between frames, as published
 FAR = 2.5  # pixels (normalised) farther than this from where they are at the goal are cut off there
-STRANGE = 5.0  # standard deviations beyond which a whitened feature says no more
+FEATURE_LIMIT = 5.0  # whitened features are clipped at this many standard deviations
 
 
-class Seeing(NamedTuple):
-    """What the observation remembers."""
+class KeypointMemory(NamedTuple):
+    """Memory of the observation."""
 
     frames: Float[Array, "depth 14"]
     """Newest last."""
     commands: Float[Array, "3 4"]
-    sight: Sight
-    """Where the camera thinks that it is, to complete the points that it does not see."""
+    pose: PoseFilter
+    """Estimated pose, to predict occluded keypoints."""
     key: Key[Array, ""]
 
 
-class Keypoints(AbstractObservation[Seeing]):
+class Keypoints(AbstractObservation[KeypointMemory]):
     """o = [whitened pixels of five frames, which points are visible now, the last three commands]: 89 numbers.
 
-    With ``honest`` false every point is fed, wherever it is, as in the paper's code. Else a point that the camera does
-    not see is not observed: where it would be follows from those that are, and from the commands; see
-    :class:`retrim.tasks.sight.Sight`.
+    Without ``occlusion`` every point is observed, wherever it is, as in the paper's code. With it, a point outside the
+    image is not observed; it is predicted by :class:`retrim.estimation.PoseFilter` from visible points and commands.
 
-    ``noise`` is that of a pixel, in pixels; drawn from the start and the tick, so that roll-outs repeat.
+    ``noise`` is the standard deviation of a pixel coordinate [px]. It is drawn from a key that follows from the start,
+    so that roll-outs repeat.
     """
 
     camera: Camera
@@ -52,7 +53,27 @@ class Keypoints(AbstractObservation[Seeing]):
     """Probability that a visible point is missed in a frame."""
     mean: Float[Array, "70"]
     whiten: Float[Array, "70 70"]
-    honest: bool = eqx.field(static=True, default=True)
+    occlusion: bool = eqx.field(static=True, default=True)
+    dt: float = eqx.field(static=True, default=0.02)
+    delay_ticks: int = eqx.field(static=True, default=0)
+    """Declared command delay of the plant [ticks]: the filter predicts under the command that acted."""
+
+    def __check_init__(self) -> None:
+        """Raise ``ValueError`` if frames are no whole number of ticks apart, or the delay outlasts the memory."""
+        if abs(FRAME_TIME / self.dt - round(FRAME_TIME / self.dt)) > 1e-6:
+            raise ValueError(f"Keypoints: dt = {self.dt} s must divide the frame time, {FRAME_TIME} s")
+        if not 0 <= self.delay_ticks <= COMMANDS:
+            raise ValueError(f"Keypoints: delay_ticks = {self.delay_ticks} must be 0 to {COMMANDS}")
+
+    @property
+    def stride(self) -> int:
+        """Ticks between two frames."""
+        return round(FRAME_TIME / self.dt)
+
+    @property
+    def depth(self) -> int:
+        """Ticks of pixels that are remembered."""
+        return (FRAMES - 1) * self.stride + 1
 
     @classmethod
     def of(
@@ -60,15 +81,17 @@ class Keypoints(AbstractObservation[Seeing]):
         goal: Float[Array, "3"],
         omega_max: Float[Array, "3"],
         *,
-        honest: bool = True,
+        occlusion: bool = True,
         noise: float = 0.0,
         dropout: float = 0.0,
         whitened: bool = True,
+        dt: float = 0.02,
+        delay_ticks: int = 0,
     ) -> "Keypoints":
-        """With the whitening of random short flights about the goal (always the same ones); or with raw pixels."""
+        """Build the observation, by default with pixels whitened over random short motions (always the same ones)."""
         plain = cls(
             Camera.published(), goal, omega_max, jnp.array(noise), jnp.array(dropout),
-            jnp.zeros(70), jnp.eye(70), honest,
+            jnp.zeros(70), jnp.eye(70), occlusion, dt, delay_ticks,
         )  # fmt: skip
         if not whitened:
             return plain
@@ -84,20 +107,24 @@ class Keypoints(AbstractObservation[Seeing]):
 
     @property
     def size(self) -> int:
-        """89."""
+        """Length of the observation: 89."""
         return 14 * FRAMES + 7 + 4 * COMMANDS
 
-    def init(self, x: State) -> Seeing:
+    def occluded(self, dropout: float) -> "Keypoints":
+        """Return the same observation with occlusion, where visible points are missed with probability ``dropout``."""
+        return dataclasses.replace(self, occlusion=True, dropout=jnp.array(dropout))
+
+    def init(self, x: State) -> KeypointMemory:
         """As if the vehicle had come in a straight line, without turning, and hovered by its commands."""
         frames = self.history(x, jnp.zeros_like(x.p))
         bits = lax.bitcast_convert_type(jnp.sum(x.p + x.v).astype(jnp.float32), jnp.int32)
         commands = jnp.zeros((COMMANDS, 4), dtype=x.p.dtype)
-        key, k_sight = random.split(random.key(bits))
-        return Seeing(frames, commands, Sight.near(x, k_sight), key)
+        key, k_pose = random.split(random.key(bits))
+        return KeypointMemory(frames, commands, PoseFilter.near(x, k_pose), key)
 
     def history(self, x: State, omega: Float[Array, "3"]) -> Float[Array, "depth 14"]:
         """Frames of a motion with constant velocity and body rates that ends in ``x``, oldest first."""
-        ago = DT * jnp.arange(DEPTH - 1, -1, -1, dtype=x.p.dtype)
+        ago = self.dt * jnp.arange(self.depth - 1, -1, -1, dtype=x.p.dtype)
 
         def frame(s: Float[Array, ""]) -> Float[Array, "14"]:
             return self.pixels(State(x.p - s * x.v, x.R @ so3.exp(-s * omega), x.v))[0].reshape(14)
@@ -106,11 +133,11 @@ class Keypoints(AbstractObservation[Seeing]):
 
     def stacked(self, frames: Float[Array, "depth 14"]) -> Float[Array, "70"]:
         """The five frames that are shown, newest first."""
-        return frames[::-STRIDE].reshape(-1)
+        return frames[:: -self.stride].reshape(-1)
 
     def features(self, frames: Float[Array, "depth 14"]) -> Float[Array, "70"]:
         """Whitened; frames that fit no motion, as when points come into sight, are cut off."""
-        return jnp.clip(self.whiten @ (self.stacked(frames) - self.mean), -STRANGE, STRANGE)
+        return jnp.clip(self.whiten @ (self.stacked(frames) - self.mean), -FEATURE_LIMIT, FEATURE_LIMIT)
 
     def pixels(self, x: State) -> tuple[Float[Array, "7 2"], Bool[Array, " 7"]]:
         """Where the points appear, cut off far outside the image, and which are visible."""
@@ -123,29 +150,34 @@ class Keypoints(AbstractObservation[Seeing]):
         return self.goal[None] + jnp.concatenate([flat, jnp.full((7, 1), -BELOW, dtype=flat.dtype)], axis=1)
 
     def __call__(
-        self, memory: Seeing, t: Float[Array, ""], x: State, last: Command
-    ) -> tuple[Float[Array, " o"], Seeing]:
-        """One frame more."""
+        self, memory: KeypointMemory, t: Float[Array, ""], x: State, last: Command
+    ) -> tuple[Float[Array, " o"], KeypointMemory]:
+        """Return the observation after one more frame."""
         key, k_noise, k_drop = random.split(memory.key, 3)
         true, visible = self.pixels(x)
         noise = (2.0 * self.noise / self.camera.size)[None] * random.normal(k_noise, (7, 2), true.dtype)
         shown = true + lax.stop_gradient(noise)
-        sight = memory.sight
-        if self.honest:
+        pose = memory.pose
+        if self.occlusion:
             visible = visible & (random.uniform(k_drop, (7,), true.dtype) >= self.dropout)
             sharpness = 2.0 * jnp.maximum(self.noise, 0.5) / self.camera.size
-            sight = lax.stop_gradient(memory.sight).predicted(lax.stop_gradient(last))
-            sight = sight.corrected(self.camera, self.ground(), lax.stop_gradient(shown), visible, sharpness)
-            sight = lax.stop_gradient(sight)
-            filled, _ = self.pixels(sight.x)
-            # the value of what is known, the gradient of what is: the completion follows the true point
+            acted = last if self.delay_ticks == 0 else self._command(memory.commands[-self.delay_ticks])
+            pose = lax.stop_gradient(memory.pose).predicted(lax.stop_gradient(acted), self.dt)
+            pose = pose.corrected(self.camera, self.ground(), lax.stop_gradient(shown), visible, sharpness)
+            pose = lax.stop_gradient(pose)
+            filled, _ = self.pixels(pose.x)
+            # The value is the predicted pixel, the gradient that of the true one.
             shown = jnp.where(visible[:, None], shown, true + lax.stop_gradient(filled - true))
         scaled = jnp.concatenate([(last.c / STANDARD_GRAVITY - 1.0)[None], last.omega / self.omega_max])
         frames = jnp.concatenate([memory.frames, shown.reshape(1, 14)])[1:]
         commands = jnp.concatenate([memory.commands, scaled[None]])[1:]
         features = self.features(frames)
         o = jnp.concatenate([features, visible.astype(true.dtype), commands.reshape(-1)])
-        return o, Seeing(frames, commands, sight, key)
+        return o, KeypointMemory(frames, commands, pose, key)
+
+    def _command(self, scaled: Float[Array, "4"]) -> Command:
+        """Return the command that was remembered as ``scaled``."""
+        return Command((scaled[0] + 1.0) * STANDARD_GRAVITY, scaled[1:] * self.omega_max)
 
 
 def random_motion(key: Key[Array, ""], goal: Float[Array, "3"]) -> tuple[State, Float[Array, "3"]]:

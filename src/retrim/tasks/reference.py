@@ -72,8 +72,8 @@ class Reference(eqx.Module):
         """The reference at time ``t`` [s], linearly between rows."""
         start, end = self.lap[0], self.lap[1]
         length = end - start
-        around = start + (t - start) % jnp.where(length > 0, length, 1.0)
-        t = jnp.where(t < end, t, jnp.where(length > 0, around, end))
+        effects = start + (t - start) % jnp.where(length > 0, length, 1.0)
+        t = jnp.where(t < end, t, jnp.where(length > 0, effects, end))
         where = jnp.clip(t / self.every, 0.0, self.rows.shape[0] - 1.0)
         i = jnp.clip(jnp.floor(where), 0, self.rows.shape[0] - 2).astype(jnp.int32)
         part = (where - i.astype(where.dtype)).astype(self.rows.dtype)
@@ -91,7 +91,7 @@ class Reference(eqx.Module):
         away = jnp.sqrt(jnp.sum((self.rows[:, :3] - p[None]) ** 2, axis=1))
         return jnp.min(jnp.where(on_lap, away, jnp.inf))
 
-    def worst_violation(self, vehicle: Vehicle) -> str | None:
+    def infeasibility(self, vehicle: Vehicle) -> str | None:
         """What the vehicle cannot fly of this, in words; None if it can fly all of it."""
         rows, times = np.asarray(self.rows), np.arange(self.rows.shape[0]) * float(self.every)
         c_max, rate_max = float(vehicle.command_max.c), np.asarray(vehicle.omega_max)
@@ -126,7 +126,7 @@ def joined(references: Sequence[Reference], *, seconds: float = 20.0, every: flo
     return Reference(jnp.concatenate(rows), jnp.array(every), jnp.array([end, end]), jnp.array(joins))
 
 
-def spun_up(t: float, ramp: float = 3.0) -> float:
+def smooth_start(t: float, ramp: float = 3.0) -> float:
     """Time along a lap [s] after a smooth start from rest that takes ``ramp`` seconds (7th-order smooth step)."""
     x = min(t / ramp, 1.0)
     return ramp * (7.0 * x**5 - 14.0 * x**6 + 10.0 * x**7 - 2.5 * x**8) + max(t - ramp, 0.0)
@@ -136,7 +136,7 @@ def circle(radius: float = 1.0, period: float = 3.0, ramp: float = 3.0) -> Refer
     """Horizontal, through (0, 0, 1), about (radius, 0, 1); first towards -y (paper, Fig. 4: 1 m, 3 s)."""
 
     def path(t: float) -> list[float]:
-        phi = 2.0 * math.pi * spun_up(t, ramp) / period
+        phi = 2.0 * math.pi * smooth_start(t, ramp) / period
         return [radius - radius * math.cos(phi), -radius * math.sin(phi), 1.0]
 
     return Reference.of(path, seconds=ramp + period, lap=ramp)
@@ -146,7 +146,7 @@ def figure8(length: float = 3.0, width: float = 1.0, period: float = 5.0, ramp: 
     """Horizontal, ``length`` x ``width``, from (0, 0, 1) (paper, Fig. 4: 5 s)."""
 
     def path(t: float) -> list[float]:
-        phi = 2.0 * math.pi * spun_up(t, ramp) / period
+        phi = 2.0 * math.pi * smooth_start(t, ramp) / period
         return [0.5 * length * (1.0 - math.cos(phi)), -0.5 * width * math.sin(2.0 * phi), 1.0]
 
     return Reference.of(path, seconds=ramp + period, lap=ramp)
@@ -158,7 +158,7 @@ def star(radius: float = 1.0, period: float = 6.0, ramp: float = 3.0) -> Referen
     vertices = [(radius + radius * math.cos(a), radius * math.sin(a)) for a in corners]
 
     def path(t: float) -> list[float]:
-        edge = 5.0 * (spun_up(t, ramp) / period % 1.0)
+        edge = 5.0 * (smooth_start(t, ramp) / period % 1.0)
         k, part = min(int(edge), 4), edge - min(int(edge), 4)
         (x0, y0), (x1, y1) = vertices[k], vertices[k + 1]
         return [x0 + part * (x1 - x0), y0 + part * (y1 - y0), 1.0]
@@ -209,14 +209,14 @@ def _row(path: Path3, t: float, last: float) -> np.ndarray:
         return np.append(point, 0.0)[:4]
 
     middle = min(max(t, 2.0 * h), last - h)
-    around = [at(middle + k * h) for k in range(-2, 3)]
-    v = (around[3] - around[1])[:3] / (2.0 * h)
-    pulls = [(around[k + 1] - 2.0 * around[k] + around[k - 1])[:3] / h**2 for k in (1, 2, 3)]
+    effects = [at(middle + k * h) for k in range(-2, 3)]
+    v = (effects[3] - effects[1])[:3] / (2.0 * h)
+    pulls = [(effects[k + 1] - 2.0 * effects[k] + effects[k - 1])[:3] / h**2 for k in (1, 2, 3)]
     p = at(t)
-    fine = (at(middle + 0.1 * h) - 2.0 * around[2] + at(middle - 0.1 * h))[:3] / (0.1 * h) ** 2
+    fine = (at(middle + 0.1 * h) - 2.0 * effects[2] + at(middle - 0.1 * h))[:3] / (0.1 * h) ** 2
     if max(np.linalg.norm(a - fine) for a in pulls) > JUMP:  # a jump does not look the same from nearer
         return np.concatenate([p[:3], v, [STANDARD_GRAVITY, 0.0, 0.0, 0.0], p[3:]])
-    R_before, R, R_after = (_attitude(a, here[3]) for a, here in zip(pulls, around[1:4], strict=True))
+    R_before, R, R_after = (_attitude(a, here[3]) for a, here in zip(pulls, effects[1:4], strict=True))
     turn = R.T @ (R_after - R_before) / (2.0 * h)
     return np.concatenate([p[:3], v, [np.linalg.norm(pulls[1] + UP), turn[2, 1], turn[0, 2], turn[1, 0]], p[3:]])
 

@@ -1,4 +1,4 @@
-"""What a task must say: where it starts, what it rewards, when it is lost, how its error is measured."""
+"""A task: where it starts, what it rewards, when it ends, and how its error is measured."""
 
 import abc
 from typing import TYPE_CHECKING, Any
@@ -41,21 +41,49 @@ class AbstractTask(eqx.Module):
         horizon: eqx.AbstractVar[int]
         observation: eqx.AbstractVar[AbstractObservation]
 
+    @property
+    def observation_in_flight(self) -> AbstractObservation[Any]:
+        """Observation used in flight; that of training unless a task says otherwise."""
+        return self.observation
+
+    @property
+    def metric(self) -> str:
+        """Name of the error in results."""
+        return "steady_error_m"
+
+    @property
+    def flight_seconds(self) -> float:
+        """Default length of a flight [s]."""
+        return 30.0
+
+    @property
+    def steady_seconds(self) -> float:
+        """A flight is scored by its mean error over this long at its end [s]."""
+        return 2.0
+
+    @abc.abstractmethod
+    def home(self) -> Float[Array, "3"]:
+        """Return the position around which flights start, world [m]."""
+
     @abc.abstractmethod
     def reset(self, key: Key[Array, ""]) -> Start:
-        """A random start; the key is consumed."""
+        """Return a random start; the key is consumed."""
 
     @abc.abstractmethod
     def reward(self, t: Float[Array, ""], x: State, u: Command) -> Float[Array, ""]:
         """r(x_t, u_t), differentiable; ``u`` is the command that acts from ``t`` on."""
 
     @abc.abstractmethod
-    def alive(self, t: Float[Array, ""], x: State) -> Bool[Array, ""]:
-        """False once the vehicle is lost; false also for a state that is not finite."""
+    def terminated(self, t: Float[Array, ""], x: State) -> Bool[Array, ""]:
+        """Return whether the vehicle has left the task's bounds; true also for a state that is not finite."""
 
     @abc.abstractmethod
     def error(self, t: Float[Array, ""], x: State) -> Float[Array, ""]:
-        """The paper's metric: distance from where the vehicle should be [m]."""
+        """Return the distance from where the vehicle should be [m]."""
+
+    def cross_track(self, x: State) -> Float[Array, ""] | None:
+        """Return the distance from the nearest point of the reference [m]; None for a task without one."""
+        return None
 
 
 def within(box: Float[Array, ""], x: State, centre: Float[Array, "3"]) -> Bool[Array, ""]:

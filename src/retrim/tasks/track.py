@@ -18,9 +18,9 @@ NOISE = 0.1 * math.pi  # [rad]
 
 
 class AbstractTrack(AbstractTask):
-    """Be where the reference is, when it is there; what differs is the reward.
+    """Be where the reference is, when it is there; subclasses differ in their reward.
 
-    A vehicle farther than ``box`` [m] from the reference along an axis is lost.
+    A vehicle farther than ``box`` [m] from the reference along an axis is terminated.
     """
 
     reference: Reference
@@ -43,16 +43,35 @@ class AbstractTrack(AbstractTask):
         R = so3.rotz(here.heading) @ so3.exp(NOISE * random.uniform(ka, (3,), here.p.dtype, minval=-1.0, maxval=1.0))
         return Start(t, State(p, R, here.v + 0.3 * random.normal(kv, (3,), here.p.dtype)))
 
-    def alive(self, t: Float[Array, ""], x: State) -> Bool[Array, ""]:
-        """Near the reference, and finite."""
-        return within(self.box, x, self.reference(t).p)
+    @property
+    def metric(self) -> str:
+        """Name of the error in results."""
+        return "tracking_error_m"
+
+    @property
+    def flight_seconds(self) -> float:
+        """Default length of a flight [s], as in the paper."""
+        return 60.0
+
+    @property
+    def steady_seconds(self) -> float:
+        """A flight is scored by its mean error over this long at its end [s]."""
+        return 10.0
+
+    def home(self) -> Float[Array, "3"]:
+        """Return the start of the reference, world [m]."""
+        return self.reference(jnp.array(0.0)).p
+
+    def terminated(self, t: Float[Array, ""], x: State) -> Bool[Array, ""]:
+        """Return whether the vehicle is outside the box around the reference, or its state not finite."""
+        return ~within(self.box, x, self.reference(t).p)
 
     def error(self, t: Float[Array, ""], x: State) -> Float[Array, ""]:
-        """Distance from where the reference is at ``t`` [m]."""
+        """Return the distance from where the reference is at ``t`` [m]."""
         return jnp.sqrt(jnp.sum((x.p - self.reference(t).p) ** 2))
 
     def cross_track(self, x: State) -> Float[Array, ""]:
-        """Distance from the nearest point of the reference's lap [m]."""
+        """Return the distance from the nearest point of the reference's lap [m]."""
         return self.reference.distance(x.p)
 
 
@@ -65,7 +84,7 @@ class Track(AbstractTrack):
         return -huber(x.p - here.p) - huber(x.v - here.v) - 0.1 * huber(u.vector() - Command.hover().vector())
 
 
-class SharpTrack(AbstractTrack):
+class L2Track(AbstractTrack):
     """With a reward that is five times as sharp in position, and asks for the reference's own command.
 
     The paper's trades centimetres for tilt, even without any disturbance.

@@ -62,3 +62,28 @@ def panel_figure(title: str, panels: Sequence[Panel], *, across: int = 3) -> Fig
         for axes in grid.flat[len(panels) :]:
             axes.set_visible(False)
     return figure
+
+
+def bars(title: str, groups: dict[str, dict[str, list[float]]]) -> Figure:
+    """Draw one group of bars per label and one bar per method: the mean, and a dot for each flight."""
+    methods = list(dict.fromkeys(method for group in groups.values() for method in group))
+    with plt.rc_context(
+        {"font.size": 10, "axes.spines.top": False, "axes.spines.right": False, "svg.fonttype": "none"}
+    ):
+        figure, axes = plt.subplots(
+            figsize=(max(6.0, 1.1 * len(groups) * len(methods)), 4.5), layout="constrained", facecolor="white"
+        )
+        width = 0.8 / len(methods)
+        for k, method in enumerate(methods):
+            places = np.arange(len(groups)) + (k - (len(methods) - 1) / 2) * width
+            color = BASE if method == "base" else COLORS[(k - 1) % len(COLORS) if k else 0]
+            means = [float(np.mean(group[method])) if group.get(method) else 0.0 for group in groups.values()]
+            axes.bar(places, means, 0.9 * width, color=color, alpha=0.5, label=method)
+            for place, group in zip(places, groups.values(), strict=True):
+                found = group.get(method, [])
+                axes.plot(np.full(len(found), place), found, "o", color=color, markersize=4)
+        axes.set_xticks(np.arange(len(groups)), list(groups), rotation=20 if len(groups) > 4 else 0, ha="center")
+        axes.set(ylabel="error [m]")
+        axes.set_title(title, fontsize=12, color=INK)
+        axes.legend(frameon=False)
+    return figure

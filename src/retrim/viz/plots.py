@@ -34,7 +34,7 @@ class Track:
 
 
 @dataclass(frozen=True)
-class Sighting:
+class ImageTrack:
     """What the camera saw in one flight."""
 
     pixel: np.ndarray
@@ -144,7 +144,7 @@ def laps(axes: Axes, base: list[Track], adapted: list[Track], lap: np.ndarray) -
     axes.set_aspect("equal", adjustable="datalim")
 
 
-def camera(axes: Axes, base: list[Sighting], adapted: list[Sighting], wanted: np.ndarray) -> None:
+def camera(axes: Axes, base: list[ImageTrack], adapted: list[ImageTrack], wanted: np.ndarray) -> None:
     """What the camera saw in the first flight of each kind; ``wanted`` (7 x 2): where the points are at the goal."""
     for sightings, color, name in ((base, BASE, "base"), (adapted, ADAPTED, "adapted")):
         for sighting in sightings[:1]:

@@ -11,10 +11,10 @@ from jax import lax
 
 from helpers import replaced
 from retrim.physics import (
-    Bem,
+    BemQuadrotor,
     Command,
-    Conditions,
-    Rotors,
+    ExternalEffects,
+    LinearDragQuadrotor,
     RotorState,
     State,
     kingfisher,
@@ -22,8 +22,8 @@ from retrim.physics import (
     small,
     with_payload,
 )
-from retrim.physics.highrate import rigid_body
 from retrim.physics.propeller import BladeForces, Inflow
+from retrim.physics.substep import rigid_body
 
 BEM, SIMPLE = (json.loads((Path(__file__).parent / f"{name}.json").read_text()) for name in ("bem", "simple_models"))
 SLOW = (0, 1, 2, 6)  # without body rates, up to 3 m/s: there the flapping, which is left out, is not seen
@@ -48,23 +48,25 @@ def state(case):
 
 def plants():
     """The kingfisher with the arms of the golden file, without drag: by blade elements and by coefficients."""
-    car = replaced(kingfisher(), arm=jnp.abs(jnp.array(SIMPLE["arms"][0][:2])), torque_ratio=jnp.array(SIMPLE["kappa"]))
-    assert (float(car.mass), car.inertia.tolist()) == (SIMPLE["mass"], SIMPLE["J"])
-    assert float(car.thrust_coefficient) == SIMPLE["thrust_coefficient"][0]
-    bem = Bem.of(replaced(car, drag_area=1e-12 * jnp.ones(3)), 0.02)
-    return bem, replaced(Rotors.of(car, 0.02, thrust_error=0.0), drag=jnp.zeros(3))
+    vehicle = replaced(
+        kingfisher(), arm=jnp.abs(jnp.array(SIMPLE["arms"][0][:2])), torque_ratio=jnp.array(SIMPLE["kappa"])
+    )
+    assert (float(vehicle.mass), vehicle.inertia.tolist()) == (SIMPLE["mass"], SIMPLE["J"])
+    assert float(vehicle.thrust_coefficient) == SIMPLE["thrust_coefficient"][0]
+    bem = BemQuadrotor.of(replaced(vehicle, drag_area=1e-12 * jnp.ones(3)), 0.02)
+    return bem, replaced(LinearDragQuadrotor.of(vehicle, 0.02, thrust_error=0.0), drag=jnp.zeros(3))
 
 
 def test_quadratic_rotors_and_a_step(case):
     """Position is the mean of both Euler steps; the published attitude is renormalised in its own way."""
     _, rotors = plants()
-    car, s = rotors.vehicle, state(case)
-    force, torque = rotors.wrench(s, s.motors, car.thrust_coefficient * s.motors**2, jnp.zeros(3))
+    vehicle, s = rotors.vehicle, state(case)
+    force, torque = rotors.wrench(s, s.motors, vehicle.thrust_coefficient * s.motors**2, jnp.zeros(3))
     gravity = np.array([0.0, 0.0, -SIMPLE["G"]])
-    np.testing.assert_allclose(s.x.R @ force / car.mass + gravity, case["tts_dvel"], rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(torque / car.inertia, case["tts_dome"], rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(s.x.R @ force / vehicle.mass + gravity, case["tts_dvel"], rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(torque / vehicle.inertia, case["tts_dome"], rtol=1e-9, atol=1e-9)
     lighter = jnp.array([0.0, 0.0, 9.81 - SIMPLE["G"]])
-    after = rigid_body(s, s.motors, s.integral, force, torque, car.mass, car.inertia, lighter)
+    after = rigid_body(s, s.motors, s.integral, force, torque, vehicle.mass, vehicle.inertia, lighter)
     np.testing.assert_allclose(after.x.v, case["sym_vel"], rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(after.omega, case["sym_ome"], rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(after.x.p, 0.5 * (case["euler_pos"] + case["sym_pos"]), rtol=1e-9, atol=1e-12)
@@ -72,28 +74,28 @@ def test_quadratic_rotors_and_a_step(case):
 
 
 def test_free_rotation(case):
-    car, s, zero = kingfisher(), state(case), jnp.zeros(3)
-    after = rigid_body(s, s.motors, zero, zero, zero, car.mass, car.inertia, zero)
+    vehicle, s, zero = kingfisher(), state(case), jnp.zeros(3)
+    after = rigid_body(s, s.motors, zero, zero, zero, vehicle.mass, vehicle.inertia, zero)
     np.testing.assert_allclose(after.omega_dot, case["rb_dome"], rtol=1e-9, atol=1e-12)
 
 
 def test_motors(case, monkeypatch):
     _, rotors = plants()
-    monkeypatch.setattr(Rotors, "rate_loop", lambda self, s, u: (jnp.asarray(case["motdes"]), s.integral))
-    after = rotors.substep(state(case), Command.hover(), Conditions.calm(jnp.dtype(float)))
+    monkeypatch.setattr(LinearDragQuadrotor, "rate_loop", lambda self, s, u: (jnp.asarray(case["motdes"]), s.integral))
+    after = rotors.substep(state(case), Command.hover(), ExternalEffects.calm(jnp.dtype(float)))
     np.testing.assert_allclose(after.motors, case["rk4_mot"], rtol=1e-9)
 
 
 def test_body_drag(case):
     """The published numbers lack the division by the mass."""
     s = state(case)
-    force = Bem.of(kingfisher(), 0.02).body_drag(s, jnp.zeros(3))
+    force = BemQuadrotor.of(kingfisher(), 0.02).body_drag(s, jnp.zeros(3))
     np.testing.assert_allclose(s.x.R @ force, case["bodydrag_dvel"], rtol=1e-9, atol=1e-12)
 
 
 @jax.jit
 def acceleration(model, s, blades):
-    calm = Conditions.calm(jnp.dtype(float))
+    calm = ExternalEffects.calm(jnp.dtype(float))
     above = jax.tree.map(lambda leaf: jnp.full(4, leaf), Inflow.above(s.motors.dtype))
     inflow = lax.fori_loop(0, 8, lambda _, inflow: model.rotors(s, s.motors, inflow, calm.wind)[1], above)
     ours, _ = model.rotors(s, s.motors, inflow, calm.wind)
@@ -115,7 +117,7 @@ def test_acceleration_of_blade_elements(index):
 @pytest.mark.parametrize(("make", "edgewise", "axial"), [(kingfisher, 0.24, 0.37), (small, 0.33, 0.45)])
 def test_damping(make, edgewise, axial):
     """Of the rotors alone, at hover [1/s]: at 3 m/s edgewise, and climbing."""
-    model = Bem.of(make(), 0.02, thrust_error=0.0)
+    model = BemQuadrotor.of(make(), 0.02, thrust_error=0.0)
     model = replaced(model, vehicle=replaced(model.vehicle, drag_area=1e-12 * jnp.ones(3)))
     motors = jnp.sqrt(model.vehicle.mass * 9.81 / (4.0 * model.loop.thrust_map)) * jnp.ones(4)
 

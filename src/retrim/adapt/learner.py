@@ -1,0 +1,138 @@
+"""The online learner: pure functions of a window of flight, without state of its own and without a clock."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from jax import random
+from jaxtyping import Array, Bool, Float, Key
+
+from ..control.lora import LoraPolicy
+from ..control.policy import Policy
+from ..learn.bptt import PolicyState, bptt
+from ..learn.env import Env
+from ..learn.pretrain import random_starts
+from ..learn.residuals.model import FittedResidual, ResidualModel
+from ..learn.residuals.targets import residual_targets
+from ..learn.window import Window
+from ..physics.state import where
+from ..tasks.task import Start
+from .gate import Verdict, all_finite, judge
+
+
+class LearnerState(eqx.Module):
+    """What has been learnt so far, in two halves, so that two processes can own one each."""
+
+    policy: PolicyState
+    residual: eqx.Module
+    """State of the residual model."""
+
+
+class FitReport(eqx.Module):
+    """Result of a residual fit."""
+
+    rms_error: Float[Array, ""]
+    """Root mean square of the error over the window [m/s^2]."""
+    accepted: Bool[Array, ""]
+    """False if the fit is not finite or no tick of the window could be used; the old state is then kept."""
+
+
+class OnlineLearner(eqx.Module):
+    """How to learn from a window of flight (paper, Sec. IV-A.3). Every number that may change is an array."""
+
+    env: Env
+    """Task of the flight, nominal model and its delay; the model knows nothing of the plant."""
+    residual_model: ResidualModel
+    policy_rate: Float[Array, ""]
+    """Adam's learning rate at the start of an update; it falls to zero along a cosine. Each update starts a fresh
+    Adam."""
+    max_grad_norm: Float[Array, ""]
+    """Largest norm of a policy gradient; infinity for none."""
+    plant_delay_ticks: int = eqx.field(static=True)
+    """Declared command delay of the plant [ticks], to pair accelerations with the commands that caused them."""
+    num_updates: int = eqx.field(static=True)
+    """Optimiser steps of one policy update."""
+    num_envs: int = eqx.field(static=True)
+    """Starts per optimiser step."""
+
+    def __check_init__(self) -> None:
+        """Raise ``ValueError`` for sizes that cannot work."""
+        for name in ("num_updates", "num_envs"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"OnlineLearner.{name} = {getattr(self, name)} must be at least 1")
+        if self.plant_delay_ticks < 0:
+            raise ValueError(f"OnlineLearner.plant_delay_ticks = {self.plant_delay_ticks} must not be negative")
+
+    def init(self, policy: Policy | LoraPolicy, key: Key[Array, ""]) -> LearnerState:
+        """Return the state before the first fit, with a residual that predicts zero; the key is consumed."""
+        fresh = PolicyState(policy, self._optimiser().init(policy.params))
+        return LearnerState(fresh, _fresh_residual(self.residual_model, key))
+
+    @eqx.filter_jit
+    def fit_residual(self, state: eqx.Module, window: Window) -> tuple[eqx.Module, FitReport]:
+        """Fit the residual model to a window, from where the last fit ended.
+
+        Args:
+            state: State of the residual model.
+            window: Ticks of flight.
+
+        Returns:
+            The new state, or ``state`` if the fit is not finite or had no data, and a report.
+        """
+        rows = residual_targets(window, self.env.dynamics, delay_ticks=self.plant_delay_ticks)
+        fitted, rms = self.residual_model.fit(state, rows)
+        accepted = all_finite(fitted) & jnp.any(rows.valid)
+        return where(accepted, fitted, state), FitReport(rms, accepted)
+
+    @eqx.filter_jit
+    def update_policy(
+        self, state: PolicyState, residual: eqx.Module, window: Window, key: Key[Array, ""]
+    ) -> tuple[PolicyState, Verdict]:
+        """Re-train the policy by back-propagation in the corrected model, and judge the result.
+
+        Gradients flow through the analytical model only. The gate flies eight starts that the update did not train
+        on: four states of the window, four random starts of the task.
+
+        Args:
+            state: Policy to start from.
+            residual: State of the residual model.
+            window: Ticks of flight.
+            key: Consumed.
+
+        Returns:
+            The trained policy, and the gate's verdict on it.
+        """
+        corrected = self.env.with_residual(FittedResidual(self.residual_model, residual))
+        k_train, k_gate, k_window = random.split(key, 3)
+        x0 = random_starts(self.env.task, k_train, self.num_updates, self.num_envs)
+        optimiser = self._optimiser()
+        fresh = PolicyState(state.policy, optimiser.init(state.policy.params))
+        trained, _ = bptt(fresh, corrected, x0, optimiser=optimiser)
+        held_out = jax.tree.map(
+            lambda a, b: jnp.concatenate([a, b]),
+            jax.vmap(self.env.task.reset)(random.split(k_gate, 4)),
+            _drawn(window, k_window, 4),
+        )
+        return trained, judge(trained.policy.merged(), state.policy.merged(), corrected, held_out)
+
+    def _optimiser(self) -> optax.GradientTransformation:
+        schedule = optax.cosine_decay_schedule(1.0, self.num_updates)
+        return optax.chain(
+            optax.clip_by_global_norm(self.max_grad_norm),
+            optax.scale_by_adam(),
+            optax.scale_by_schedule(lambda step: -self.policy_rate * schedule(step)),
+        )
+
+
+@eqx.filter_jit
+def _fresh_residual(model: ResidualModel, key: Key[Array, ""]) -> eqx.Module:
+    state: eqx.Module = model.init(key)
+    return state
+
+
+def _drawn(window: Window, key: Key[Array, ""], n: int) -> Start:
+    """Draw ``n`` states, with their times, from the valid part of the window."""
+    weight = window.valid.astype(window.x.p.dtype)
+    row = random.choice(key, window.valid.shape[0], (n,), p=weight / jnp.sum(weight))
+    drawn: Start = jax.vmap(Start)(window.t[row], jax.tree.map(lambda leaf: leaf[row], window.x))
+    return drawn

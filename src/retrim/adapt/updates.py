@@ -1,0 +1,111 @@
+"""What learners send to pilots: frozen, typed messages that turn into bytes and back."""
+
+import json
+from dataclasses import dataclass, fields
+from typing import Any, Literal
+
+from ..errors import MessageError
+from ..learn.bptt import PolicyState
+from ..transport import wire
+from .learner import LearnerState
+
+Layer = Literal["residual", "policy"]
+"""The two layers of learning."""
+
+
+@dataclass(frozen=True)
+class ResidualUpdate:
+    """A residual was fitted."""
+
+    computed_from: float
+    """Time of the newest measurement that it was learnt from [s]."""
+    rms_error: float
+    """Root mean square of the fit's error [m/s^2]."""
+    state: Any
+    """New state of the residual model."""
+
+    def note(self) -> str:
+        """Return one line for the log."""
+        return f"rms error {self.rms_error:.3f} m/s^2"
+
+
+@dataclass(frozen=True)
+class PolicyUpdate:
+    """A policy was re-trained and admitted."""
+
+    computed_from: float
+    """Time of the newest measurement that it was learnt from [s]."""
+    cost: float
+    """Its cost on the gate's roll-outs."""
+    incumbent_cost: float
+    """Cost of the policy that it replaces."""
+    state: PolicyState
+    """The new policy and its optimiser state."""
+
+    def note(self) -> str:
+        """Return one line for the log."""
+        return f"cost {self.cost:.4f} against {self.incumbent_cost:.4f}"
+
+
+@dataclass(frozen=True)
+class Rejection:
+    """A result that must not be used."""
+
+    computed_from: float
+    layer: Layer
+    reason: str
+
+    def note(self) -> str:
+        """Return one line for the log."""
+        return self.reason
+
+
+@dataclass(frozen=True)
+class Skip:
+    """A window was offered while the learner was busy."""
+
+    computed_from: float
+    layer: Layer
+
+    def note(self) -> str:
+        """Return one line for the log."""
+        return f"{self.layer} learner still busy"
+
+
+Update = ResidualUpdate | PolicyUpdate | Rejection | Skip
+KINDS: dict[type, str] = {ResidualUpdate: "residual", PolicyUpdate: "policy", Rejection: "rejected", Skip: "skipped"}
+"""Name of each kind of update in messages and logs."""
+
+
+def pack_update(update: Update) -> bytes:
+    """Return the bytes of an update; the inverse of :func:`unpack_update`."""
+    plain = {f.name: getattr(update, f.name) for f in fields(update) if f.name != "state"}
+    return wire.pack(getattr(update, "state", ()), kind=KINDS[type(update)], about={"update": json.dumps(plain)})
+
+
+def unpack_update(data: bytes, like: LearnerState, *, source: str) -> Update:
+    """Read an update.
+
+    Args:
+        data: Bytes of a message.
+        like: A learner state of the structure, shapes and types that are expected.
+        source: Where the bytes come from, for messages of errors.
+
+    Returns:
+        The update.
+
+    Raises:
+        MessageError: The message is truncated, damaged, of another kind or shape, or not finite.
+    """
+    kind = wire.kind_of(data, source=source)
+    types = {name: cls for cls, name in KINDS.items()}
+    if kind not in types:
+        raise MessageError(f"{source}: holds a {kind!r}, expected one of {', '.join(types)}")
+    expected: Any = {"residual": like.residual, "policy": like.policy}.get(kind, ())
+    state = wire.unpack(data, expected, kind=kind, source=source)
+    try:
+        plain = json.loads(wire.describe(data, kind=kind, source=source)["update"])
+        update: Update = types[kind](**plain, **({"state": state} if kind in ("residual", "policy") else {}))
+    except (KeyError, TypeError, ValueError) as error:
+        raise MessageError(f"{source}: not the fields of a {kind!r} update ({error})") from error
+    return update

@@ -1,0 +1,80 @@
+"""Workers: what one learner does with one window, whichever clock or process it runs in.
+
+A worker's state advances only when its own update comes back to it as published, so that a result that is dropped on
+the way (a new flight, a lost message) never becomes the base of the next one.
+"""
+
+from typing import Protocol
+
+import equinox as eqx
+import jax
+from jax import random
+from jaxtyping import Array, Key
+
+from ..learn.bptt import PolicyState
+from ..learn.window import Window
+from .learner import LearnerState, OnlineLearner
+from .updates import Layer, PolicyUpdate, Rejection, ResidualUpdate, Update
+
+
+class Worker(Protocol):
+    """One layer of learning."""
+
+    layer: Layer
+
+    def learn(self, window: Window) -> Update:
+        """Learn from a window; blocks until the result is there."""
+        ...
+
+    def receive(self, update: Update) -> None:
+        """Take note of an update that was published, of this or another layer."""
+        ...
+
+
+class ResidualWorker:
+    """Fits the residual model, from where its last published fit ended."""
+
+    layer: Layer = "residual"
+
+    def __init__(self, learner: OnlineLearner, state: LearnerState) -> None:
+        self._learner, self._residual = learner, state.residual
+
+    def learn(self, window: Window) -> ResidualUpdate | Rejection:
+        """Fit to ``window``."""
+        fitted, report = jax.block_until_ready(self._learner.fit_residual(self._residual, window))
+        t = float(window.t[-1])
+        if not report.accepted:
+            return Rejection(t, self.layer, "the residual's fit is not finite, or no tick of the window can be used")
+        return ResidualUpdate(t, float(report.rms_error), fitted)
+
+    def receive(self, update: Update) -> None:
+        """Go on from a published fit."""
+        if isinstance(update, ResidualUpdate):
+            self._residual = update.state
+
+
+class PolicyWorker:
+    """Re-trains the policy in the nominal model plus the last published residual."""
+
+    layer: Layer = "policy"
+
+    def __init__(self, learner: OnlineLearner, state: LearnerState, key: Key[Array, ""]) -> None:
+        self._learner, self._key = learner, key
+        self._policy: PolicyState = state.policy
+        self._residual: eqx.Module = state.residual
+
+    def learn(self, window: Window) -> PolicyUpdate | Rejection:
+        """Re-train; the window gives starts for the gate."""
+        self._key, key = random.split(self._key)
+        trained, verdict = jax.block_until_ready(self._learner.update_policy(self._policy, self._residual, window, key))
+        t = float(window.t[-1])
+        if not verdict.admitted:
+            return Rejection(t, self.layer, verdict.reason())
+        return PolicyUpdate(t, float(verdict.candidate), float(verdict.incumbent), trained)
+
+    def receive(self, update: Update) -> None:
+        """Go on from a published policy, in the model of a published residual."""
+        if isinstance(update, PolicyUpdate):
+            self._policy = update.state
+        elif isinstance(update, ResidualUpdate):
+            self._residual = update.state

@@ -1,0 +1,79 @@
+"""Output of the commands: lines and progress, in a terminal and in a log file."""
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from ..experiments.reporter import Advance
+from ..experiments.tables.document import TableSection
+
+console = Console(highlight=False)
+LINE_EVERY = 10.0  # [s], where the output is no terminal
+
+
+class RichReporter:
+    """Progress bars in a terminal; elsewhere a line now and then."""
+
+    def say(self, text: str) -> None:
+        """Print plain text."""
+        console.print(text, markup=False, soft_wrap=True)
+
+    @contextmanager
+    def progress(self, title: str) -> Iterator[Advance]:
+        """Show the advance of one piece of work."""
+        if not console.is_terminal:
+            yield _lines(title)
+            return
+        columns = (
+            TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[note]}"),
+            TimeElapsedColumn(), TimeRemainingColumn(),
+        )  # fmt: skip
+        with Progress(*columns, console=console) as bars:
+            bar = bars.add_task(title, total=1.0, note="")
+            yield lambda share, note: bars.update(bar, completed=share, note=escape(note))
+
+
+def _lines(title: str) -> Advance:
+    """Print a line at the start, at the end, and every ten seconds."""
+    began, last = time.monotonic(), [float("-inf")]
+
+    def advance(share: float, note: str) -> None:
+        now = time.monotonic()
+        if now - last[0] >= LINE_EVERY or share >= 1.0:
+            last[0] = now
+            console.print(f"{title}: {100 * share:.0f} %, {note}, {now - began:.0f} s", markup=False, soft_wrap=True)
+
+    return advance
+
+
+def refuse(message: str) -> int:
+    """Print one clear line and return the exit code of a refusal."""
+    line = " ".join(message.split())
+    console.print(f"[bold red]retrim:[/] {escape(line)}", soft_wrap=True)
+    return 1
+
+
+def show_table(section: TableSection) -> None:
+    """Print a table."""
+    table = Table(title=escape(section.title) or None, title_style="bold")
+    for column in section.columns:
+        table.add_column(escape(column))
+    for row in section.rows:
+        table.add_row(*(_styled(text) for text in row))
+    console.print(table)
+
+
+def show_paths(paths: Sequence[object]) -> None:
+    """Print the paths of files that were written."""
+    for path in paths:
+        console.print(f"[bold]{escape(str(path))}[/]", soft_wrap=True)
+
+
+def _styled(text: str) -> str:
+    """Markdown's bold as the terminal's."""
+    return f"[bold]{escape(text.replace('**', ''))}[/]" if text.startswith("**") else escape(text)

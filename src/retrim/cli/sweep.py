@@ -1,0 +1,33 @@
+"""``retrim sweep``."""
+
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import tyro
+
+from ..experiments.run import Run
+from ..experiments.sweep import read_sweep, run_sweep
+from .console import RichReporter, show_paths
+
+
+def sweep(file: tyro.conf.Positional[Path], out: Path | None = None) -> Callable[[threading.Event], int]:
+    """Fly every combination of a sweep file: presets x scenarios x methods x seeds.
+
+    The folder holds the policies and every flight's row while the sweep runs: the same command with the same --out
+    goes on after an interruption or a kill.
+
+    Args:
+        file: TOML file with any of: presets, seeds, methods, disturbances, plants, vehicles, sensors, references,
+            starts, seconds, and a table [overlay] with values on top of the presets.
+        out: Folder for sweep.md, sweep.json and sweep.png; by default runs/ and the file's name.
+    """
+
+    def ordered(stop: threading.Event) -> int:
+        content = read_sweep(file)
+        run = Run("sweep", out or Path("runs") / f"sweep-{file.stem}", stop=stop)
+        run_sweep(content, run, RichReporter())
+        show_paths([path for path in (run.folder / "sweep.md", run.folder / "sweep.png") if path.is_file()])
+        return run.exit_code
+
+    return ordered

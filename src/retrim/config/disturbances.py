@@ -1,0 +1,100 @@
+"""Disturbances by name, with a size if wanted: ``wind=6+payload=0.1``."""
+
+from collections.abc import Callable
+
+import jax.numpy as jnp
+from jax import random
+from jaxtyping import Array, Key
+
+from ..errors import ConfigError
+from ..physics.disturbance import Constant, Disturbance, RandomWalk, Reversing, Together
+from ..physics.faults import BatterySag, Payload, WeakRotor
+from ..physics.wind import Dryden, Fan, SteadyWind
+from .registry import Registry
+
+DisturbanceFactory = Callable[[Key[Array, ""], float | None], Disturbance]
+"""From a key, for what is random, and a size (None for the default) to a disturbance."""
+
+SEED_TAG = 2**30 + 3  # folded into a seed: disturbances share no key with starts, learners and sensors
+
+DISTURBANCES: Registry[DisturbanceFactory] = Registry("disturbance", example="sums as wind+payload=0.1, or module:name")
+register_disturbance = DISTURBANCES.register
+
+
+def disturbance(names: str, seed: int = 0) -> Disturbance:
+    """Return a disturbance by name.
+
+    Args:
+        names: As ``wind``, ``wind=6`` (with a size), or a sum ``wind=6+payload``.
+        seed: What is random about the disturbance follows from it.
+
+    Raises:
+        ConfigError: There is no such disturbance, or it has no such size.
+    """
+    parts = list[Disturbance]()
+    for i, part in enumerate(names.split("+")):
+        name, equals, text = part.partition("=")
+        size = None
+        if equals:
+            try:
+                size = float(text)
+            except ValueError as error:
+                raise ConfigError(f"disturbance {part!r}: {text!r} is not a number") from error
+        factory = DISTURBANCES.find(name)
+        key = random.fold_in(random.fold_in(random.key(seed), SEED_TAG), i)
+        try:
+            parts.append(factory(key, size))
+        except (TypeError, ValueError) as error:
+            raise error if isinstance(error, ConfigError) else ConfigError(f"disturbance {part!r}: {error}") from error
+    return parts[0] if len(parts) == 1 else Together(tuple(parts))
+
+
+def _bounded(size: float | None, default: float, low: float, high: float, unit: str) -> float:
+    value = default if size is None else size
+    if not low <= value <= high:
+        raise ConfigError(f"a size of {value:g} {unit} must be between {low:g} and {high:g}")
+    return value
+
+
+def _push(level: float | None) -> DisturbanceFactory:
+    def make(key: Key[Array, ""], size: float | None) -> Disturbance:
+        if level is not None and size is not None:
+            raise ConfigError("this level is fixed; use push=SIZE [m/s^2 per axis]")
+        return Constant(jnp.full(3, level if level is not None else _bounded(size, 1.0, -10.0, 10.0, "m/s^2")))
+
+    return make
+
+
+def _diagonal(speed: float) -> Array:
+    wind: Array = jnp.array([speed / 2.0**0.5, speed / 2.0**0.5, 0.0])
+    return wind
+
+
+def _fan(key: Key[Array, ""], size: float | None) -> Disturbance:
+    # The outlet is 1.5 m from the goal (0, 0, 1), diagonally; by default 4 m/s reach the goal.
+    outlet, direction = jnp.array([-1.06, -1.06, 1.0]), jnp.array([1.0, 1.0, 0.0])
+    return Fan.of(outlet, direction, speed=_bounded(size, 6.0, 0.0, 20.0, "m/s"), width=0.3, key=key)
+
+
+_BUILT_IN: dict[str, DisturbanceFactory] = {
+    "none": _push(0.0),
+    "small": _push(0.5),  # the paper's levels, m/s^2 per axis (Sec. IV-B)
+    "large": _push(2.0),
+    "push": _push(None),
+    "reversing": lambda key, size: Reversing(  # Sec. IV-B.3
+        jnp.full(3, _bounded(size, 0.5, -10.0, 10.0, "m/s^2")), jnp.array(15.0)
+    ),
+    # The bounds are the paper's for training DATT, +-1 m/s^2.
+    "walk": lambda key, size: RandomWalk.of(_bounded(size, 0.5, 0.0, 10.0, "m/s^2"), 1.0, key=key),
+    "wind": lambda key, size: SteadyWind(_diagonal(_bounded(size, 4.0, 0.0, 20.0, "m/s"))),
+    "gusts": lambda key, size: Dryden.of(_diagonal(_bounded(size, 4.0, 0.5, 20.0, "m/s")), key=key),
+    "fan": _fan,
+    "payload": lambda key, size: Payload.of(_bounded(size, 0.07, 0.0, 20.0, "kg")),  # the paper's: 190 g become 260 g
+    "pickup": lambda key, size: Payload.of(_bounded(size, 0.07, 0.0, 20.0, "kg"), picked=8.0, dropped=20.0),
+    "battery": lambda key, size: BatterySag(  # thrust lost per second, as a share
+        jnp.array(_bounded(size, 0.002, 0.0, 0.1, "1/s")), jnp.array(0.8)
+    ),
+    "weak-rotor": lambda key, size: WeakRotor.of(0, _bounded(size, 0.9, 0.3, 1.0, "of its thrust")),
+}
+for _name, _factory in _BUILT_IN.items():
+    DISTURBANCES.register(_name, _factory)

@@ -1,0 +1,82 @@
+"""Names: one registry for each kind of thing that an experiment is made of.
+
+A name is looked up among what was registered, then among the entry points of installed packages; ``module:name`` is
+imported from the Python path or the current folder.
+"""
+
+import importlib
+import sys
+from collections.abc import Iterator, Mapping
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Generic, TypeVar
+
+from ..errors import ConfigError
+from .loading import suggestion
+
+T = TypeVar("T")
+
+
+class Registry(Mapping[str, T], Generic[T]):
+    """Things of one kind by name."""
+
+    def __init__(self, kind: str, *, example: str) -> None:
+        """Start an empty registry.
+
+        Args:
+            kind: What it holds, in the singular; entry points of the group ``retrim.<kind>s`` belong to it.
+            example: How a thing of one's own is named, for messages of errors.
+        """
+        self._kind, self._example, self._known = kind, example, dict[str, T]()
+
+    def register(self, name: str, thing: T) -> T:
+        """Add a thing under a new name.
+
+        Raises:
+            ConfigError: The name is taken, or cannot be a name.
+        """
+        if not name or any(sign in name for sign in ":+= \t\n"):
+            raise ConfigError(f"{self._kind} name {name!r} must not be empty nor contain ':', '+', '=' or spaces")
+        if name in self._known:
+            raise ConfigError(f"there is a {self._kind} {name!r} already")
+        self._known[name] = thing
+        return thing
+
+    def find(self, name: str) -> T:
+        """Return the thing of that name.
+
+        Raises:
+            ConfigError: There is none, with the nearest names; or ``module:name`` cannot be imported.
+        """
+        if name in self._known:
+            return self._known[name]
+        if ":" in name:
+            return self._imported(name)
+        for entry in entry_points(group=f"retrim.{self._kind}s"):
+            if entry.name == name:
+                found: T = entry.load()
+                return found
+        raise ConfigError(f"no {self._kind} {name!r}; {suggestion(name, self)}, or {self._example}")
+
+    def _imported(self, name: str) -> T:
+        module, _, attribute = name.partition(":")
+        here = str(Path.cwd())
+        if here not in sys.path:
+            sys.path.append(here)
+        try:
+            found: T = getattr(importlib.import_module(module), attribute)
+        except Exception as error:  # whatever the module of a user raises
+            raise ConfigError(f"{self._kind} {name!r} cannot be imported: {type(error).__name__}: {error}") from error
+        return found
+
+    def __getitem__(self, name: str) -> T:
+        """Return what was registered under ``name``."""
+        return self._known[name]
+
+    def __iter__(self) -> Iterator[str]:
+        """Iterate over the registered names."""
+        return iter(self._known)
+
+    def __len__(self) -> int:
+        """Return the number of registered names."""
+        return len(self._known)

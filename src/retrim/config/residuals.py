@@ -1,0 +1,53 @@
+"""Residual models by name."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+
+from ..errors import ConfigError
+from ..learn.residuals.ensemble import EnsembleModel
+from ..learn.residuals.model import ResidualModel
+from ..physics.vehicle import Vehicle
+from .presets import Preset
+from .registry import Registry
+
+
+@dataclass(frozen=True)
+class ResidualRequest:
+    """What a preset asks of a residual model."""
+
+    preset: Preset
+    vehicle: Vehicle
+
+
+RESIDUALS: Registry[Callable[[ResidualRequest], ResidualModel]] = Registry("residual", example="module:name")
+register_residual = RESIDUALS.register
+
+
+def make_residual(request: ResidualRequest) -> ResidualModel:
+    """Build the preset's residual model.
+
+    Raises:
+        ConfigError: There is none of that name, or it is no residual model.
+    """
+    name = request.preset.adapt.residual
+    found = RESIDUALS.find(name)
+    model = found if isinstance(found, ResidualModel) and not isinstance(found, type) else found(request)
+    if not isinstance(model, ResidualModel):
+        raise ConfigError(f"residual {name!r} gives a {type(model).__name__} without init, fit, predict and spread")
+    return model
+
+
+def _ensemble(request: ResidualRequest) -> ResidualModel:
+    a = request.preset.adapt
+    return EnsembleModel(
+        jnp.array(request.preset.goal),
+        request.vehicle.omega_max,
+        jnp.array(a.fit_learning_rate),
+        jnp.array(a.spectral_weight),
+        steps=a.fit_steps,
+    )
+
+
+register_residual("ensemble", _ensemble)

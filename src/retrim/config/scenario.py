@@ -1,0 +1,82 @@
+"""Where a flight takes place."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from ..errors import ConfigError
+from ..plants.plant import Plant
+from .disturbances import disturbance
+from .plants import PLANTS, PlantEntry, PlantRequest
+from .sensors import SENSORS
+from .vehicle_file import VehicleSpec
+from .vehicles import make_vehicle, name_of, vehicle_from
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """Plant, vehicle, sensors and disturbance of a flight, by name; checked when it is made."""
+
+    disturbance: str = "none"
+    """A name, a name with a size, or a sum, as ``wind=6+payload``."""
+    plant: str = "bem"
+    vehicle: str | VehicleSpec | None = None
+    """None: that which the policy was trained for, or the plant's own."""
+    sensors: str = "ideal"
+    thrust_error: float = 0.035
+    """By how much more than commanded the rotors give, as a share; bem and simple only."""
+    reference: str | None = None
+    """What a tracking policy follows; None: what it was trained on."""
+
+    def __post_init__(self) -> None:
+        """Raise :class:`ConfigError` for an unknown name, and for a choice that the plant does not have."""
+        entry = self.entry
+        SENSORS.find(self.sensors)
+        disturbance(self.disturbance)
+        if self.vehicle is not None:
+            if entry.own_vehicle is not None:
+                raise ConfigError(
+                    f"plant {self.plant!r} flies its own vehicle, {entry.own_vehicle}, not {name_of(self.vehicle)}"
+                )
+            object.__setattr__(self, "vehicle", vehicle_from(self.vehicle))
+        if self.sensors != "ideal" and not entry.has_sensors:
+            raise ConfigError(
+                f"plant {self.plant!r} measures its true state; sensors {self.sensors!r} need bem or simple"
+            )
+        if not -0.5 <= self.thrust_error <= 0.5:
+            raise ConfigError(f"thrust error {self.thrust_error} must be between -0.5 and 0.5")
+
+    @property
+    def entry(self) -> PlantEntry:
+        """The plant's entry in the registry."""
+        entry: Any = PLANTS.find(self.plant)
+        if isinstance(entry, PlantEntry):
+            return entry
+        if not callable(entry):
+            raise ConfigError(f"plant {self.plant!r} is a {type(entry).__name__}, not a function of a PlantRequest")
+        return PlantEntry(entry, about=(entry.__doc__ or self.plant).strip().splitlines()[0], has_sensors=True)
+
+    def vehicle_name(self, trained_for: str | VehicleSpec) -> str:
+        """Return the name of the vehicle that flies a policy trained for ``trained_for``."""
+        return self.entry.own_vehicle or name_of(self.vehicle or trained_for)
+
+    def make(self, trained_for: str | VehicleSpec = "small", *, dt: float = 0.02, seed: int = 0) -> Plant:
+        """Build the plant.
+
+        Args:
+            trained_for: Vehicle of the policy; it flies unless the scenario has another.
+            dt: Control period [s].
+            seed: Disturbance and sensors follow from it.
+
+        Raises:
+            PlantError: A package that the plant needs is not installed.
+        """
+        entry = self.entry
+        request = PlantRequest(
+            make_vehicle(self.vehicle or ("small" if entry.own_vehicle else trained_for)),
+            disturbance(self.disturbance, seed),
+            SENSORS.find(self.sensors)(),
+            self.thrust_error,
+            dt,
+            seed,
+        )
+        return entry.make(request)

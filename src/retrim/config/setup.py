@@ -1,0 +1,235 @@
+"""From a preset's numbers to objects, built once."""
+
+import functools
+import math
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax import random
+from jaxtyping import Array, Float, Key
+
+from ..adapt.learner import LearnerState, OnlineLearner
+from ..adapt.workers import PolicyWorker, ResidualWorker
+from ..control.controller import PolicyController
+from ..control.lora import LoraPolicy
+from ..control.policy import Policy
+from ..errors import ConfigError
+from ..learn.encoder import pretrain_encoder
+from ..learn.env import Env
+from ..learn.pretrain import pretrain
+from ..physics.actuators import Lagged
+from ..physics.dynamics import AbstractDynamics, PointMass
+from ..physics.state import State
+from ..physics.vehicle import Vehicle
+from ..runtime.adaptive import AdaptivePilot, Scheduled
+from ..runtime.lockstep import LockstepLearner
+from ..runtime.pilot import ControllerPilot, Pilot
+from ..tasks.hover import TILT, Hover
+from ..tasks.keypoints import Keypoints
+from ..tasks.reference import Reference
+from ..tasks.task import AbstractTask
+from .loading import parse
+from .presets import Preset
+from .residuals import ResidualRequest, make_residual
+from .tasks import TaskRequest, find_task, make_reference
+from .vehicles import make_vehicle
+
+Method = Literal["base", "full", "lora"]
+"""How a policy flies: as it is, re-training all weights, or a low-rank delta."""
+Latency = Literal["fixed", "measured"]
+"""What learning costs in flight time: the preset's fixed figures, or the time that the clock shows."""
+
+START_TAG = 2**30 + 1  # folded into a seed for the starts of flights: they share no key with training
+LOW_RANK_TAG = 2**30 + 4  # folded into a learner's key for the delta that it starts from
+
+
+@dataclass(frozen=True)
+class Setup:
+    """Everything that a preset describes, as objects. Make it with :meth:`of`."""
+
+    preset: Preset
+    vehicle: Vehicle
+    """Vehicle of training."""
+    env: Env
+    """Environment of training: nominal model, task, delay."""
+    flown: AbstractTask
+    """Task of flight: that of training, but for another reference."""
+    learner: OnlineLearner
+    """The learner beside the flight; it re-trains on ``flown``."""
+    optimiser: optax.GradientTransformation
+    """Of pretraining: Adam under a cosine, behind a clip."""
+
+    @classmethod
+    def of(cls, preset: Preset, reference: str | Reference | None = None) -> "Setup":
+        """Build a set-up.
+
+        Args:
+            preset: The numbers.
+            reference: What a tracking flight follows, by name or as an object; None for what training follows.
+
+        Raises:
+            ConfigError: A name does not exist, the task tracks no reference, or values do not fit together.
+        """
+        entry = find_task(preset.task)
+        if reference is not None and not entry.has_reference:
+            raise ConfigError(f"reference {reference!r}: a {preset.task} policy follows none")
+        vehicle = make_vehicle(preset.vehicle)
+        trained_on = (
+            make_reference(preset.track.reference if preset.track else "circle") if entry.has_reference else None
+        )
+        try:
+            task = entry.make(TaskRequest(preset, vehicle, trained_on))
+            flown = task
+            if reference is not None:
+                followed = make_reference(reference) if isinstance(reference, str) else reference
+                flown = entry.make(TaskRequest(preset, vehicle, followed))
+            nominal: AbstractDynamics[Any] = PointMass(preset.dt)
+            if preset.actuator_tau is not None:
+                nominal = Lagged(nominal, jnp.array(preset.actuator_tau))
+            env = Env(nominal, task, preset.delay_ticks)
+            learner = _learner(preset, vehicle, Env(nominal, flown, preset.delay_ticks))
+        except (TypeError, ValueError) as error:
+            raise (
+                error if isinstance(error, ConfigError) else ConfigError(f"preset {preset.name!r}: {error}")
+            ) from error
+        p = preset.pretrain
+        cosine = optax.cosine_decay_schedule(p.learning_rate, p.num_updates)
+        clip = optax.clip_by_global_norm(p.max_grad_norm or math.inf)
+        return cls(preset, vehicle, env, flown, learner, optax.chain(clip, optax.adam(cosine, b2=p.adam_b2)))
+
+    def new_policy(self, key: Key[Array, ""]) -> Policy:
+        """Return an untrained policy; the key is consumed."""
+        size, hidden = self.env.task.observation.size, self.preset.pretrain.hidden_sizes
+        fresh: Policy = jax.jit(lambda key: Policy.of(size, self.vehicle, key=key, hidden=hidden))(key)
+        return fresh
+
+    def pretraining(self, seed: int = 0) -> Iterator[tuple[Policy, Float[Array, " updates"]]]:
+        """Train a policy from scratch.
+
+        Args:
+            seed: Seed of the weights and of the starts.
+
+        Yields:
+            The policy after every few steps, and the losses of those steps. A preset with encoder steps trains the
+            encoder before the first value.
+        """
+        k_init, k_train = random.split(random.key(seed))
+        fresh, p = self.new_policy(k_init), self.preset.pretrain
+        vision, observation = self.preset.vision, self.env.task.observation
+        if vision is not None and vision.encoder_steps and isinstance(observation, Keypoints):
+            fresh, _ = pretrain_encoder(fresh, observation, random.split(k_init)[1], steps=vision.encoder_steps)
+        chunks = pretrain(
+            fresh,
+            self.env,
+            k_train,
+            optimiser=self.optimiser,
+            num_updates=p.num_updates,
+            num_envs=p.num_envs,
+            chunk=math.gcd(p.num_updates, 10),
+        )
+        return ((state.policy.merged(), losses) for state, losses in chunks)
+
+    def pretrained(self, seed: int = 0) -> Policy:
+        """Return a policy trained from scratch, without a word; :meth:`pretraining` shows progress."""
+        ((last, _),) = deque(self.pretraining(seed), maxlen=1)
+        return last
+
+    def pilot(
+        self,
+        policy: Policy | LoraPolicy,
+        method: Method = "base",
+        key: Key[Array, ""] | None = None,
+        *,
+        latency: Latency = "fixed",
+        state: LearnerState | None = None,
+    ) -> Pilot:
+        """Return a pilot for ``policy``.
+
+        Args:
+            policy: A policy of this preset.
+            method: ``base`` flies it as it is; ``full`` and ``lora`` re-train it in flight.
+            key: Seed of the learners; consumed. Only ``base`` needs none.
+            latency: What learning costs in flight time.
+            state: What an earlier flight learnt, to go on from.
+
+        Raises:
+            ValueError: The method needs a key.
+        """
+        if method == "base":
+            return ControllerPilot(PolicyController(self.flown.observation_in_flight, policy.merged()))
+        if key is None:
+            raise ValueError(f"Setup.pilot: method {method!r} needs a key")
+        return self.adaptive_pilot(self.low_rank(policy, key) if method == "lora" else policy, key, latency, state)
+
+    def low_rank(self, policy: Policy | LoraPolicy, key: Key[Array, ""]) -> LoraPolicy:
+        """Return ``policy`` with a fresh low-rank delta (ranks 4, 10, 1 and scale 4, as in the paper)."""
+        if isinstance(policy, LoraPolicy):
+            return policy
+        fresh: LoraPolicy = _low_rank(policy, random.fold_in(key, LOW_RANK_TAG))
+        return fresh
+
+    def adaptive_pilot(
+        self,
+        policy: Policy | LoraPolicy,
+        key: Key[Array, ""],
+        latency: Latency = "fixed",
+        state: LearnerState | None = None,
+    ) -> AdaptivePilot:
+        """Return a pilot that flies ``policy`` and re-trains it; the key is consumed. See :meth:`pilot`."""
+        k_residual, k_learn = random.split(key)
+        state = state or self.learner.init(policy, k_residual)
+        a, dt, fixed = self.preset.adapt, self.preset.dt, latency == "fixed"
+        fit = LockstepLearner(ResidualWorker(self.learner, state), a.fit_latency if fixed else None, dt)
+        update = LockstepLearner(PolicyWorker(self.learner, state, k_learn), a.update_latency if fixed else None, dt)
+        return AdaptivePilot(
+            self.flown.observation_in_flight,
+            state,
+            (Scheduled(fit, a.fit_every), Scheduled(update, a.update_every)),
+            dt=dt,
+            window=a.window,
+        )
+
+    def flight_starts(self, n: int, seed: int = 0) -> list[State]:
+        """Return ``n`` starts: +- 1 m per axis from the task's home, 18 degrees about each axis, 0.1 m/s.
+
+        They follow from the seed and the home alone, so that all presets of a task fly from the same ones.
+        """
+        nearby = Hover(self.flown.home(), self.flown.observation, jnp.array(1.0), jnp.array(TILT))
+        key = random.fold_in(random.key(seed), START_TAG)
+        batch = jax.jit(lambda key: jax.vmap(nearby.reset)(random.split(key, n)).x)(key)
+        return [jax.tree.map(lambda leaf, i=i: jnp.asarray(np.asarray(leaf)[i]), batch) for i in range(n)]
+
+    def limits_exceeded(self) -> str | None:
+        """Return what the vehicle of training cannot fly of the flown reference; None if it can fly all of it."""
+        followed = getattr(self.flown, "reference", None)
+        return followed.infeasibility(self.vehicle) if isinstance(followed, Reference) else None
+
+
+@functools.lru_cache(maxsize=16)
+def setup_for(preset: str, reference: str | None = None) -> Setup:
+    """Return the set-up of a preset given as JSON, built once per process, for executors."""
+    return Setup.of(parse(preset, source="preset"), reference)
+
+
+@jax.jit
+def _low_rank(policy: Policy, key: Key[Array, ""]) -> LoraPolicy:
+    return LoraPolicy.of(policy, key=key)
+
+
+def _learner(preset: Preset, vehicle: Vehicle, env: Env) -> OnlineLearner:
+    a = preset.adapt
+    return OnlineLearner(
+        env,
+        make_residual(ResidualRequest(preset, vehicle)),
+        policy_rate=jnp.array(a.learning_rate),
+        max_grad_norm=jnp.array(a.max_grad_norm or math.inf),
+        plant_delay_ticks=preset.plant_delay_ticks,
+        num_updates=a.num_updates,
+        num_envs=a.num_envs,
+    )

@@ -1,0 +1,159 @@
+"""Tasks and references by name."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+
+from ..errors import ConfigError
+from ..physics.vehicle import Vehicle
+from ..tasks.hover import Hover, L2Hover
+from ..tasks.keypoints import Keypoints
+from ..tasks.observation import AbstractObservation, StateObs
+from ..tasks.preview import Preview
+from ..tasks.reference import REFERENCES as BUILT_IN
+from ..tasks.reference import Reference, from_csv, joined
+from ..tasks.task import AbstractTask
+from ..tasks.track import L2Track
+from ..tasks.track import Track as PaperTrack
+from .presets import Preset
+from .presets import Track as TrackTable
+from .presets import Vision as VisionTable
+from .registry import Registry
+
+REFERENCES: Registry[Callable[[], Reference]] = Registry(
+    "reference", example="a CSV file of t, x, y, z, or module:name"
+)
+for _name, _make in BUILT_IN.items():
+    REFERENCES.register(_name, _make)
+register_reference = REFERENCES.register
+
+
+@dataclass(frozen=True)
+class TaskRequest:
+    """What a preset asks of a task."""
+
+    preset: Preset
+    vehicle: Vehicle
+    reference: Reference | None = None
+    """What is tracked; None for a task that tracks nothing."""
+
+    @property
+    def options(self) -> Mapping[str, Any]:
+        """The preset's free table, for a task of one's own."""
+        return self.preset.options
+
+    def state_observation(self) -> StateObs:
+        """Return the paper's observation, o = [p, R, v], with the preset's past commands."""
+        return StateObs(jnp.array(self.preset.goal), self.vehicle.omega_max, self.preset.command_history)
+
+
+@dataclass(frozen=True)
+class TaskEntry:
+    """A kind of task."""
+
+    make: Callable[[TaskRequest], AbstractTask]
+    default_preset: str = "hover/fast"
+    """Preset that is trained unless another is asked for."""
+    has_reference: bool = False
+    """Whether it tracks a reference."""
+
+
+TASKS: Registry[TaskEntry] = Registry("task", example="module:name of a TaskEntry")
+register_task = TASKS.register
+
+
+def find_task(name: str) -> TaskEntry:
+    """Return the entry of a task by name; ``module:name`` may be a function of a :class:`TaskRequest`.
+
+    Raises:
+        ConfigError: There is no such task, or ``module:name`` is no entry.
+    """
+    entry: Any = TASKS.find(name)
+    if isinstance(entry, TaskEntry):
+        return entry
+    if not callable(entry):
+        raise ConfigError(f"task {name!r} is a {type(entry).__name__}, not a function of a TaskRequest")
+    return TaskEntry(entry)
+
+
+def make_reference(names: str) -> Reference:
+    """Return a reference by name or CSV file; several, joined by +, become a family.
+
+    Raises:
+        ConfigError: There is no such reference, or its file cannot be used.
+    """
+    found = [_one_reference(name) for name in names.split("+")]
+    return found[0] if len(found) == 1 else joined(found)
+
+
+def _one_reference(name: str) -> Reference:
+    try:
+        return from_csv(Path(name)) if name.lower().endswith(".csv") else REFERENCES.find(name)()
+    except OSError as error:
+        raise ConfigError(f"{name}: {error.strerror or error}") from error
+    except ValueError as error:
+        raise error if isinstance(error, ConfigError) else ConfigError(str(error)) from error
+
+
+def _hover(request: TaskRequest) -> AbstractTask:
+    p = request.preset
+    kind = L2Hover if p.reward == "l2" else Hover
+    return kind(
+        jnp.array(p.goal),
+        request.state_observation(),
+        jnp.array(p.termination_box),
+        jnp.array(p.pretrain.max_start_yaw),
+        p.dt,
+        p.pretrain.horizon,
+    )
+
+
+def _vision(request: TaskRequest) -> AbstractTask:
+    p, table = request.preset, request.preset.vision or VisionTable()
+    training = Keypoints.of(
+        jnp.array(p.goal),
+        request.vehicle.omega_max,
+        occlusion=False,
+        noise=table.pixel_noise,
+        whitened=table.whiten_pixels,
+        dt=p.dt,
+        delay_ticks=p.plant_delay_ticks,
+    )
+    # Occluded points are predicted by a pose filter so well that training need not know of it.
+    flown = training.occluded(table.dropout) if table.occlusion else None
+    kind = L2Hover if p.reward == "l2" else Hover
+    return kind(
+        jnp.array(p.goal),
+        training,
+        jnp.array(p.termination_box),
+        jnp.array(p.pretrain.max_start_yaw),
+        p.dt,
+        p.pretrain.horizon,
+        flown,
+    )
+
+
+def _track(request: TaskRequest) -> AbstractTask:
+    p, table = request.preset, request.preset.track or TrackTable()
+    if request.reference is None:
+        raise ConfigError("task 'track' needs a reference")
+    observation: AbstractObservation[Any] = request.state_observation()
+    if table.observation == "preview":
+        observation = Preview(request.reference, request.vehicle.omega_max, p.command_history)
+    kind = L2Track if p.reward == "l2" else PaperTrack
+    return kind(
+        request.reference,
+        observation,
+        jnp.array(table.start_spread),
+        jnp.array(p.termination_box),
+        p.dt,
+        p.pretrain.horizon,
+    )
+
+
+register_task("hover", TaskEntry(_hover, "hover/fast"))
+register_task("vision", TaskEntry(_vision, "vision/ideal"))
+register_task("track", TaskEntry(_track, "track/preview", has_reference=True))

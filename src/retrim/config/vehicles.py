@@ -1,0 +1,56 @@
+"""Vehicles by name or file."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from ..errors import ConfigError
+from ..physics.vehicle import Vehicle, kingfisher, large, small
+from .registry import Registry
+from .vehicle_file import VehicleSpec, read_vehicle
+
+VEHICLES: Registry[Callable[[], Vehicle]] = Registry(
+    "vehicle", example="a vehicle file, as my_quad.toml, or module:name"
+)
+for _name, _make in (("small", small), ("large", large), ("kingfisher", kingfisher)):
+    VEHICLES.register(_name, _make)
+
+register_vehicle = VEHICLES.register
+
+
+def vehicle_from(name: str | VehicleSpec) -> str | VehicleSpec:
+    """Return what a preset or scenario keeps of a vehicle: a name that exists, or the content of its file.
+
+    Raises:
+        ConfigError: There is no such vehicle, or its file cannot be used.
+    """
+    if isinstance(name, VehicleSpec):
+        return name
+    if name.endswith(".toml"):
+        return read_vehicle(Path(name))
+    VEHICLES.find(name)
+    return name
+
+
+def make_vehicle(vehicle: str | VehicleSpec) -> Vehicle:
+    """Build a vehicle.
+
+    Raises:
+        ConfigError: There is no such vehicle, or it cannot exist.
+    """
+    try:
+        found = vehicle_from(vehicle)
+        made = found.build() if isinstance(found, VehicleSpec) else VEHICLES.find(found)()
+    except (ValueError, TypeError) as error:
+        raise (
+            error if isinstance(error, ConfigError) else ConfigError(f"vehicle {name_of(vehicle)}: {error}")
+        ) from error
+    if not isinstance(made, Vehicle):
+        raise ConfigError(
+            f"vehicle {name_of(vehicle)!r} is a {type(made).__name__}, not a function that gives a Vehicle"
+        )
+    return made
+
+
+def name_of(vehicle: str | VehicleSpec) -> str:
+    """Return the vehicle's name, for results."""
+    return vehicle.name if isinstance(vehicle, VehicleSpec) else vehicle

@@ -1,0 +1,21 @@
+"""Every error that retrim raises on purpose, under one root."""
+
+
+class RetrimError(Exception):
+    """Root of all errors of this package. The message names what was wrong and what would be right."""
+
+
+class ConfigError(RetrimError, ValueError):
+    """A preset, scenario, vehicle, task or reference that does not exist or cannot be used."""
+
+
+class PlantError(RetrimError, RuntimeError):
+    """A plant refused what it was asked for, or it is gone."""
+
+
+class MessageError(RetrimError, ValueError):
+    """Bytes that must not be used: truncated, damaged, of another kind, or with values that are not finite."""
+
+
+class CheckpointError(RetrimError, ValueError):
+    """A file with a policy or with what was learnt that must not be flown."""

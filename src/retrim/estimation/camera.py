@@ -1,0 +1,73 @@
+"""A wide-angle camera that looks straight down: the double-sphere model (Usenko et al. 2018), and its inverse."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from ..physics.state import State
+
+DOWN = ((0.0, -1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
+"""Body to camera: the camera's z looks along body -z; camera x is body -y, camera y is body -x."""
+D_MIN = 0.05  # of the denominator of the projection, far off axis and behind
+
+
+class Projection(NamedTuple):
+    """A point in the image."""
+
+    pixel: Float[Array, "2"]
+    """Normalised: the image is [-1, 1] x [-1, 1]."""
+    visible: Bool[Array, ""]
+    """In front of the camera, where the model holds, and inside the image."""
+
+
+class Camera(eqx.Module):
+    """Intrinsics."""
+
+    xi: Float[Array, ""]
+    alpha: Float[Array, ""]
+    focal: Float[Array, "2"]
+    """[px]"""
+    centre: Float[Array, "2"]
+    """[px]"""
+    size: Float[Array, "2"]
+    """[px]"""
+
+    @classmethod
+    def published(cls) -> "Camera":
+        """The one that the paper's authors describe: 1280 x 720, about 120 degrees across."""
+        return cls(
+            xi=jnp.array(-0.007441148905788614),
+            alpha=jnp.array(0.6138265280850498),
+            focal=jnp.array([599.87676296874, 449.2911037186814]),
+            centre=jnp.array([632.1317557077697, 388.2472267118482]),
+            size=jnp.array([1280.0, 720.0]),
+        )
+
+    def project(self, P: Float[Array, "3"]) -> Projection:
+        """Where a point in camera coordinates [m] appears. Finite, with a finite gradient, wherever it is."""
+        d1 = jnp.sqrt(jnp.sum(P**2) + 1e-12)
+        z1 = self.xi * d1 + P[2]
+        d2 = jnp.sqrt(P[0] ** 2 + P[1] ** 2 + z1**2 + 1e-12)
+        D = self.alpha * d2 + (1.0 - self.alpha) * z1
+        pixel = 2.0 * (self.focal * P[:2] / jnp.maximum(D, D_MIN * d1) + self.centre) / self.size - 1.0
+        w1 = jnp.where(self.alpha <= 0.5, self.alpha / (1.0 - self.alpha), (1.0 - self.alpha) / self.alpha)
+        w2 = (w1 + self.xi) / jnp.sqrt(2.0 * w1 * self.xi + self.xi**2 + 1.0)
+        holds = (P[2] > -w2 * d1) & (P[2] > 0.0) & (D_MIN * d1 < D)
+        return Projection(pixel, holds & jnp.all(jnp.abs(pixel) <= 1.0))
+
+    def bearing(self, pixel: Float[Array, "2"]) -> Float[Array, "3"]:
+        """The direction that appears at ``pixel`` (normalised), of length one in camera coordinates."""
+        m = ((pixel + 1.0) * self.size / 2.0 - self.centre) / self.focal
+        r2 = jnp.sum(m**2)
+        inside = jnp.maximum(1.0 - (2.0 * self.alpha - 1.0) * r2, 1e-6)
+        mz = (1.0 - self.alpha**2 * r2) / (self.alpha * jnp.sqrt(inside) + 1.0 - self.alpha)
+        stretch = (mz * self.xi + jnp.sqrt(mz**2 + (1.0 - self.xi**2) * r2)) / (mz**2 + r2)
+        return stretch * jnp.append(m, mz) - jnp.array([0.0, 0.0, 1.0], dtype=m.dtype) * self.xi
+
+
+def in_camera(x: State, points: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+    """World points [m] in the coordinates of a camera at the body's origin."""
+    down = jnp.array(DOWN, dtype=x.p.dtype)
+    return (points - x.p[None]) @ x.R @ down.T

@@ -1,0 +1,12 @@
+"""Experiments as a library: training, fleets of flights, sweeps, tables, pictures. Nothing here prints."""
+
+from .compile_cache import enable_compile_cache as enable_compile_cache
+from .fleet import Fleet as Fleet
+from .fleet import Flights as Flights
+from .flights import Flight as Flight
+from .flights import FlightSpec as FlightSpec
+from .flights import fly_one as fly_one
+from .metrics import rows as rows
+from .run import Run as Run
+from .training import nominal_error as nominal_error
+from .training import train as train

@@ -1,0 +1,1 @@
+"""How long each piece of work takes on this machine, and how much memory."""

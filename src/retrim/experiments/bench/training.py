@@ -1,0 +1,45 @@
+"""What the bench times of pretraining."""
+
+from typing import Any
+
+from jax import random
+
+from ...config.loading import load
+from ...config.setup import Setup
+from ...learn.bptt import PolicyState
+from ...learn.pretrain import train_chunk
+from ..stopwatch import Stopwatch
+from ..training import nominal_error, train
+from .timing import compiled, timed
+
+
+def pretrain(name: str, runs: int) -> dict[str, Any]:
+    """Time pretraining without an encoder, each run with a seed of its own; and the errors of the policies."""
+    setup = Setup.of(load(name))
+    p, optimiser = setup.preset.pretrain, setup.optimiser
+    policy = setup.new_policy(random.key(0))
+    state = PolicyState(policy, optimiser.init(policy.params))
+    sizes = optimiser, 10, p.num_envs
+    program, compile_s = compiled(train_chunk, state, setup.env, random.key(0), *sizes)
+
+    kept = list[PolicyState]()
+
+    def run() -> PolicyState:
+        trained = state
+        for k in random.split(random.key(len(kept) + 1), p.num_updates // 10):
+            trained, _ = program(trained, setup.env, k, *sizes)
+        kept.append(trained)
+        return trained
+
+    row = timed(compile_s, run, runs)
+    errors = [nominal_error(setup, trained.policy.merged()) for trained in kept]
+    row["remarks"] += "; error " + ", ".join(f"{1000 * e:.1f}" for e in errors) + " mm"
+    return row
+
+
+def encode_and_pretrain(name: str) -> dict[str, Any]:
+    """Time encoder and policy of a preset for vision."""
+    setup, watch = Setup.of(load(name)), Stopwatch()
+    policy, _ = train(setup, 0)
+    row = {"compile_s": watch.compile_s, "run_s": watch.total_s - watch.compile_s}
+    return row | {"remarks": f"error {1000 * nominal_error(setup, policy):.1f} mm"}

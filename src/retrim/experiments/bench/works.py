@@ -1,0 +1,208 @@
+"""The works of the bench. ``python -m retrim.experiments.bench.works NAME`` does one and prints JSON."""
+
+import json
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax, random
+from jaxtyping import Array, Key
+
+from ...adapt.buffer import RollingBuffer
+from ...adapt.gate import Verdict
+from ...adapt.learner import LearnerState, OnlineLearner
+from ...config.disturbances import disturbance
+from ...config.loading import load
+from ...config.scenario import Scenario
+from ...config.setup import Setup
+from ...control.controller import PolicyController
+from ...learn.bptt import PolicyState
+from ...learn.window import Window
+from ...physics.bem import BemQuadrotor
+from ...physics.state import Command, State
+from ...physics.vehicle import small
+from ...runtime.batch import batch_flight
+from ...runtime.flight import fly
+from ..fleet import Fleet
+from ..stopwatch import Stopwatch
+from .timing import Work, compiled, timed
+from .training import encode_and_pretrain, pretrain
+
+
+def _learner(name: str = "hover/paper") -> tuple[OnlineLearner, LearnerState, Window]:
+    """A learner, its state before the first fit, and a full window of flight under the large disturbance."""
+    setup = Setup.of(load(name))
+    plant = Scenario("large").make()
+    buffer = RollingBuffer(setup.preset.adapt.window)
+    measurement = plant.reset(setup.flight_starts(1)[0])
+    for _ in range(setup.preset.adapt.window):
+        buffer.push(measurement.t, measurement.x, Command.hover())
+        measurement, _ = plant.step(Command.hover())
+    state = setup.learner.init(setup.new_policy(random.key(0)), random.key(1))
+    return setup.learner, state, buffer.window()
+
+
+def _update(name: str, *, lora: bool = False) -> dict[str, Any]:
+    learner, state, window = _learner(name)
+    if lora:
+        policy = Setup.of(load(name)).low_rank(state.policy.policy, random.key(2))
+        state = learner.init(policy, random.key(1))
+    fitted, _ = learner.fit_residual(state.residual, window)
+    arguments = learner, state.policy, fitted, window, random.key(0)
+    program, compile_s = compiled(OnlineLearner.update_policy, *arguments)
+    return timed(compile_s, lambda: program(*arguments), 9)
+
+
+def _residual() -> dict[str, Any]:
+    learner, state, window = _learner()
+    program, compile_s = compiled(OnlineLearner.fit_residual, learner, state.residual, window)
+    return timed(compile_s, lambda: program(learner, state.residual, window), 9)
+
+
+def _programs() -> dict[str, Any]:
+    """Trace and compile, or load, everything a flight needs: policy, plant, residual fit, policy update."""
+    watch, preset = Stopwatch(), load("hover/fast")
+    policy = Setup.of(preset).new_policy(random.key(0))
+    Fleet(preset, policy, [Scenario("large")], starts=1, seconds=3.0).warm_up()
+    return {"compile_s": watch.compile_s, "run_s": watch.total_s - watch.compile_s, "remarks": "preset hover/fast"}
+
+
+def _tick() -> dict[str, Any]:
+    """One flight without adaptation: plant, observation, policy, checks."""
+    setup = Setup.of(load("hover/fast"))
+    policy, plant, x0 = setup.new_policy(random.key(0)), Scenario().make(), setup.flight_starts(1)[0]
+    began = time.perf_counter()
+    fly(plant, setup.pilot(policy), x0, ticks=2)
+    compile_s = time.perf_counter() - began
+    row = timed(compile_s, lambda: fly(plant, setup.pilot(policy), x0, ticks=1500).p, 5)
+    row["remarks"] = f"{1000 * row['run_s'] / 1500:.2f} ms a tick; " + row["remarks"]
+    return row
+
+
+def _eight() -> dict[str, Any]:
+    """Eight flights of 30 s on bem, plant and policy as one program; four on each of two threads."""
+    setup = Setup.of(load("hover/fast"))
+    controller = PolicyController(setup.flown.observation_in_flight, setup.new_policy(random.key(0)))
+    model, effects, starts = BemQuadrotor.of(small(), 0.02), disturbance("none"), setup.flight_starts(8)
+    halves = [jax.tree.map(lambda *leaves: jnp.stack(leaves), *starts[i : i + 4]) for i in (0, 4)]
+
+    @jax.jit
+    def four(controller: PolicyController, x0s: State) -> State:
+        return lax.map(lambda x0: batch_flight(model, effects, controller, x0, ticks=1500)[0], x0s)  # type: ignore[no-any-return]
+
+    program, compile_s = compiled(four, controller, halves[0])
+    with ThreadPoolExecutor(2) as pool:
+        fly_all = lambda: list(pool.map(lambda x0s: jax.block_until_ready(program(controller, x0s)), halves))  # noqa: E731
+        return timed(compile_s, fly_all, 3)
+
+
+def _bem_tick() -> dict[str, Any]:
+    """One step of the blade-element plant."""
+    plant, u = Scenario().make(), Command.hover()
+    began = time.perf_counter()
+    plant.reset(None)
+    plant.step(u)
+    compile_s = time.perf_counter() - began
+
+    def ticks() -> Any:
+        for _ in range(500):
+            measurement, _ = plant.step(u)
+        return measurement.x.p
+
+    row = timed(compile_s, ticks, 5)
+    return row | {"run_s": row["run_s"] / 500, "remarks": f"500 ticks: {row['remarks']}"}
+
+
+def _fleet(how: str) -> dict[str, Any]:
+    """Eight updates of eight vehicles."""
+    learner, state, window = _learner()
+    fitted, _ = learner.fit_residual(state.residual, window)
+    keys = random.split(random.key(0), 8)
+
+    def one(state: LearnerState, window: Window, key: Key[Array, ""]) -> tuple[PolicyState, Verdict]:
+        return learner.update_policy(state.policy, state.residual, window, key)
+
+    state = LearnerState(state.policy, fitted)
+    if how == "threads":
+        jax.block_until_ready(one(state, window, keys[0]))
+        with ThreadPoolExecutor(2) as pool:
+            row = timed(0.0, lambda: list(pool.map(lambda k: jax.block_until_ready(one(state, window, k)), keys)), 3)
+        return row | {"compile_s": None, "remarks": row["remarks"] + "; compiled as one update"}
+
+    @jax.jit
+    def fleet(state: LearnerState, window: Window, keys: Key[Array, "8"]) -> tuple[PolicyState, Verdict]:
+        if how == "map":
+            return lax.map(lambda key: one(state, window, key), keys)  # type: ignore[no-any-return]
+        return jax.vmap(lambda key: one(state, window, key))(keys)
+
+    program, compile_s = compiled(fleet, state, window, keys)
+    return timed(compile_s, lambda: program(state, window, keys), 3)
+
+
+def _demo() -> dict[str, Any]:
+    with tempfile.TemporaryDirectory() as folder:
+        began = time.perf_counter()
+        subprocess.run(
+            [sys.executable, "-m", "retrim.cli", "demo", "--out", folder], check=True, stdout=subprocess.DEVNULL
+        )
+        total = time.perf_counter() - began
+        with open(f"{folder}/results.json") as file:
+            compile_s = json.load(file)["compile_s"]
+    return {"compile_s": compile_s, "run_s": total - compile_s, "remarks": "48 flights of 30 s, 24 of them adapting"}
+
+
+def _with_latency(title: str, name: str) -> Work:
+    """An update beside the latency that a preset charges for it."""
+    return Work(title, f"{load(name).adapt.update_latency:g} s, its latency", lambda: _update(name))
+
+
+WORKS: dict[str, Work] = {
+    "pretrain-paper": Work("pretrain 300 x 100 x 150", "40 s", lambda: pretrain("hover/paper", 1), "15 s"),
+    "pretrain-fast": Work("pretrain 150 x 16 x 150, to 5 mm", "6 s", lambda: pretrain("hover/fast", 3)),
+    "pretrain-track-paper": Work("pretrain tracking 300 x 100 x 150", "45 s", lambda: pretrain("track/paper", 1)),
+    "pretrain-track": Work(
+        "pretrain tracking 600 x 32 x 100, three references", "-", lambda: pretrain("track/preview", 1)
+    ),
+    "pretrain-vision": Work(
+        "encoder, and pretrain 300 x 16 x 150", "30 s, to 0.02 m", lambda: encode_and_pretrain("vision/ideal")
+    ),
+    "pretrain-vision-paper": Work(
+        "encoder, and pretrain 500 x 300 x 150", "360 s", lambda: encode_and_pretrain("vision/paper")
+    ),
+    "update": Work("policy update 30 x 10 x 150, with residual", "0.8 s", lambda: _update("hover/paper"), "1.5 s"),
+    "update-fast": _with_latency("policy update 30 x 10 x 150, preset hover/fast", "hover/fast"),
+    "update-lora": Work("policy update 30 x 10 x 150, LoRA", "-", lambda: _update("hover/fast", lora=True)),
+    "update-track": _with_latency("policy update 30 x 10 x 100, preset track/preview", "track/preview"),
+    "update-vision": _with_latency("policy update 30 x 10 x 150, preset vision/ideal", "vision/ideal"),
+    "update-vision-paper": _with_latency("policy update 50 x 30 x 150, preset vision/paper", "vision/paper"),
+    "residual": Work("residual, 3 nets x 100 steps x 100 samples", "0.1 s", _residual, "2 s"),
+    "programs-cold": Work("all programs of a flight, empty cache", "compile 60 s", _programs, cached=True),
+    "programs-warm": Work("all programs of a flight, from the cache", "compile 5 s", _programs, cached=True),
+    "bem-tick": Work("one tick of the plant bem", "0.002 s", _bem_tick),
+    "bem-eight": Work("8 flights of 30 s on bem, one program", "10 s (goal 3 s)", _eight),
+    "flight": Work("30 s of flight, not adapting", "-", _tick),
+    "fleet-map": Work("8 policy updates, lax.map", "-", lambda: _fleet("map")),
+    "fleet-vmap": Work("8 policy updates, vmap", "-", lambda: _fleet("vmap")),
+    "fleet-threads": Work("8 policy updates, 2 threads", "-", lambda: _fleet("threads")),
+    "demo": Work("retrim demo", "180 s in all, 2000 MB", _demo),
+}
+
+
+def main() -> None:
+    """Do the work named on the command line and print its row."""
+    work = WORKS[sys.argv[1]]
+    found = work.do()
+    peak = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    unit = 1024.0 if sys.platform != "darwin" else 1024.0**2
+    known = {"goal": work.goal, "paper": work.paper}
+    print(json.dumps({"work": work.title, **known, "peak_mb": peak / unit, **found}))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,112 @@
+"""From flights to pictures."""
+
+import itertools
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ..config.disturbances import disturbance
+from ..config.scenario import Scenario
+from ..config.setup import Setup
+from ..physics.effects import ExternalEffects
+from ..physics.state import State
+from ..tasks.keypoints import Keypoints
+from ..tasks.track import AbstractTrack
+from ..viz import plots
+from .flights import Flight
+
+
+def picture(
+    flights: Sequence[Flight], setup: Setup, scenario: Scenario, folder: Path, *, stem: str | None = None
+) -> list[Path]:
+    """Draw the flights of one scenario, before and after adaptation.
+
+    Args:
+        flights: What was flown; flights of other scenarios are left out.
+        setup: Preset of the policy, on the scenario's reference.
+        scenario: Which flights to draw.
+        folder: Where to write.
+        stem: Name of the files; by default task and disturbance.
+
+    Returns:
+        Paths of the PNG and the SVG; none if there is nothing to draw.
+    """
+    shown = [f for f in flights if f.spec.scenario == scenario]
+    if not shown:
+        return []
+    before = [f for f in shown if f.spec.method == "base"]
+    after = [f for f in shown if f.spec.method != "base"]
+    base, adapted = ([_track(f) for f in group] for group in (before, after))
+    seconds = max(float(track.t[-1]) for track in (*base, *adapted))
+    task, preset = setup.flown, setup.preset
+    where = f"{shown[0].vehicle} on plant {scenario.plant!r}"
+    kind = preset.task.rpartition(":")[2]
+    title = f"{kind.capitalize()}: {where}, disturbance {scenario.disturbance!r}, preset {preset.name!r}"
+
+    observation = setup.env.task.observation
+    if isinstance(observation, Keypoints):
+        home = jax.tree.map(lambda leaf: leaf[None], State.at(task.home()))
+        first, last = (
+            [_image_track(observation, f.log.true.as_state()) for f in group[:1]] for group in (before, after)
+        )
+        beside = partial(plots.camera, base=first, adapted=last, wanted=_image_track(observation, home).pixel[0])
+    elif isinstance(task, AbstractTrack):
+        beside = partial(plots.laps, base=base, adapted=adapted, lap=np.asarray(task.reference.rows)[:, :3])
+    else:
+        x, y, z = (float(value) for value in task.home())
+        beside = partial(plots.paths, base=base, adapted=adapted, goal=(x, y, z))
+    figure = plots.flight_figure(title, base, adapted, spans(scenario.disturbance, task.home(), seconds), beside)
+    clean = "".join(sign if sign.isalnum() or sign in "-." else "_" for sign in scenario.disturbance)
+    return plots.save(figure, folder, stem or f"{kind}_{clean}")
+
+
+def spans(name: str, home: Array, seconds: float) -> list[plots.Span]:
+    """Return when something disturbs the flight, and what; one span for all that changes all the time."""
+    times = np.linspace(0.0, seconds, round(10 * seconds), endpoint=False)
+    acting, x = disturbance(name), State.at(home)
+    found = jax.vmap(lambda t: acting(t, x))(jnp.asarray(times, dtype=x.p.dtype))
+    values = np.concatenate([np.asarray(leaf).reshape(len(times), -1) for leaf in jax.tree.leaves(found)], axis=1)
+    edges = [0, *(np.flatnonzero(np.any(np.diff(values, axis=0) != 0, axis=1)) + 1), len(times)]
+    if len(edges) > 12:
+        return [plots.Span(0.0, seconds, name, strong=False)]
+    marked = []
+    for first, after in itertools.pairwise(edges):
+        end = float(times[after]) if after < len(times) else seconds
+        here: ExternalEffects = jax.tree.map(lambda leaf, i=first: np.asarray(leaf)[i], found)
+        if label := _label(here):
+            marked.append(plots.Span(float(times[first]), end, label, strong=bool(here.push[0] < 0)))
+    return marked
+
+
+def _label(here: ExternalEffects) -> str:
+    """Effects in words; empty if there are none."""
+    words = list[str]()
+    if np.any(here.push):
+        same = len(set(here.push.tolist())) == 1
+        vector = ", ".join(f"{a:+g}" for a in here.push)
+        words.append(f"pushed by {here.push[0]:+g} m/s² per axis" if same else f"pushed by ({vector}) m/s²")
+    if np.any(here.wind):
+        words.append(f"wind of {np.linalg.norm(here.wind):.1f} m/s")
+    if here.mass > 0:
+        words.append(f"{1000 * here.mass:.0f} g of load")
+    if np.any(here.gain != 1):
+        words.append("rotors at " + ", ".join(f"{100 * g:.0f}" for g in here.gain) + " %")
+    return "; ".join(words)
+
+
+def _track(flight: Flight) -> plots.Track:
+    return plots.Track(flight.log.t, flight.log.p, flight.error, flight.swaps, flight.log.terminated)
+
+
+def _image_track(observation: Keypoints, x: State) -> plots.ImageTrack:
+    return plots.ImageTrack(*map(np.asarray, _pixels(observation, x)))
+
+
+@jax.jit
+def _pixels(observation: Keypoints, x: State) -> tuple[Array, Array]:
+    return jax.vmap(observation.pixels)(x)

@@ -1,0 +1,218 @@
+"""Many flights of one preset: scenarios x methods x seeds x starts, on any executor."""
+
+import contextlib
+import signal
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+from jax import random
+
+from ..adapt.buffer import RollingBuffer
+from ..adapt.learner import LearnerState
+from ..config.loading import dump
+from ..config.presets import Preset
+from ..config.scenario import Scenario
+from ..config.setup import Latency, Method, Setup, setup_for
+from ..control.lora import LoraPolicy
+from ..control.policy import Policy
+from ..errors import ConfigError
+from ..physics.state import State
+from ..runtime.flight import FlightStopped, fly
+from .flights import Flight, FlightSpec, fly_one
+from .metrics import Rows, rows
+from .provenance import cores
+
+Progress = Callable[[int, int], None]
+"""Called with the number of flights that are over, and of all flights."""
+
+
+@dataclass(frozen=True)
+class Flights:
+    """The flights of a fleet that were flown to their end."""
+
+    flown: list[Flight]
+    interrupted: bool
+    """Some flights are missing: the fleet was stopped."""
+
+    def rows(self) -> Rows:
+        """Return one row of results per scenario, method and seed."""
+        return rows(self.flown)
+
+
+class Fleet:
+    """Flies every combination of scenarios, methods, policies (one per seed) and starts."""
+
+    def __init__(
+        self,
+        preset: Preset,
+        policies: Policy | Mapping[int, Policy],
+        scenarios: Sequence[Scenario],
+        *,
+        methods: Sequence[Method] = ("base", "full"),
+        starts: int = 8,
+        seconds: float | None = None,
+        latency: Latency = "fixed",
+        state: LearnerState | None = None,
+    ) -> None:
+        """Plan the flights.
+
+        Args:
+            preset: Preset of the policies.
+            policies: By seed; a single one has the seed 0.
+            scenarios: Where they fly.
+            methods: How they fly.
+            starts: Flights per scenario, method and seed, each from another start.
+            seconds: Length of a flight; the task's own by default.
+            latency: What learning costs in flight time. ``measured`` flies one flight at a time, so that none is
+                charged for another's work.
+            state: What an earlier flight learnt; adapting flights go on from it.
+
+        Raises:
+            ConfigError: Something does not exist, or does not fit together.
+        """
+        if starts < 1 or starts > 100_000 or not scenarios or not methods:
+            raise ConfigError(
+                f"{starts} starts of {len(scenarios)} scenarios by {len(methods)} methods cannot be flown"
+            )
+        self.preset = preset
+        self.policies = dict(policies) if isinstance(policies, Mapping) else {0: policies}
+        self._setups = {name: setup_for(dump(preset), name) for name in {s.reference for s in scenarios}}
+        first = next(iter(self._setups.values()))
+        self.seconds = first.flown.flight_seconds if seconds is None else seconds
+        if not 1.0 <= self.seconds <= 36_000.0:
+            raise ConfigError(f"flights of {self.seconds:g} s: must be between 1 s and 36000 s")
+        self._latency, self._state = latency, state
+        self._starts = {
+            (name, seed): setup.flight_starts(starts, seed)
+            for name, setup in self._setups.items()
+            for seed in self.policies
+        }
+        self.specs = [
+            FlightSpec(scenario, method, start, seed)
+            for scenario in scenarios
+            for method in methods
+            for seed in self.policies
+            for start in range(starts)
+        ]
+
+    def warm_up(self) -> None:
+        """Compile every program of the flights before the first take-off, in this process."""
+        done = set[Any]()
+        for spec in self.specs:
+            setup, policy = self._setups[spec.scenario.reference], self.policies[spec.seed]
+            x0 = self._starts[spec.scenario.reference, spec.seed][0]
+            if spec.scenario not in done:
+                done.add(spec.scenario)
+                pilot = setup.pilot(policy)
+                fly(spec.scenario.make(self.preset.vehicle, dt=self.preset.dt), pilot, x0, ticks=2)
+            if spec.method != "base" and (spec.scenario.reference, spec.method) not in done:
+                done.add((spec.scenario.reference, spec.method))
+                adaptive = setup.low_rank(policy, spec.key()) if spec.method == "lora" else policy
+                buffer = RollingBuffer(self.preset.adapt.window)
+                buffer.push(0.0, x0, policy.u_hover)
+                state, window = setup.learner.init(adaptive, random.key(0)), buffer.window()
+                jax.block_until_ready(setup.learner.fit_residual(state.residual, window))
+                jax.block_until_ready(setup.learner.update_policy(state.policy, state.residual, window, random.key(0)))
+
+    def run(
+        self,
+        executor: Executor | None = None,
+        *,
+        progress: Progress | None = None,
+        stop: threading.Event | None = None,
+        only: Sequence[FlightSpec] | None = None,
+    ) -> Flights:
+        """Fly.
+
+        Args:
+            executor: Any executor; by default one thread per core. One with other processes builds its own programs.
+            progress: Called in this thread when a flight is over.
+            stop: Gives up what is flying. Ctrl-C does the same, and sets it.
+            only: Fly these specifications, a part of ``specs``.
+
+        Returns:
+            The flights that were flown to their end, in the order of the specifications.
+
+        Raises:
+            PlantError: A plant refused, or its package is not installed.
+        """
+        stop = stop or threading.Event()
+        specs = self.specs if only is None else list(only)
+        if executor is not None:
+            return self._run(executor, specs, progress, stop, shared=isinstance(executor, ThreadPoolExecutor))
+        with ThreadPoolExecutor(1 if self._latency == "measured" else cores()) as pool:
+            return self._run(pool, specs, progress, stop, shared=True)
+
+    def _run(
+        self,
+        executor: Executor,
+        specs: Sequence[FlightSpec],
+        progress: Progress | None,
+        stop: threading.Event,
+        *,
+        shared: bool,
+    ) -> Flights:
+        futures: dict[FlightSpec, Future[Flight]] = {}
+        try:
+            for spec in specs:
+                futures[spec] = executor.submit(_job, self._job(spec), stop if shared else None)
+            for done, future in enumerate(as_completed(futures.values()), start=1):
+                future.result()
+                if progress is not None:
+                    progress(done, len(specs))
+        except (KeyboardInterrupt, FlightStopped):
+            stop.set()
+        except BaseException:
+            stop.set()
+            raise
+        finally:
+            with _deaf_to_interrupts():  # a further Ctrl-C must not lose what is done
+                for future in futures.values():
+                    future.cancel()
+                if stop.is_set():
+                    for future in futures.values():
+                        if not future.cancelled():
+                            future.exception()
+        over = [futures[spec] for spec in specs if spec in futures]
+        flown = [f.result() for f in over if f.done() and not f.cancelled() and f.exception() is None]
+        return Flights(flown, interrupted=len(flown) < len(specs))
+
+    def _job(self, spec: FlightSpec) -> "Job":
+        x0 = self._starts[spec.scenario.reference, spec.seed][spec.start]
+        return Job(dump(self.preset), self.policies[spec.seed], spec, x0, self.seconds, self._latency, self._state)
+
+
+@dataclass(frozen=True)
+class Job:
+    """Everything that one flight needs, in a form that can be sent to another process."""
+
+    preset: str
+    policy: Policy | LoraPolicy
+    spec: FlightSpec
+    x0: State
+    seconds: float
+    latency: Latency
+    state: LearnerState | None
+
+
+def _job(job: Job, stop: threading.Event | None) -> Flight:
+    """Fly a job, in whatever process."""
+    setup: Setup = setup_for(job.preset, job.spec.scenario.reference)
+    return fly_one(setup, job.policy, job.spec, job.x0, job.seconds, latency=job.latency, state=job.state, stop=stop)
+
+
+@contextlib.contextmanager
+def _deaf_to_interrupts() -> Iterator[None]:
+    """Ignore Ctrl-C for a moment; only the main thread may, and only it receives one."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -1,0 +1,72 @@
+"""Files that a run of flights leaves: events, logs and what was learnt."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ..config.presets import Preset
+from ..control.lora import LoraPolicy
+from ..io.checkpoint import save_delta
+from ..io.files import write_whole
+from ..io.trained import save_learnt, save_policy
+from .flights import Flight
+
+
+def write_events(flights: Sequence[Flight], folder: Path) -> None:
+    """Write ``events.jsonl``: what adaptation did, flight by flight."""
+    lines = [
+        json.dumps(
+            {
+                "event": event.kind,
+                "disturbance": flight.spec.scenario.disturbance,
+                "start": flight.spec.start,
+                "t": event.t,
+                "note": event.note,
+            }
+        )
+        for flight in flights
+        for event in flight.events
+    ]
+    write_whole(folder / "events.jsonl", "".join(line + "\n" for line in lines))
+
+
+def write_logs(flights: Sequence[Flight], folder: Path) -> None:
+    """Write one NPZ for each flight under ``logs/``: times, true and measured states, commands, errors."""
+    (folder / "logs").mkdir(exist_ok=True)
+    for flight in flights:
+        spec, log = flight.spec, flight.log
+        name = f"{spec.method}_seed{spec.seed}_start{spec.start}"
+        with (folder / "logs" / f"{name}.npz.partial").open("wb") as file:
+            np.savez_compressed(
+                file,
+                t=log.t,
+                p=log.true.p,
+                R=log.true.R,
+                v=log.true.v,
+                p_measured=log.measured.p,
+                R_measured=log.measured.R,
+                v_measured=log.measured.v,
+                u=log.u,
+                error=flight.error,
+                terminated=log.terminated,
+            )
+        (folder / "logs" / f"{name}.npz.partial").replace(folder / "logs" / f"{name}.npz")
+
+
+def write_learnt(flights: Sequence[Flight], preset: Preset, folder: Path) -> None:
+    """Write what the first whole adapting flight learnt.
+
+    ``learnt.safetensors`` (to go on from), and ``adapted.safetensors`` (a policy) or ``delta.safetensors`` (of a
+    low-rank one).
+    """
+    learnt = next((f.learnt for f in flights if f.learnt is not None and not f.log.terminated), None)
+    if learnt is None:
+        return
+    save_learnt(folder / "learnt.safetensors", learnt, preset)
+    policy = learnt.policy.policy
+    if isinstance(policy, LoraPolicy):
+        save_delta(folder / "delta.safetensors", policy)
+    else:
+        save_policy(folder / "adapted.safetensors", policy, preset)

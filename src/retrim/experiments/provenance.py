@@ -1,0 +1,67 @@
+"""Where results come from: commit, versions, hardware and command line."""
+
+import functools
+import os
+import platform
+import subprocess
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+
+import jax
+
+PACKAGES = ("retrim", "jax", "jaxlib", "equinox", "optax", "numpy")
+
+
+@functools.cache
+def commit() -> str:
+    """Return the commit of the checkout of this package, with ``-dirty`` for local changes; or ``unknown``."""
+    here = Path(__file__).resolve().parent
+
+    def git(*words: str) -> str:
+        return subprocess.run(
+            ["git", "-C", str(here), *words], capture_output=True, text=True, check=True
+        ).stdout.strip()
+
+    try:
+        if Path(git("rev-parse", "--show-toplevel")) / "src" / "retrim" != here.parent:
+            return "unknown"
+        return git("rev-parse", "--short=12", "HEAD") + ("-dirty" if git("status", "--porcelain") else "")
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of Python and of the packages that compute."""
+    return {name: version(name) for name in PACKAGES} | {"python": platform.python_version()}
+
+
+def describe_hardware() -> str:
+    """Return the CPU cores and accelerators in words."""
+    name = platform.machine()
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        name = next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        pass
+    accelerators = sorted({d.device_kind for d in jax.devices() if d.platform != "cpu"})
+    return ", ".join([f"{cores()} CPU cores ({name})", *accelerators])
+
+
+def cores() -> int:
+    """Return the number of CPU cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
+
+
+def command_line(words: Sequence[str]) -> str:
+    """Return the command with ``--out`` removed and absolute paths reduced to file names."""
+    kept, words = list[str](), list(words)
+    while words:
+        option, sign, value = words.pop(0).partition("=")
+        if option == "--out":
+            words = words if sign else words[1:]
+        elif sign:
+            kept.append(f"{option}={Path(value).name if Path(value).is_absolute() else value}")
+        else:
+            kept.append(Path(option).name if Path(option).is_absolute() else option)
+    return " ".join(["retrim", *kept])

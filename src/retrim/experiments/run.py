@@ -1,0 +1,76 @@
+"""The folder of a run: created once, results written whole, an interruption remembered."""
+
+import json
+import sys
+import threading
+from collections.abc import Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from ..io.files import check_writable, write_whole
+from .provenance import command_line, commit, describe_hardware, versions
+from .stopwatch import Stopwatch
+
+SCHEMA = "retrim.results/2"
+INTERRUPTED = 130  # exit code
+
+
+class Run:
+    """Folder, stopwatch and stop token of one command.
+
+    ``stop`` is set by the first Ctrl-C, also where the KeyboardInterrupt itself is lost; long work looks at it.
+    """
+
+    def __init__(self, command: str, out: Path | None = None, *, stop: threading.Event | None = None) -> None:
+        """Choose the folder and check that it can be written.
+
+        Args:
+            command: Names the folder if ``out`` is None: a new one under ``runs/``.
+            out: The folder.
+            stop: Set when the run should end early.
+
+        Raises:
+            ConfigError: The folder cannot be written.
+        """
+        self.folder = out or Path("runs") / f"{command}-{datetime.now():%Y%m%d-%H%M%S}"
+        self.watch = Stopwatch()
+        self.stop = stop or threading.Event()
+        commit()  # remembered from before the run writes anything into the checkout
+        check_writable(self.folder)
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether the run was told to end early."""
+        return self.stop.is_set()
+
+    @property
+    def exit_code(self) -> int:
+        """0, or 130 for a run that was interrupted."""
+        return INTERRUPTED if self.interrupted else 0
+
+    def write_text(self, name: str, text: str) -> Path:
+        """Write a file of the folder, whole; return its path."""
+        path = self.folder / name
+        write_whole(path, text)
+        return path
+
+    def write_results(
+        self, rows: Sequence[dict[str, Any]], *, seeds: Sequence[int], name: str = "results", **more: Any
+    ) -> Path:
+        """Write ``<name>.json`` with rows, provenance and times; return its path."""
+        compiling = self.watch.compile_s
+        results = {
+            "schema": SCHEMA,
+            "command": command_line(sys.argv[1:]),
+            "commit": commit(),
+            "versions": versions(),
+            "device": describe_hardware(),
+            "seeds": list(seeds),
+            "compile_s": round(compiling, 3),
+            "run_s": round(self.watch.total_s - compiling, 3),
+            "interrupted": self.interrupted,
+            "rows": list(rows),
+            **more,
+        }
+        return self.write_text(f"{name}.json", json.dumps(results, indent=2) + "\n")

@@ -1,0 +1,51 @@
+"""Compile time apart from run time."""
+
+import threading
+import time
+
+import jax
+
+EVENTS = (
+    "/jax/core/compile/jaxpr_trace_duration",
+    "/jax/core/compile/jaxpr_to_mlir_module_duration",
+    "/jax/core/compile/backend_compile_duration",
+)
+
+
+class Stopwatch:
+    """Separates compiling (tracing, lowering, XLA, reading the compile cache) from running, from its creation on."""
+
+    def __init__(self) -> None:
+        self._began = time.perf_counter()
+        self._compiling = list[tuple[float, float]]()  # intervals without overlap, in order
+        self._lock = threading.Lock()
+        jax.monitoring.register_event_duration_secs_listener(self._listen)
+
+    def _listen(self, event: str, duration_secs: float, **_: str | int) -> None:
+        if event in EVENTS:
+            now = time.perf_counter()
+            self.compiled(max(self._began, now - duration_secs), now)
+
+    def compiled(self, start: float, end: float) -> None:
+        """Note that something was being compiled; overlapping intervals count once."""
+        with self._lock:
+            while self._compiling and self._compiling[-1][1] >= start:
+                before = self._compiling.pop()
+                start, end = min(start, before[0]), max(end, before[1])
+            self._compiling.append((start, end))
+
+    @property
+    def compile_s(self) -> float:
+        """Seconds so far in which something was being compiled."""
+        with self._lock:
+            return sum(end - start for start, end in self._compiling)
+
+    @property
+    def total_s(self) -> float:
+        """Seconds since the start."""
+        return time.perf_counter() - self._began
+
+    def sentence(self) -> str:
+        """Return compile and run time in words."""
+        compiling = self.compile_s
+        return f"Compiling {compiling:.0f} s, all else {self.total_s - compiling:.0f} s."

@@ -1,0 +1,241 @@
+"""Sweeps: policies x scenarios x seeds from one TOML file, resumable after a kill."""
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic.dataclasses import dataclass
+
+from ..config.loading import changed as changed_preset
+from ..config.loading import dump, load, read_toml, suggestion
+from ..config.presets import Preset
+from ..config.scenario import Scenario
+from ..config.setup import Method, Setup
+from ..control.policy import Policy
+from ..errors import ConfigError
+from ..io.files import write_whole
+from ..io.trained import load_policy, save_policy
+from ..viz.panels import bars
+from ..viz.plots import save
+from .fleet import Fleet
+from .flights import Flight, FlightSpec
+from .metrics import Rows
+from .reporter import Reporter
+from .run import Run
+from .tables.document import Document, TableSection
+from .training import train
+
+STRICT = ConfigDict(extra="forbid")
+
+
+@dataclass(frozen=True, config=STRICT)
+class Sweep:
+    """The content of a sweep file."""
+
+    presets: tuple[str, ...] = Field(default=("hover/fast",), min_length=1)
+    """Presets to train a policy with, for each seed."""
+    seeds: tuple[int, ...] = Field(default=(0,), min_length=1)
+    """Training seeds; each also seeds starts, disturbances and learners of its flights."""
+    methods: tuple[Method, ...] = Field(default=("base", "full"), min_length=1)
+    disturbances: tuple[str, ...] = Field(default=("none",), min_length=1)
+    plants: tuple[str, ...] = Field(default=("bem",), min_length=1)
+    vehicles: tuple[str, ...] = ()
+    """Vehicles that fly; that of training by default."""
+    sensors: tuple[str, ...] = Field(default=("ideal",), min_length=1)
+    references: tuple[str, ...] = ()
+    """What tracking policies follow."""
+    starts: int = Field(default=1, ge=1, le=100_000)
+    seconds: float | None = Field(default=None, ge=1.0, le=36_000.0)
+    """Length of a flight; the task's own by default."""
+    overlay: dict[str, Any] = Field(default_factory=dict)
+    """Values on top of every preset, as in a preset's own TOML file."""
+
+    def scenarios(self) -> list[Scenario]:
+        """Return every combination of disturbance, plant, vehicle, sensors and reference."""
+        return [
+            Scenario(disturbance, plant, vehicle, sensors, reference=reference)
+            for plant in self.plants
+            for vehicle in self.vehicles or (None,)
+            for sensors in self.sensors
+            for reference in self.references or (None,)
+            for disturbance in self.disturbances
+        ]
+
+
+def read_sweep(path: Path) -> Sweep:
+    """Read a sweep file.
+
+    Raises:
+        ConfigError: It cannot be read, or a key or value does not fit.
+    """
+    try:
+        return TypeAdapter(Sweep).validate_python(read_toml(path))
+    except ValidationError as error:
+        wrong = []
+        for each in error.errors(include_url=False):
+            where, message = ".".join(map(str, each["loc"])), each["msg"]
+            if each["type"] == "unexpected_keyword_argument":
+                message = f"unknown key; {suggestion(where, [f.name for f in dataclasses.fields(Sweep)])}"
+            wrong.append(f"{where}: {message}")
+        raise ConfigError(f"{path}: {'; '.join(wrong)}") from error
+
+
+def run_sweep(sweep: Sweep, run: Run, reporter: Reporter) -> Rows:
+    """Train and fly everything that the run's folder does not hold yet.
+
+    Policies are kept in ``policies/``, each flight's row in ``flights.jsonl``; a run that was killed goes on from
+    them. ``sweep.md``, ``sweep.json`` and ``sweep.png`` are written at the end, and after an interruption.
+
+    Returns:
+        One row per preset, scenario and method.
+
+    Raises:
+        ConfigError: Something does not exist or does not fit together; found before anything is trained.
+    """
+    planned = [(preset, Fleet(preset, Setup.of(preset).new_policy(_zero()), sweep.scenarios(), starts=1))
+               for preset in _presets(sweep)]  # fmt: skip
+    kept = _Kept(run.folder / "flights.jsonl")
+    for preset, _ in planned:
+        policies = _policies(preset, sweep, run, reporter)
+        if run.interrupted:
+            break
+        fleet = Fleet(
+            preset, policies, sweep.scenarios(), methods=sweep.methods, starts=sweep.starts, seconds=sweep.seconds
+        )
+        missing = [spec for spec in fleet.specs if _key(preset, spec, fleet.seconds) not in kept.rows]
+        if missing:
+            with reporter.progress(f"flying {preset.name}") as advance:
+                advance(0.0, "compiling the programs of a flight")
+                fleet.warm_up()
+                for i in range(0, len(missing), BATCH):
+                    batch = fleet.run(stop=run.stop, only=missing[i : i + BATCH])
+                    for flight in batch.flown:
+                        kept.add(_key(preset, flight.spec, fleet.seconds), _row(preset, flight))
+                    advance(min(1.0, (i + BATCH) / len(missing)), f"{min(i + BATCH, len(missing))} flights")
+                    if batch.interrupted:
+                        break
+        if run.interrupted:
+            break
+    return _report(sweep, kept, run, reporter)
+
+
+BATCH = 8  # flights between two writes of the results
+
+
+def _zero() -> Any:
+    from jax import random
+
+    return random.key(0)
+
+
+def _presets(sweep: Sweep) -> list[Preset]:
+    return [changed_preset(load(name), **sweep.overlay) for name in sweep.presets]
+
+
+def _policies(preset: Preset, sweep: Sweep, run: Run, reporter: Reporter) -> dict[int, Policy]:
+    """Trained policies by seed, from the run's folder where they are there."""
+    found = dict[int, Policy]()
+    for seed in sweep.seeds:
+        digest = hashlib.sha256(dump(preset).encode()).hexdigest()[:8]
+        path = run.folder / "policies" / f"{preset.name.replace('/', '-')}-{digest}-seed{seed}.safetensors"
+        if path.is_file():
+            found[seed], _ = load_policy(path)
+            continue
+        reporter.say(f"preset {preset.name}, seed {seed}")
+        policy, _ = train(Setup.of(preset), seed, reporter=reporter, stop=run.stop)
+        if run.interrupted:
+            break
+        save_policy(path, policy, preset)
+        found[seed] = policy
+    return found
+
+
+class _Kept:
+    """Rows of flights that are over, one line of JSON each; a torn last line is flown again."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self.rows = path, dict[str, dict[str, Any]]()
+        for line in path.read_text().splitlines() if path.is_file() else ():
+            try:
+                row = json.loads(line)
+                self.rows[row["key"]] = row
+            except (json.JSONDecodeError, KeyError, TypeError):
+                continue
+
+    def add(self, key: str, row: Mapping[str, Any]) -> None:
+        """Keep a row; the whole file is written."""
+        self.rows[key] = {"key": key, **row}
+        write_whole(self._path, "".join(json.dumps(each) + "\n" for each in self.rows.values()))
+
+
+def _key(preset: Preset, spec: FlightSpec, seconds: float) -> str:
+    text = dump(preset) + repr((spec, seconds))
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _row(preset: Preset, flight: Flight) -> dict[str, Any]:
+    spec, scenario = flight.spec, flight.spec.scenario
+    steady = None if flight.log.terminated else flight.steady
+    return {
+        "preset": preset.name,
+        "method": spec.method,
+        "disturbance": scenario.disturbance,
+        "plant": scenario.plant,
+        "vehicle": flight.vehicle,
+        "sensors": scenario.sensors,
+        "reference": scenario.reference,
+        "seed": spec.seed,
+        "start": spec.start,
+        "error": steady,
+        "peak_after_5s": None if flight.log.terminated else flight.peak,
+        "crashed": flight.log.terminated,
+    }
+
+
+GROUP = ("preset", "plant", "vehicle", "sensors", "reference", "disturbance", "method")
+
+
+def _report(sweep: Sweep, kept: _Kept, run: Run, reporter: Reporter) -> Rows:
+    groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
+    for row in kept.rows.values():
+        groups.setdefault(tuple(row[name] for name in GROUP), []).append(row)
+    found, cells = Rows(), list[tuple[str, ...]]()
+    varied = [name for i, name in enumerate(GROUP) if len({group[i] for group in groups}) > 1 or name == "method"]
+    for group, flights in groups.items():
+        errors = np.array([np.inf if row["error"] is None else row["error"] for row in flights])
+        whole, crashes = errors[np.isfinite(errors)], sum(row["crashed"] for row in flights)
+        median, worst = float(np.median(errors)), float(errors.max())
+        found.append(
+            dict(zip(GROUP, group, strict=True))
+            | {"mean": float(whole.mean()) if len(whole) else None, "n": len(flights), "crashes": crashes}
+            | {"median": median if np.isfinite(median) else None, "max": worst if np.isfinite(worst) else None}
+        )
+        named = dict(zip(GROUP, group, strict=True))
+        spread = f"{whole.mean():.3f} ± {whole.std(ddof=len(whole) > 1):.3f}" if len(whole) else "crashed"
+        limit = "crashed" if crashes else f"{worst:.3f}"
+        cells.append(
+            (*(str(named[name]) for name in varied), spread, f"{median:.3f}", limit, f"{crashes} of {len(flights)}")
+        )
+    intro = "Made by `retrim sweep`. Error [m] over the last seconds of each flight, over seeds and starts."
+    document = Document(run, "sweep", "Sweep", intro, sweep.seeds, reporter, {"sweep": dataclasses.asdict(sweep)})
+    if cells:
+        drawn = save(bars("Error at the end of the flights [m]", _bar_groups(groups)), run.folder, "sweep")
+        columns = (*varied, "mean ± std [m]", "median [m]", "maximum [m]", "crashed")
+        document.add(TableSection(columns, tuple(cells), picture=drawn[0]), found)
+    document.write()
+    return found
+
+
+def _bar_groups(groups: Mapping[tuple[Any, ...], list[dict[str, Any]]]) -> dict[str, dict[str, list[float]]]:
+    """Errors of whole flights by scenario and method."""
+    shown: dict[str, dict[str, list[float]]] = {}
+    varied = [i for i, name in enumerate(GROUP[:-1]) if len({group[i] for group in groups}) > 1] or [5]
+    for group, flights in groups.items():
+        label = ", ".join(str(group[i]) for i in varied)
+        shown.setdefault(label, {})[str(group[-1])] = [row["error"] for row in flights if row["error"] is not None]
+    return shown

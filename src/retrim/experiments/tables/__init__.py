@@ -1,0 +1,8 @@
+"""The paper's tables and figures, one file each; every one is a function of a run and a reporter."""
+
+from .hover import hover as hover
+from .model import model as model
+from .plants import plants as plants
+from .reversing import reversing as reversing
+from .tracking import tracking as tracking
+from .vision import vision as vision

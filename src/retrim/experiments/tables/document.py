@@ -1,0 +1,67 @@
+"""One renderer for all tables: sections of text cells, written as Markdown and JSON after each section."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ..provenance import commit, describe_hardware
+from ..reporter import Reporter
+from ..run import Run
+
+
+@dataclass(frozen=True)
+class TableSection:
+    """One table, as text."""
+
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    title: str = ""
+    about: str = ""
+    """Text above the table."""
+    picture: Path | None = None
+    """A picture below it, in the folder of the document."""
+
+    def markdown(self) -> list[str]:
+        """Return the section as lines of Markdown."""
+        lines = [f"## {self.title}", ""] if self.title else []
+        lines += [self.about, ""] if self.about else []
+        if self.rows:
+            lines += ["| " + " | ".join(self.columns) + " |", "|---" * len(self.columns) + "|"]
+            lines += ["| " + " | ".join(row) + " |" for row in self.rows] + [""]
+        if self.picture is not None:
+            lines += [f"![{self.title or self.picture.stem}]({self.picture.name})", ""]
+        return lines
+
+
+@dataclass
+class Document:
+    """``<name>.md`` and ``<name>.json`` in the folder of a run. Every section is written when it is added."""
+
+    run: Run
+    name: str
+    title: str
+    intro: str
+    seeds: Sequence[int]
+    reporter: Reporter
+    more: dict[str, Any] = field(default_factory=dict)
+    """Further values for the JSON file."""
+    _sections: list[TableSection] = field(default_factory=list)
+    _rows: list[dict[str, Any]] = field(default_factory=list)
+
+    def add(self, section: TableSection, rows: Sequence[dict[str, Any]] = ()) -> None:
+        """Add a section and the rows of results behind it; write both files."""
+        self._sections.append(section)
+        self._rows += rows
+        self.reporter.say("\n".join(section.markdown()))
+        self.write()
+
+    def write(self) -> Path:
+        """Write both files; return the path of the Markdown."""
+        seeds = ", ".join(map(str, self.seeds))
+        head = [f"# {self.title}", "", self.intro, ""]
+        head += [f"Commit {commit()}; {describe_hardware()}; training seeds {seeds}.", ""]
+        body = [line for section in self._sections for line in section.markdown()]
+        foot = self.run.watch.sentence() + (" Interrupted: incomplete." if self.run.interrupted else "")
+        self.run.write_results(self._rows, seeds=self.seeds, name=self.name, **self.more)
+        return self.run.write_text(f"{self.name}.md", "\n".join([*head, *body, foot, ""]))

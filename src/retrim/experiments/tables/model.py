@@ -1,0 +1,223 @@
+"""The blade-element plant: curves and figures beside published ones."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from ...config.disturbances import disturbance
+from ...config.vehicles import VEHICLES
+from ...physics.bem import FRAME_FACTOR, IN_PLANE_GAIN, BemQuadrotor, BemState
+from ...physics.effects import ExternalEffects
+from ...physics.propeller import Inflow, Propeller, five_inch, rotor, three_inch, vortex_ring
+from ...physics.state import STANDARD_GRAVITY, Command, State
+from ...physics.substep import SUBSTEP
+from ...viz import plots
+from ...viz.panels import Curve, Panel, panel_figure
+from ..reporter import Reporter
+from ..run import Run
+from .document import Document, TableSection
+
+DT = 0.02  # [s]
+PUBLISHED_MAP = 1.562522e-6  # [N s^2], thrust map of the 5.1 in rotors (Agilicious)
+GOLDEN_HOVER = ((1800.0, 5.13804), (1850.0, 5.42739), (1900.0, 5.72464), (1950.0, 6.02982))  # rad/s, N; see docs
+
+
+def model(run: Run, reporter: Reporter) -> None:
+    """Make ``model.md`` and the picture: thrust, drag, inflow, rate and thrust steps, battery sag."""
+    reporter.say("computing the curves of the blade-element model")
+    panels = [thrust_panel(), drag_panel(), inflow_panel(), rate_panel(), step_panel(), sag_panel()]
+    drawn, _ = plots.save(panel_figure("The plant bem", panels), run.folder, "model")
+    table = published()
+    lines = tuple(
+        (
+            row["what"],
+            f"{row['ours']:.5g}",
+            f"{row['published']:.5g}",
+            f"{100 * (row['ours'] / row['published'] - 1):+.1f} %",
+            row["source"],
+        )
+        for row in table
+    )
+    title = "The blade-element plant beside published figures"
+    document = Document(run, "model", title, "Made by `retrim reproduce model`.", [0], reporter)
+    document.add(TableSection(("quantity", "here", "published", "deviation", "source"), lines, picture=drawn), table)
+
+
+def published() -> list[dict[str, Any]]:
+    """Our figures beside published ones."""
+    big, little = five_inch(), three_inch()
+    still = Settled(big, 1109.15, 0.0, 0.0)
+    low = Settled(little, 1548.8, 0.0, 0.0)
+    side = Settled(big, 1109.15, 3.0, 0.0)
+    up, down = Settled(big, 1109.15, 0.0, -0.5), Settled(big, 1109.15, 0.0, 0.0)
+    damping = FRAME_FACTOR * 4 * (down.thrust - up.thrust) / 0.5 / 0.752
+    return [
+        _row("thrust coefficient, 5.1 in, hover [1e-6 N s^2]", 1e6 * still.thrust / 1109.15**2, 1.5625, "thrust map"),
+        _row("induced velocity, 5.1 in, 1109 rad/s [m/s]", still.v_i, 7.79, "recomputed"),
+        _row("torque over thrust, 5.1 in, hover [m]", still.torque / still.thrust, 0.0117, "recomputed"),
+        _row("thrust coefficient, 3.07 in, hover [1e-7 N s^2]", 1e7 * low.thrust / 1548.8**2, 2.05, "authors' code"),
+        _row("torque over thrust, 3.07 in, hover [m]", low.torque / low.thrust, 0.00804, "authors' code"),
+        _row(
+            "edgewise rotor drag, kingfisher, 3 m/s [1/s]",
+            4 * IN_PLANE_GAIN * side.in_plane / 0.752 / 3.0,
+            0.24,
+            "recomputed",
+        ),
+        _row("axial damping, kingfisher, climbing [1/s]", damping, 0.37, "recomputed"),
+        *(
+            _row(f"thrust, {int(w)} rad/s [N]", Settled(big, w, 0.0, 0.0).thrust, T, "Agilicious")
+            for w, T in GOLDEN_HOVER
+        ),
+    ]
+
+
+class Settled:
+    """One rotor in steady air, its inflow found."""
+
+    def __init__(self, prop: Propeller, omega: float, v_hor: float, v_ver: float) -> None:
+        forces, inflow = _settled(prop, jnp.array(omega), jnp.array(v_hor), jnp.array(v_ver))
+        self.thrust, self.in_plane, self.torque = (float(f) for f in forces)
+        self.v_i = float(vortex_ring(inflow, jnp.array(v_ver)))
+
+
+@eqx.filter_jit
+def _settled(prop: Propeller, omega: Array, v_hor: Array, v_ver: Array) -> Any:
+    return rotor(prop, omega, v_hor, v_ver, Inflow.above(omega.dtype), steps=16)
+
+
+def thrust_panel() -> Panel:
+    """Thrust of the 5.1 in rotor in still air, against the published thrust map."""
+    speeds = np.linspace(200.0, 2300.0, 30)
+    ours = np.array([Settled(five_inch(), float(w), 0.0, 0.0).thrust for w in speeds])
+    points = np.array(GOLDEN_HOVER)
+    return Panel(
+        "Hover thrust, 5.1 in rotor",
+        "rotor speed [rad/s]",
+        "thrust [N]",
+        [
+            Curve(speeds, ours, "blade elements"),
+            Curve(speeds, PUBLISHED_MAP * speeds**2, "published thrust map", dashed=True),
+            Curve(points[:, 0], points[:, 1], "Agilicious' own model", marks=True, color=2),
+        ],
+    )
+
+
+def drag_panel() -> Panel:
+    """Deceleration of a level vehicle at hover thrust against the speed of flight."""
+    curves, speeds = list[Curve](), np.linspace(0.0, 10.0, 41)
+    for i, name in enumerate(("small", "kingfisher")):
+        bem = BemQuadrotor.of(VEHICLES[name](), DT)
+        found = np.array([_drag(bem, float(v)) for v in speeds])
+        curves.append(Curve(speeds, found[:, 0], f"{name}: rotors and body", color=i))
+        curves.append(Curve(speeds, found[:, 1], f"{name}: rotors", dashed=True, color=i))
+    curves.append(Curve(np.array([0.0, 8.0]), 0.24 * np.array([0.0, 8.0]), "kingfisher, published: 0.24 1/s", color=2))
+    return Panel("Drag of the level vehicle", "speed [m/s]", "deceleration [m/s²]", curves)
+
+
+def _drag(bem: BemQuadrotor, speed: float) -> tuple[float, float]:
+    x = State(jnp.zeros(3), jnp.eye(3), jnp.array([speed, 0.0, 0.0]))
+    s = _init(bem, x)
+    total = float(_loads(bem, s)[0])
+    body = float(bem.body_drag(s.body, jnp.zeros(3))[0])
+    mass = float(bem.vehicle.mass)
+    return -total / mass, -(total - body) / mass
+
+
+@eqx.filter_jit
+def _init(bem: BemQuadrotor, x: State) -> BemState:
+    return bem.init(x)
+
+
+@eqx.filter_jit
+def _loads(bem: BemQuadrotor, s: BemState) -> Float[Array, "3"]:
+    still = jnp.zeros_like(s.body.x.p)
+    blades, _ = bem.rotors(s.body, s.body.motors, s.inflow, still)
+    return bem.loads(s.body, s.body.motors, blades, ExternalEffects.calm(still.dtype)).force
+
+
+def inflow_panel() -> Panel:
+    """Induced velocity against descent, with and without the vortex-ring rule."""
+    descents = np.linspace(-6.0, 14.0, 81)
+    ruled, plain = list[float](), list[float]()
+    for v in descents:
+        _, inflow = _settled(five_inch(), jnp.array(1109.15), jnp.array(0.0), jnp.array(float(v)))
+        ruled.append(float(vortex_ring(inflow, jnp.array(float(v)))))
+        plain.append(float(inflow.v_i))
+    spec = np.array([[-4, 5.3631], [-2, 6.5346], [-1, 7.1522], [0, 7.7904], [1, 8.7662], [2, 9.5403], [4, 10.9296]])
+    return Panel(
+        "Induced velocity, kingfisher's rotor at hover speed",
+        "descent [m/s]",
+        "induced velocity [m/s]",
+        [
+            Curve(descents, np.array(ruled), "with the vortex-ring rule"),
+            Curve(descents, np.array(plain), "momentum theory alone", dashed=True),
+            Curve(spec[:, 0], spec[:, 1], "fine quadrature, bracketing search", marks=True, color=2),
+        ],
+    )
+
+
+def rate_panel() -> Panel:
+    """Response of the roll rate to a step of the command."""
+    curves = list[Curve]()
+    for name in VEHICLES:
+        bem = BemQuadrotor.of(VEHICLES[name](), DT)
+        for axis, word in ((0, "roll"), (2, "yaw")):
+            u = Command(jnp.array(STANDARD_GRAVITY), 2.0 * jnp.eye(3)[axis])
+            rates = np.asarray(_flown(bem, u, lambda s: s.body.omega, 300))[:, axis]
+            curves.append(
+                Curve(np.arange(1, 301) * 1.0, rates / 2.0, f"{name}, {word}", dashed=axis == 2, color=len(curves) // 2)
+            )
+    return Panel("Step of the body rate", "time [ms]", "rate / command", curves, columns=2)
+
+
+def step_panel() -> Panel:
+    """Response of the acceleration to a step of collective thrust."""
+    curves = []
+    for name in VEHICLES:
+        bem = BemQuadrotor.of(VEHICLES[name](), DT)
+        u = Command(jnp.array(STANDARD_GRAVITY + 5.0), jnp.zeros(3))
+        speeds = np.asarray(_flown(bem, u, lambda s: s.body.x.v, 300))[:, 2]
+        curves.append(Curve(np.arange(2, 301) * 1.0, np.diff(speeds) / SUBSTEP, name))
+    curves.append(Curve(np.array([0.0, 300.0]), np.array([5.0, 5.0]), "commanded", dashed=True))
+    return Panel("Step of collective thrust by 5 m/s²", "time [ms]", "vertical acceleration [m/s²]", curves)
+
+
+def sag_panel() -> Panel:
+    """Vertical acceleration under u_hover while the battery sags."""
+    bem, sag, times = BemQuadrotor.of(VEHICLES["small"](), DT), disturbance("battery"), np.linspace(0.0, 120.0, 61)
+    x = State.at(jnp.zeros(3))
+    found = []
+    for t in times:
+        s = _init(bem, x)
+        effects = sag(jnp.array(float(t)), x)
+        still = jnp.zeros(3)
+        blades, _ = bem.rotors(s.body, s.body.motors, s.inflow, still)
+        force = bem.loads(s.body, s.body.motors, blades, effects).force[2]
+        found.append(float(force / bem.vehicle.mass) - STANDARD_GRAVITY)
+    return Panel(
+        "Battery sag: u_hover held still",
+        "time [s]",
+        "vertical acceleration [m/s²]",
+        [Curve(times, np.array(found), "small, -0.2 %/s down to 80 %")],
+    )
+
+
+@eqx.filter_jit
+def _flown(bem: BemQuadrotor, u: Command, see: Callable[[BemState], Array], steps: int) -> Array:
+    """What ``see`` sees after each millisecond, from hover."""
+    effects = ExternalEffects.calm(jnp.zeros(3).dtype)
+
+    def step(s: BemState, _: None) -> tuple[BemState, Array]:
+        after = bem.substep(s, u, effects)
+        return after, see(after)
+
+    return lax.scan(step, bem.init(State.at(jnp.zeros(3))), None, length=steps)[1]
+
+
+def _row(what: str, ours: float, theirs: float, source: str) -> dict[str, Any]:
+    return {"what": what, "ours": ours, "published": theirs, "source": source}

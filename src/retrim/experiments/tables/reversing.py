@@ -1,0 +1,97 @@
+"""Hover under a push that turns around every 15 s (the paper's Sec. IV-B.3)."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...config.loading import load
+from ...config.presets import Adapt
+from ...config.scenario import Scenario
+from ...config.setup import Method, Setup
+from ...errors import ConfigError
+from ..figures import picture
+from ..flights import Flight
+from ..metrics import rows
+from ..reporter import Reporter
+from ..run import Run
+from .document import Document, TableSection
+from .study import fly_all, train_all
+
+PERIOD = 15.0  # [s]
+METHODS: dict[Method, str] = {"base": "base policy", "full": "**adapted**"}
+INTRO = """\
+Made by `retrim reproduce reversing`. ±0.5 m/s² on each axis, reversed every 15 s. Mean error [m] over a second:
+that before the reversal, that before the next update takes effect, and that before each later one or the next
+reversal; mean ± standard deviation over flights. The first update that takes effect after a reversal was still
+learnt before it. Learning is charged to flight time by the preset's fixed latencies."""
+
+
+def reversing(
+    run: Run,
+    reporter: Reporter,
+    *,
+    preset: str = "hover/fast",
+    plant: str = "bem",
+    seeds: Sequence[int] = (0,),
+    seconds: float = 60.0,
+    starts: int = 8,
+) -> None:
+    """Make ``reversing.md``: the error before and after each update, its peak, and the picture."""
+    loaded = load(preset)
+    if loaded.task != "hover" or seconds < 2 * PERIOD:
+        raise ConfigError(f"{preset}, {seconds:g} s: needs a preset for hover and at least {2 * PERIOD:g} s")
+    document = Document(
+        run, "reversing", "Hover under a push that reverses (Sec. IV-B.3 of the paper)", INTRO, seeds, reporter
+    )
+    study = train_all(loaded, seeds, run, reporter)
+    scenario = Scenario("reversing", plant=plant)
+    flown = fly_all(study, [scenario], run, reporter, starts=starts, seconds=seconds).flown
+    if not flown:
+        document.write()
+        return
+    moments = _moments(loaded.adapt, seconds)
+    errors: dict[Method, list[np.ndarray]] = {
+        m: [_errors(f, moments) for f in flown if f.spec.method == m and not f.log.terminated] for m in METHODS
+    }
+    found = rows(flown)
+    peaks = "; ".join(f"{METHODS[row['method']].strip('*')} {_peak(row)}" for row in found)
+    crashed = sum(row["crashes"] for row in found)
+    about = f"{study.about()} Median of the largest error after 5 s [m]: {peaks}. {crashed} of {len(flown)} flights crashed."
+    drawn = picture(flown, Setup.of(loaded), scenario, run.folder)
+    document.more = {"moments_s": moments.tolist(), "errors_m": {m: np.array(e).tolist() for m, e in errors.items()}}
+    document.add(_section(errors, moments, about, drawn[0]), found)
+
+
+def _peak(row: dict[str, Any]) -> str:
+    return "-" if row["peak_after_5s"] is None else f"{row['peak_after_5s']:.3f}"
+
+
+def _moments(adapt: Adapt, seconds: float) -> np.ndarray:
+    """When the errors are read [s]: for each reversal, at it, and at the end of what each update leads to."""
+    turns = np.arange(PERIOD, seconds - PERIOD / 2, PERIOD)
+    swaps = np.arange(adapt.update_latency, PERIOD, adapt.update_every)
+    moments: np.ndarray = np.minimum(turns[:, None] + np.concatenate([[0.0], swaps, [PERIOD]])[None], seconds)
+    return moments
+
+
+def _errors(flight: Flight, moments: np.ndarray) -> np.ndarray:
+    """Mean over the second before each moment [m]."""
+    t = flight.log.t
+    found = [flight.error[(t > end - 1.0) & (t <= end + 1e-6)].mean() for end in moments.flat]
+    return np.array(found).reshape(moments.shape)
+
+
+def _section(errors: dict[Method, list[np.ndarray]], moments: np.ndarray, about: str, drawn: Path) -> TableSection:
+    updates = [f"after update {i}" for i in range(1, moments.shape[1] - 1)]
+    lines = list[tuple[str, ...]]()
+    for i, reversal in enumerate(moments[:, 0]):
+        for method, name in METHODS.items():
+            table = [found[i] for found in errors[method]]
+            columns = np.array(table).T  # empty where none was flown to its end
+            cells = [f"{c.mean():.3f} ± {c.std(ddof=len(table) > 1):.3f}" for c in columns]
+            cells = cells or ["-"] * moments.shape[1]
+            lines.append((f"reversed at {reversal:g} s, {name}", *cells))
+    columns_ = ("", "just before it", "before an update takes effect", *updates)
+    return TableSection(columns_, tuple(lines), "", about, drawn)

@@ -1,0 +1,83 @@
+"""Pretraining with progress, and the error of a policy in its own model."""
+
+import threading
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import random
+from jaxtyping import Array
+
+from ..config.loading import changed
+from ..config.setup import Setup
+from ..control.policy import Policy
+from ..learn.env import Env
+from ..learn.rollout import rollout
+from ..tasks.task import Start
+from .reporter import Reporter, Silent
+
+
+class Trained(NamedTuple):
+    """Result of pretraining; after an interruption the last state that was reached."""
+
+    policy: Policy
+    losses: list[float]
+    """Loss of each optimiser step."""
+
+
+def train(
+    setup: Setup, seed: int = 0, *, reporter: Reporter | None = None, stop: threading.Event | None = None
+) -> Trained:
+    """Pretrain a policy.
+
+    Args:
+        setup: What to train.
+        seed: Seed of weights and starts.
+        reporter: Receives the progress.
+        stop: Ends training after the current steps; Ctrl-C does the same, and sets it.
+    """
+    stop = stop or threading.Event()
+    p, vision = setup.preset.pretrain, setup.preset.vision
+    policy, losses = setup.new_policy(random.key(seed)), list[float]()
+    first = f"encoder, {vision.encoder_steps} steps" if vision and vision.encoder_steps else "compiling"
+    title = f"pretraining, {p.num_updates} x {p.num_envs} x {p.horizon}"
+    with (reporter or Silent()).progress(title) as advance:
+        advance(0.0, first)
+        try:
+            for trained, latest in setup.pretraining(seed):
+                policy = trained
+                losses += [float(loss) for loss in latest]
+                advance(len(losses) / p.num_updates, f"loss {losses[-1]:.3f}")
+                if stop.is_set():
+                    break
+        except KeyboardInterrupt:
+            stop.set()
+    return Trained(policy, losses)
+
+
+def nominal_error(setup: Setup, policy: Policy, *, n: int = 64, seed: int = 1) -> float:
+    """Return the mean error in the policy's own model [m], over the last half second of 6 s.
+
+    Args:
+        setup: Preset of the policy.
+        policy: What flies.
+        n: Number of roll-outs, from starts of its training.
+        seed: Seed of the starts.
+    """
+    dt = setup.preset.dt
+    env = Setup.of(changed(setup.preset, pretrain={"horizon": round(6.0 / dt)})).env
+    x0 = jax.vmap(env.task.reset)(random.split(random.key(seed), n))
+    return float(_settled(policy, env, x0, round(0.5 / dt)))
+
+
+@eqx.filter_jit
+def _settled(policy: Policy, env: Env, x0: Start, ticks: int) -> Array:
+    def error(start: Start) -> Array:
+        flown = rollout(env, policy, start)
+        last = jax.tree.map(lambda leaf: leaf[-ticks:], flown.x)
+        horizon = env.task.horizon
+        times = start.t + env.task.dt * jnp.arange(horizon - ticks, horizon, dtype=start.t.dtype)
+        return jnp.mean(jax.vmap(env.task.error)(times, last))
+
+    return jnp.mean(jax.vmap(error)(x0))

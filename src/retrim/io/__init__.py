@@ -1,0 +1,10 @@
+"""Files: policies, deltas, and what a flight has learnt."""
+
+from .checkpoint import load_delta as load_delta
+from .checkpoint import read_policy as read_policy
+from .checkpoint import save_delta as save_delta
+from .checkpoint import write_policy as write_policy
+from .trained import load_learnt as load_learnt
+from .trained import load_policy as load_policy
+from .trained import save_learnt as save_learnt
+from .trained import save_policy as save_policy

@@ -1,0 +1,138 @@
+"""Policies as files: weights, limits, a description and a checksum. Reading one needs no configuration."""
+
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import random
+
+from ..control.lora import LoraPolicy
+from ..control.policy import Policy
+from ..errors import CheckpointError, MessageError
+from ..physics.vehicle import small
+from ..transport import wire
+from .files import read_bounded, write_whole
+
+MAX_WIDTH, MAX_LAYERS = 16_384, 16
+
+
+def write_policy(path: str | Path, policy: Policy, about: Mapping[str, str]) -> None:
+    """Write a policy; the folder is made if need be.
+
+    Args:
+        path: The file.
+        policy: What to write.
+        about: Header fields, as a preset; the architecture is added.
+    """
+    header = {**about, "architecture": architecture(policy)}
+    write_whole(Path(path), wire.pack(policy, kind="policy", about=header))
+
+
+def read_policy(path: str | Path) -> tuple[Policy, dict[str, str]]:
+    """Read a policy from a file, or from a folder that holds ``policy.safetensors``.
+
+    Returns:
+        The policy, and the header of its file.
+
+    Raises:
+        CheckpointError: The file is missing, truncated, damaged or of another kind, its weights are not finite, or
+            its limits do not enclose hover.
+    """
+    path = Path(path)
+    file = path / "policy.safetensors" if path.is_dir() else path
+    data = read_bounded(file, "`retrim pretrain hover --out DIR` makes one")
+    try:
+        header = wire.describe(data, kind="policy", source=str(file))
+        like = policy_like(header.get("architecture", ""), source=str(file))
+        policy = wire.unpack(data, like, kind="policy", source=str(file))
+    except MessageError as error:
+        raise CheckpointError(str(error)) from error
+    low, hover, high = (np.asarray(u.vector()) for u in (policy.u_min, policy.u_hover, policy.u_max))
+    if not (np.all(low < hover) and np.all(hover < high)):
+        raise CheckpointError(f"{file}: command limits {low} to {high} do not enclose hover, {hover}")
+    return policy, header
+
+
+def policy_like(sizes: str, *, source: str) -> Policy:
+    """Return the shapes of a policy from its architecture, as ``15-512-512-4``.
+
+    Raises:
+        CheckpointError: It is no architecture of a policy.
+    """
+    try:
+        widths = [int(word) for word in sizes.split("-")]
+    except ValueError:
+        widths = []
+    if not (3 <= len(widths) <= MAX_LAYERS and all(0 < n <= MAX_WIDTH for n in widths) and widths[-1] == 4):
+        raise CheckpointError(f"{source}: architecture {sizes!r}, expected sizes as 15-512-512-4")
+    like: Policy = jax.eval_shape(lambda: Policy.of(widths[0], small(), key=random.key(0), hidden=tuple(widths[1:-1])))
+    return like
+
+
+def architecture(policy: Policy) -> str:
+    """Return the sizes of a policy's layers, as ``15-512-512-4``."""
+    return "-".join(str(n) for n in (policy.layers[0].weight.shape[1], *(l.weight.shape[0] for l in policy.layers)))
+
+
+def fingerprint(policy: Policy) -> str:
+    """Return a hash of a policy's weights in single precision: a low-rank delta belongs to one base."""
+    digest = hashlib.sha256()
+    for layer in policy.layers:
+        for leaf in (layer.weight, layer.bias):
+            digest.update(np.asarray(leaf, dtype=np.float32, order="C").tobytes())
+    return digest.hexdigest()
+
+
+def save_delta(path: str | Path, policy: LoraPolicy) -> None:
+    """Write what a low-rank policy has learnt, without its base: about 50 kB for the paper's network."""
+    about = {"base": fingerprint(policy.base), **lora_header(policy)}
+    write_whole(Path(path), wire.pack(policy.delta, kind="delta", about=about))
+
+
+def load_delta(path: str | Path, base: Policy) -> LoraPolicy:
+    """Read a delta and put it on its base; ``.merged()`` flies.
+
+    Raises:
+        CheckpointError: The file is missing, damaged or of another kind, or made for another base.
+    """
+    path = Path(path)
+    data = read_bounded(path, "`retrim fly --adapt lora --out DIR` makes a delta.safetensors")
+    try:
+        header = wire.describe(data, kind="delta", source=str(path))
+        if header.get("base") != fingerprint(base):
+            made_for = header.get("base", "unnamed")[:12]
+            raise CheckpointError(
+                f"{path}: made for another base policy, {made_for}..., not for {fingerprint(base)[:12]}..."
+            )
+        like = lora_like(base, header, source=str(path))
+        delta = wire.unpack(data, like.delta, kind="delta", source=str(path))
+    except MessageError as error:
+        raise CheckpointError(str(error)) from error
+    return LoraPolicy(base, delta, jnp.asarray(float(header["scale"]), dtype=base.layers[0].weight.dtype))
+
+
+def lora_header(policy: LoraPolicy) -> dict[str, str]:
+    """Return the header fields that give the shapes of a low-rank policy."""
+    ranks = "-".join(str(factors.down.shape[0]) for factors in policy.delta)
+    return {"ranks": ranks, "scale": repr(float(policy.scale))}
+
+
+def lora_like(base: Policy, header: Mapping[str, str], *, source: str) -> LoraPolicy:
+    """Return the shapes of a low-rank policy on ``base`` from header fields.
+
+    Raises:
+        CheckpointError: Ranks or scale are missing or cannot be.
+    """
+    try:
+        ranks, scale = tuple(map(int, header["ranks"].split("-"))), float(header["scale"])
+        if not np.isfinite(scale):
+            raise ValueError(f"scale {scale}")
+        like: LoraPolicy = jax.eval_shape(
+            lambda base: LoraPolicy.of(base, key=random.key(0), ranks=ranks, scale=scale), base
+        )
+    except (KeyError, ValueError) as error:
+        raise CheckpointError(f"{source}: no usable ranks and scale of a low-rank delta ({error})") from error
+    return like

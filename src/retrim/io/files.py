@@ -1,0 +1,61 @@
+"""Files that are written whole or not at all."""
+
+import contextlib
+import os
+from pathlib import Path
+
+from ..errors import CheckpointError, ConfigError
+from ..transport.wire import MAX_BYTES
+
+
+def write_whole(path: Path, data: bytes | str) -> None:
+    """Write a file through a partial one beside it, so that an interruption leaves the old file or the new one.
+
+    Raises:
+        OSError: The folder cannot be written, or the disk is full.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(path.name + ".partial")
+    try:
+        with partial.open("wb") as file:
+            file.write(data.encode() if isinstance(data, str) else data)
+            file.flush()
+            os.fsync(file.fileno())
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def read_bounded(path: Path, advice: str) -> bytes:
+    """Read a file of at most :data:`retrim.transport.wire.MAX_BYTES`.
+
+    Raises:
+        CheckpointError: It is no regular file (with ``advice`` on how to make one), too large, or cannot be read.
+    """
+    if not path.is_file():
+        raise CheckpointError(f"{path}: no such file; {advice}")
+    if (size := path.stat().st_size) > MAX_BYTES:
+        raise CheckpointError(f"{path}: {size} bytes, more than the {MAX_BYTES} that are accepted")
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise CheckpointError(f"{path}: cannot be read ({error.strerror})") from error
+
+
+def check_writable(folder: Path) -> None:
+    """Make a folder and check that files can be written there, before anything long begins.
+
+    Raises:
+        ConfigError: They cannot.
+    """
+    probe = folder / ".retrim-probe"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe.write_bytes(b"x" * 4096)
+    except OSError as error:
+        raise ConfigError(
+            f"{folder}: results cannot be written there ({error.strerror}); choose another --out"
+        ) from error
+    finally:
+        with contextlib.suppress(OSError):
+            probe.unlink(missing_ok=True)

@@ -1,0 +1,29 @@
+"""The environment of training: a model, a task and a command delay as one value."""
+
+from typing import Any
+
+import equinox as eqx
+
+from ..physics.dynamics import AbstractDynamics, Hybrid, Residual
+from ..tasks.task import AbstractTask
+
+
+class Env(eqx.Module):
+    """Where a policy is trained and judged: one drone, one model, one task."""
+
+    dynamics: AbstractDynamics[Any]
+    """Model of the vehicle; it ticks at the task's rate."""
+    task: AbstractTask
+    delay_ticks: int = eqx.field(static=True, default=0)
+    """A command issued at a tick acts this many ticks later."""
+
+    def __check_init__(self) -> None:
+        """Raise ``ValueError`` for a negative delay, and for a model and a task that tick at different rates."""
+        if self.delay_ticks < 0:
+            raise ValueError(f"Env.delay_ticks = {self.delay_ticks} must not be negative")
+        if self.dynamics.dt != self.task.dt:
+            raise ValueError(f"Env: the model ticks every {self.dynamics.dt} s, the task every {self.task.dt} s")
+
+    def with_residual(self, residual: Residual) -> "Env":
+        """Return the same environment with ``residual`` added to its model, without gradients through it."""
+        return Env(Hybrid(self.dynamics, residual), self.task, self.delay_ticks)

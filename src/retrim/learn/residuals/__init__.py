@@ -1,0 +1,10 @@
+"""Models of the residual acceleration, one per file, behind the protocol of :mod:`.model`."""
+
+from .ensemble import EnsembleModel as EnsembleModel
+from .ensemble import EnsembleResidual as EnsembleResidual
+from .ensemble import EnsembleState as EnsembleState
+from .ensemble import fit_ensemble as fit_ensemble
+from .model import FittedResidual as FittedResidual
+from .model import ResidualModel as ResidualModel
+from .targets import Targets as Targets
+from .targets import residual_targets as residual_targets

@@ -1,0 +1,48 @@
+"""What the online learner needs from a model of the residual acceleration."""
+
+from typing import Any, Protocol, runtime_checkable
+
+import equinox as eqx
+from jaxtyping import Array, Float, Key
+
+from ...physics.state import Command, State
+from .targets import Targets
+
+
+@runtime_checkable
+class ResidualModel(Protocol):
+    """A way to learn the residual. It is an ``eqx.Module`` that holds settings; what is learnt is its *state*.
+
+    Every method is pure and traceable. The state is a pytree of arrays with fixed shapes.
+    """
+
+    def init(self, key: Key[Array, ""]) -> Any:
+        """Return the state before the first fit; it must predict zero. The key is consumed."""
+        ...
+
+    def fit(self, state: Any, rows: Targets) -> tuple[Any, Float[Array, ""]]:
+        """Fit to ``rows`` from ``state``.
+
+        Returns:
+            The new state, and the root mean square of the error over the valid rows [m/s^2].
+        """
+        ...
+
+    def predict(self, state: Any, x: State, u: Command) -> Float[Array, "3"]:
+        """Return the predicted residual acceleration, world frame [m/s^2]."""
+        ...
+
+    def spread(self, state: Any, x: State, u: Command) -> Float[Array, "3"]:
+        """Return the uncertainty of the prediction, one standard deviation per axis [m/s^2]."""
+        ...
+
+
+class FittedResidual(eqx.Module):
+    """A residual model with its state: a function of (x, u), as :class:`retrim.physics.Hybrid` takes it."""
+
+    model: ResidualModel
+    state: Any
+
+    def __call__(self, x: State, u: Command) -> Float[Array, "3"]:
+        """Return the predicted residual acceleration, world frame [m/s^2]."""
+        return self.model.predict(self.state, x, u)

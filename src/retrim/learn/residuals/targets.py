@@ -1,0 +1,76 @@
+"""What the nominal model missed in a window of flight (paper, Sec. III-D)."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from ...physics.dynamics import AbstractDynamics
+from ...physics.state import Command, State
+from ..window import Window
+
+
+class Targets(eqx.Module):
+    """Rows of a residual fit: inputs, the acceleration that the model missed, and which rows count."""
+
+    x: State
+    """State at the start of each tick (leading axis n)."""
+    u: Command
+    """Command *acting* during the tick (leading axis n)."""
+    a_res: Float[Array, "n 3"]
+    """Missed acceleration, world frame [m/s^2]."""
+    valid: Bool[Array, " n"]
+
+
+def residual_targets(window: Window, nominal: AbstractDynamics[Any], *, delay_ticks: int = 0) -> Targets:
+    """Compute a_res = a_gt - a_hat of each tick.
+
+    a_gt is the forward difference of velocity over the tick, a_hat that of the nominal model from the same state, both
+    under the command that was acting: the one accepted ``delay_ticks`` before.
+
+    A row does not count if its time step, or a step between its command and it, is not one tick (a gap in the
+    measurements), nor while the hidden state of the model (an actuator lag) still remembers the assumed hover start.
+
+    Args:
+        window: n ticks of flight.
+        nominal: The analytical model.
+        delay_ticks: Declared command delay of the plant [ticks].
+
+    Returns:
+        n - 1 - ``delay_ticks`` rows.
+
+    Raises:
+        ValueError: The window is too short for the delay.
+    """
+    n = window.valid.shape[0]
+    rows = n - 1 - delay_ticks
+    if rows < 1:
+        raise ValueError(f"a window of {n} ticks is too short for a delay of {delay_ticks} ticks")
+    x = jax.tree.map(lambda leaf: leaf[delay_ticks : delay_ticks + rows], window.x)
+    v_next = window.x.v[delay_ticks + 1 :]
+    u = jax.tree.map(lambda leaf: leaf[:rows], window.u)
+
+    def tick(s: Any, row: tuple[State, Command, Float[Array, "3"]]) -> tuple[Any, Float[Array, "3"]]:
+        x, u, v_next = row
+        after = nominal.step(nominal.with_state(s, x), u, jnp.zeros_like(x.p))  # hidden state, as a lag, goes on
+        return after, (v_next - nominal.state(after).v) / nominal.dt
+
+    first = nominal.init(jax.tree.map(lambda leaf: leaf[0], x))
+    _, a_res = lax.scan(tick, first, (x, u, v_next))
+    settled = _settled(window, nominal.settling_ticks)[:rows]
+    return Targets(x, u, a_res, window.valid[:rows] & _regular(window, nominal.dt, delay_ticks) & settled)
+
+
+def _regular(window: Window, dt: float, delay_ticks: int) -> Bool[Array, " rows"]:
+    """Whether all steps from the row's command to its next velocity are one tick long, to a quarter of it."""
+    one_tick = jnp.abs(jnp.diff(window.t) - dt) < 0.25 * dt
+    rows = one_tick.shape[0] - delay_ticks
+    return jnp.all(jnp.stack([one_tick[k : k + rows] for k in range(delay_ticks + 1)]), axis=0)
+
+
+def _settled(window: Window, ticks: int | Float[Array, ""]) -> Bool[Array, " n"]:
+    """Whether at least ``ticks`` valid ticks lie before this one in the window."""
+    return jnp.cumsum(window.valid) > ticks

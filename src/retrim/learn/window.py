@@ -1,0 +1,47 @@
+"""The last seconds of a flight, as learners take them."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from ..physics.state import Command, State
+
+
+class Window(eqx.Module):
+    """The last ``n`` ticks of a flight, oldest first. While it fills, ``valid`` is false in front."""
+
+    t: Float[Array, " n"]
+    """Time of each tick [s], by the plant's clock."""
+    x: State
+    """Measured state at each tick (leading axis n)."""
+    u: Command
+    """Command that the plant accepted at each tick (leading axis n)."""
+    valid: Bool[Array, " n"]
+
+    @classmethod
+    def of(
+        cls,
+        t: Float[Array, " n"],
+        p: Float[Array, "n 3"],
+        R: Float[Array, "n 3 3"],
+        v: Float[Array, "n 3"],
+        c: Float[Array, " n"],
+        omega: Float[Array, "n 3"],
+    ) -> "Window":
+        """Build a window from the columns of a flight log.
+
+        Args:
+            t: Times [s], rising.
+            p: Positions, world [m].
+            R: Attitudes, body to world.
+            v: Velocities, world [m/s].
+            c: Collective thrust commands, mass-normalised [m/s^2].
+            omega: Body rate commands [rad/s].
+
+        Returns:
+            A window in which every tick is valid.
+        """
+        states = jax.vmap(State)(jnp.asarray(p), jnp.asarray(R), jnp.asarray(v))
+        commands = jax.vmap(Command)(jnp.asarray(c), jnp.asarray(omega))
+        return cls(jnp.asarray(t), states, commands, jnp.ones(len(t), dtype=bool))

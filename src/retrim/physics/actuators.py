@@ -1,0 +1,59 @@
+"""First-order actuator lag for any model: without it, a sharp reward learns gains that slow motors cannot follow."""
+
+from typing import Generic, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .dynamics import AbstractDynamics
+from .state import Command, State
+
+X = TypeVar("X")
+
+
+class LagState(eqx.Module, Generic[X]):
+    """State of the model, and the command that has arrived at the actuators."""
+
+    inner: X
+    acting: Command
+
+
+class Lagged(AbstractDynamics[LagState[X]]):
+    """Each command reaches the model through a first-order lag; the model sees where it stands after the tick."""
+
+    base: AbstractDynamics[X]
+    tau: Float[Array, ""]
+    """Time constant [s]."""
+
+    @property
+    def dt(self) -> float:
+        """Control tick of the base model [s]."""
+        return self.base.dt
+
+    @property
+    def settling_ticks(self) -> Float[Array, ""]:
+        """Three time constants, on top of the base model's settling time [ticks]."""
+        return jnp.ceil(3.0 * self.tau / self.dt) + self.base.settling_ticks
+
+    def init(self, x: State) -> LagState[X]:
+        """Lift to the base model's state, with the actuators at hover."""
+        hover = jax.tree.map(lambda leaf: leaf.astype(x.p.dtype), Command.hover())
+        return LagState(self.base.init(x), hover)
+
+    def state(self, s: LagState[X]) -> State:
+        """Return the vehicle's state."""
+        return self.base.state(s.inner)
+
+    def with_state(self, s: LagState[X], x: State) -> LagState[X]:
+        """Replace (p, R, v); hidden state stays."""
+        return LagState(self.base.with_state(s.inner, x), s.acting)
+
+    def step(self, s: LagState[X], u: Command, a_ext: Float[Array, "3"]) -> LagState[X]:
+        """One tick under the mean of the lagged command over it."""
+        decay = jnp.exp(-self.dt / self.tau)
+        left = self.tau / self.dt * (1.0 - decay)  # share of the old command in the mean over the tick
+        mean = jax.tree.map(lambda old, new: new + left * (old - new), s.acting, u)
+        end = jax.tree.map(lambda old, new: new + decay * (old - new), s.acting, u)
+        return LagState(self.base.step(s.inner, mean, a_ext), end)

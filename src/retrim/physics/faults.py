@@ -1,0 +1,79 @@
+"""What goes wrong with the vehicle itself: a load, a sagging battery, a weak rotor."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .effects import ExternalEffects
+from .state import State
+from .vehicle import payload_inertia
+
+
+class Payload(eqx.Module):
+    """A load picked up at one time and dropped at another; the flight controller does not know of it."""
+
+    mass: Float[Array, ""]
+    """[kg]"""
+    inertia: Float[Array, "3"]
+    """[kg m^2]"""
+    picked: Float[Array, ""]
+    """[s]"""
+    dropped: Float[Array, ""]
+    """[s]; infinity: never"""
+
+    def __check_init__(self) -> None:
+        """Raise ``ValueError`` for a load that weighs nothing, or is dropped before it is picked up."""
+        if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(self)):
+            return
+        if not self.mass > 0 or not self.dropped > self.picked:
+            raise ValueError(f"Payload: mass = {self.mass} kg, picked = {self.picked} s, dropped = {self.dropped} s")
+
+    @classmethod
+    def of(cls, mass: float, *, picked: float = 0.0, dropped: float = float("inf")) -> "Payload":
+        """A small cube under the vehicle; see :func:`payload_inertia`."""
+        return cls(jnp.array(mass), payload_inertia(mass), jnp.array(picked), jnp.array(dropped))
+
+    def __call__(self, t: Float[Array, ""], x: State) -> ExternalEffects:
+        """Heavier, while it is carried."""
+        carried = jnp.where((t >= self.picked) & (t < self.dropped), 1.0, 0.0).astype(self.mass.dtype)
+        return ExternalEffects.of(x.p.dtype, mass=carried * self.mass, inertia=carried * self.inertia)
+
+
+class BatterySag(eqx.Module):
+    """Thrust falls at a steady rate, down to a floor, as the battery's voltage does."""
+
+    rate: Float[Array, ""]
+    """Share of the thrust lost per second [1/s]."""
+    floor: Float[Array, ""]
+    """Share that remains at the end."""
+
+    def __check_init__(self) -> None:
+        """Raise ``ValueError`` if the rate is negative or the floor is not between 0 and 1."""
+        if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(self)):
+            return
+        if not self.rate >= 0 or not 0 < self.floor <= 1:
+            raise ValueError(f"BatterySag: rate = {self.rate} 1/s, floor = {self.floor}")
+
+    def __call__(self, t: Float[Array, ""], x: State) -> ExternalEffects:
+        """All rotors weaker."""
+        share = jnp.maximum(1.0 - self.rate * t, self.floor)
+        return ExternalEffects.of(x.p.dtype, gain=share * jnp.ones(4, dtype=share.dtype))
+
+
+class WeakRotor(eqx.Module):
+    """One rotor gives less thrust and torque than its speed promises: a chipped propeller."""
+
+    gain: Float[Array, "4"]
+    """Front-right, back-left, back-right, front-left."""
+
+    @classmethod
+    def of(cls, rotor: int, share: float) -> "WeakRotor":
+        """``rotor`` 0 ... 3 keeps ``share`` of its thrust."""
+        if rotor not in range(4) or not 0 < share <= 1:
+            raise ValueError(f"WeakRotor: rotor = {rotor} must be 0 to 3, share = {share} in (0, 1]")
+        return cls(jnp.ones(4).at[rotor].set(share))
+
+    def __call__(self, t: Float[Array, ""], x: State) -> ExternalEffects:
+        """One rotor weaker."""
+        return ExternalEffects.of(x.p.dtype, gain=self.gain)

@@ -1,0 +1,11 @@
+"""Plants, one file each. Packages that only one of them needs are imported when such a plant is made."""
+
+from .crazyflow import CrazyflowPlant as CrazyflowPlant
+from .mujoco import MujocoPlant as MujocoPlant
+from .plant import Measurement as Measurement
+from .plant import Plant as Plant
+from .plant import as_numpy as as_numpy
+from .plant import check_command as check_command
+from .rotorpy import RotorpyPlant as RotorpyPlant
+from .sensors import SensorModel as SensorModel
+from .sim import SimPlant as SimPlant

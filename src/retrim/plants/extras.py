@@ -1,0 +1,27 @@
+"""Packages that only one plant needs: imported when such a plant is made, never with ``retrim``."""
+
+import contextlib
+import importlib
+import io
+from types import ModuleType
+
+from ..errors import PlantError
+
+
+def import_extra(module: str, name: str) -> ModuleType:
+    """Import ``module``, which the extra ``name`` installs.
+
+    Raises:
+        PlantError: The extra is not installed, with the command that installs it; or SciPy was imported before
+            SCIPY_ARRAY_API=1 was set, which crazyflow needs.
+    """
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):  # mujoco.mjx prints which accelerators it did not find
+            return importlib.import_module(module)
+    except ImportError as error:
+        raise PlantError(
+            f"plant {name!r} needs the package {name!r} ({error}); in a checkout: `make dev`, or "
+            f"`uv pip install -e '.[{name}]'`; elsewhere: `pip install {name}`"
+        ) from error
+    except RuntimeError as error:
+        raise PlantError(f"plant {name}: {' '.join(str(error).split())}") from error

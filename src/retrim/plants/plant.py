@@ -1,0 +1,132 @@
+"""The one imperative seam: simulators, other engines and vehicles stand behind the same three calls."""
+
+import math
+from types import TracebackType
+from typing import NamedTuple, Protocol, Self, runtime_checkable
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..errors import PlantError
+from ..physics.state import Command, State
+
+
+class Measurement(NamedTuple):
+    """What a plant measured at the end of a tick."""
+
+    t: float
+    """Time by the plant's clock [s]; it may start anywhere."""
+    x: State
+    """Measured position, attitude and velocity."""
+    omega: Float[Array, "3"] | None = None
+    """Body rates [rad/s], if they are measured."""
+    a: Float[Array, "3"] | None = None
+    """Acceleration, world [m/s^2], if it is measured; the mean over the tick."""
+    motor_speeds: Float[Array, "4"] | None = None
+    """Rotor speeds [rad/s], if they are measured."""
+    battery: float | None = None
+    """Charge left, 0 to 1, if it is known."""
+    age: float = 0.0
+    """Time since the state was valid [s]."""
+    truth: State | None = None
+    """True state, where the plant knows better than its sensors. For scores, never for pilots."""
+
+    @property
+    def p(self) -> Float[Array, "3"]:
+        """Measured position, world [m]."""
+        return self.x.p
+
+    @property
+    def R(self) -> Float[Array, "3 3"]:
+        """Measured attitude, body to world."""
+        return self.x.R
+
+    @property
+    def v(self) -> Float[Array, "3"]:
+        """Measured velocity, world [m/s]."""
+        return self.x.v
+
+    @property
+    def true_state(self) -> State:
+        """True state, or the measured one where no other is known."""
+        return self.x if self.truth is None else self.truth
+
+
+@runtime_checkable
+class Plant(Protocol):
+    """Three calls and a context manager: leaving it stops the plant.
+
+    A plant derives from this class, or has the same methods.
+    """
+
+    dt: float
+    """Control tick [s]."""
+
+    def reset(self, x0: State | None) -> Measurement:
+        """Start a flight.
+
+        Args:
+            x0: State in which it starts; None for where the vehicle is.
+
+        Returns:
+            The first measurement.
+
+        Raises:
+            PlantError: The plant cannot start there.
+        """
+        ...
+
+    def step(self, u: Command) -> tuple[Measurement, Command]:
+        """Apply a command for one tick and block until it is over.
+
+        Args:
+            u: The command.
+
+        Returns:
+            The measurement at the end of the tick, and the command that was really accepted: ``u`` itself unless the
+            plant limited it.
+
+        Raises:
+            PlantError: The command is not finite (it then never reaches the vehicle), or the plant was stopped.
+        """
+        ...
+
+    def stop(self) -> None:
+        """Bring the vehicle to a safe state. Idempotent; always called at the end of a flight."""
+        ...
+
+    def __enter__(self) -> Self:
+        """Return the plant."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Stop the plant."""
+        self.stop()
+
+
+def as_numpy(u: Command) -> np.ndarray:
+    """Return [c, omega] as a NumPy array, without an operation of JAX."""
+    return np.append(np.asarray(u.c), np.asarray(u.omega))
+
+
+def check_command(u: Command, plant: str) -> None:
+    """Refuse a command that is not finite; every plant calls this first.
+
+    Raises:
+        PlantError: It names the plant and the entry.
+    """
+    for name, value in zip(("c", "omega[0]", "omega[1]", "omega[2]"), as_numpy(u).tolist(), strict=True):
+        if not math.isfinite(value):
+            raise PlantError(f"{plant}: command refused, {name} = {value} is not finite")
+
+
+def limited(u: Command, low: Command, high: Command) -> Command:
+    """Return ``u`` within the limits of a vehicle; ``u`` itself if it already is."""
+    wanted, least, most = as_numpy(u), as_numpy(low), as_numpy(high)
+    accepted = np.clip(wanted, least, most).astype(wanted.dtype)
+    if np.array_equal(accepted, wanted):
+        return u
+    return Command(jnp.asarray(accepted[0]), jnp.asarray(accepted[1:]))

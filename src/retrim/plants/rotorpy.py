@@ -1,0 +1,46 @@
+"""rotorpy's Hummingbird as a plant."""
+
+import math
+
+import numpy as np
+
+from ..errors import PlantError
+from ..physics.disturbance import Disturbance
+from ..physics.effects import ExternalEffects
+from ..physics.state import STANDARD_GRAVITY
+from .external import ExternalPlant, Pose
+from .extras import import_extra
+
+RATE_GAIN = 20.0  # [1/s]; rotorpy's own default, 1 1/s, lets the rates lag by a second
+STEPS = 2  # rotorpy's rate loop runs once per step of its integrator: at 100 Hz, as its own simulations do
+
+
+class RotorpyPlant(ExternalPlant):
+    """rotorpy's AscTec Hummingbird (0.5 kg): its rate loop, motors (5 ms), rotor and body drag, integrator.
+
+    Wind and push hold for a tick. The push is an external acceleration; rotorpy has no input for one, so that the
+    weight, a force in the world frame that rotorpy uses for nothing else, takes it in. There is no ground.
+    """
+
+    def __init__(self, disturbance: Disturbance, *, dt: float = 0.02) -> None:
+        super().__init__(disturbance, dt)
+        params = import_extra("rotorpy.vehicles.hummingbird_params", "rotorpy").quad_params
+        multirotor = import_extra("rotorpy.vehicles.multirotor", "rotorpy").Multirotor
+        self._rotation = import_extra("scipy.spatial.transform", "rotorpy").Rotation
+        self._quad = multirotor({**params, "k_w": RATE_GAIN}, control_abstraction="cmd_ctbr", aero=True)
+
+    def _launch(self, x: Pose) -> None:
+        hover = math.sqrt(self._quad.mass * STANDARD_GRAVITY / (4.0 * self._quad.k_eta))
+        q = self._rotation.from_matrix(x.R).as_quat()  # scalar last, as rotorpy's
+        self._state = {"x": x.p, "v": x.v, "q": q, "w": np.zeros(3), "rotor_speeds": np.full(4, hover)}
+
+    def _advance(self, u: np.ndarray, effects: ExternalEffects) -> Pose:
+        if np.any(effects.gain != 1.0) or np.any(effects.mass != 0.0) or np.any(effects.inertia != 0.0):
+            raise PlantError("RotorpyPlant: cannot carry a load or weaken rotors; it supports pushes and wind")
+        quad = self._quad
+        quad.weight = quad.mass * (np.asarray(effects.push[0]) - np.array([0.0, 0.0, STANDARD_GRAVITY]))
+        self._state["wind"] = np.asarray(effects.wind[0])
+        command = {"cmd_thrust": u[0] * quad.mass, "cmd_w": u[1:]}
+        for _ in range(STEPS):
+            self._state = quad.step(self._state, command, self.dt / STEPS)
+        return Pose(self._state["x"], self._rotation.from_quat(self._state["q"]).as_matrix(), self._state["v"])

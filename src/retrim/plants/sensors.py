@@ -1,0 +1,92 @@
+"""Sensor model: samples of the state at a rate, with latency, noise and dropouts; and an inertial unit."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax, random
+from jaxtyping import Array, Bool, Float, Key
+
+from ..physics import so3
+from ..physics.state import State, where
+
+
+class SensorModel(eqx.Module):
+    """A motion-capture system or an estimator, at 100 Hz as in the paper."""
+
+    position: Float[Array, ""]
+    """Standard deviation per axis [m]."""
+    velocity: Float[Array, ""]
+    """Standard deviation per axis [m/s]."""
+    attitude: Float[Array, ""]
+    """Standard deviation of a rotation about each body axis [rad]."""
+    dropout: Float[Array, ""]
+    """Probability that a sample is lost; the last one then stands."""
+    latency: int = eqx.field(static=True)
+    """Age of a sample when it arrives [ms]."""
+    period: int = eqx.field(static=True, default=10)
+    """Time between samples [ms]."""
+    gyro: float = eqx.field(static=True, default=0.0)
+    """Standard deviation of the body rates per axis [rad/s]; the inertial unit has no latency."""
+    accelerometer: float = eqx.field(static=True, default=0.0)
+    """Standard deviation of the acceleration per axis [m/s^2]."""
+
+    def __check_init__(self) -> None:
+        """Raise ``ValueError`` if a deviation is negative or a probability is none."""
+        if self.latency < 0 or self.period < 1:
+            raise ValueError(f"SensorModel: latency = {self.latency} ms, period = {self.period} ms")
+        if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(self)):
+            return
+        for name in ("position", "velocity", "attitude"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"SensorModel.{name} = {getattr(self, name)} must not be negative")
+        if not 0 <= self.dropout < 1:
+            raise ValueError(f"SensorModel.dropout = {self.dropout} must be in [0, 1)")
+
+    @classmethod
+    def of(
+        cls,
+        *,
+        position: float = 0.0,
+        velocity: float = 0.0,
+        attitude: float = 0.0,
+        dropout: float = 0.0,
+        latency: int = 0,
+        gyro: float = 0.0,
+        accelerometer: float = 0.0,
+    ) -> "SensorModel":
+        """Build a sensor model from plain numbers; by default exact, without latency, every 10 ms."""
+        return cls(
+            jnp.array(position),
+            jnp.array(velocity),
+            jnp.array(attitude),
+            jnp.array(dropout),
+            latency,
+            gyro=gyro,
+            accelerometer=accelerometer,
+        )
+
+    @property
+    def held(self) -> int:
+        """Number of samples under way, and the one that has arrived."""
+        return -(-self.latency // self.period) + 1
+
+    def noisy(self, x: State, key: Key[Array, ""]) -> State:
+        """One sample of ``x``."""
+        kp, kv, kr = random.split(key, 3)
+        dtype = x.p.dtype
+        p, v, r = (random.normal(k, (3,), dtype) for k in (kp, kv, kr))
+        return State(x.p + self.position * p, x.R @ so3.exp(self.attitude * r), x.v + self.velocity * v)
+
+    def received(self, queue: State, xs: State, key: Key[Array, ""]) -> State:
+        """The queue (oldest first, ``held`` long) after the true states ``xs``, one per period, were sampled."""
+
+        def one(queue: State, step: tuple[State, Key[Array, ""]]) -> tuple[State, None]:
+            x, key = step
+            k_noise, k_lost = random.split(key)
+            lost: Bool[Array, ""] = random.uniform(k_lost, (), self.dropout.dtype) < self.dropout
+            last = jax.tree.map(lambda leaf: leaf[-1], queue)
+            new = where(lost, last, self.noisy(x, k_noise))
+            return jax.tree.map(lambda old, n: jnp.concatenate([old[1:], n[None]]), queue, new), None
+
+        after, _ = lax.scan(one, queue, (xs, random.split(key, xs.p.shape[0])))
+        return after

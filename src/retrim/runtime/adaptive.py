@@ -1,0 +1,106 @@
+"""The adaptive pilot: flies a policy, feeds learners, and applies their updates."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from ..adapt.buffer import RollingBuffer
+from ..adapt.learner import LearnerState
+from ..adapt.updates import PolicyUpdate, ResidualUpdate, Update
+from ..control.controller import PolicyController
+from ..physics.state import Command
+from ..plants.plant import Measurement
+from ..tasks.observation import AbstractObservation
+from .events import Event
+from .learner import Learner
+from .pilot import ControllerPilot, Pilot
+
+
+class Scheduled(NamedTuple):
+    """A learner and how often it is offered a window."""
+
+    learner: Learner
+    every_s: float
+    """Time between windows [s], rounded to whole ticks."""
+
+
+class AdaptivePilot(Pilot):
+    """A pilot that learns as it flies. ``state`` is what has been learnt and published so far."""
+
+    def __init__(
+        self,
+        observation: AbstractObservation[Any],
+        state: LearnerState,
+        learners: Sequence[Scheduled],
+        *,
+        dt: float,
+        window: int,
+    ) -> None:
+        """Build a pilot.
+
+        Args:
+            observation: What the policy sees in flight.
+            state: Policy and residual at the start.
+            learners: They are offered windows in this order.
+            dt: Control tick [s].
+            window: Ticks of flight that learners see.
+        """
+        self._observation, self._dt = observation, dt
+        self._learners = tuple(learners)
+        self._periods = [max(1, round(each.every_s / dt)) for each in self._learners]
+        self._buffer = RollingBuffer(window)
+        self._pilot = ControllerPilot(PolicyController(observation, state.policy.policy.merged()))
+        self._ticks_offered = [0] * len(self._learners)
+        self._start = 0.0
+        self._new_events: list[Event] = []
+        self.state = state
+        self.events: list[Event] = []
+
+    def reset(self, measurement: Measurement) -> None:
+        """Start a flight: what was learnt stays; the buffer and what is under way do not."""
+        self._buffer.clear()
+        self._start, self._ticks_offered = measurement.t, [0] * len(self._learners)
+        for learner, _ in self._learners:
+            learner.reset()
+        self._pilot.reset(measurement)
+
+    def act(self, measurement: Measurement) -> Command:
+        """Apply updates that are visible, fly one tick, offer windows that are due."""
+        t = measurement.t - self._start
+        tick = round(t / self._dt)
+        self._apply(t, tick)
+        u = self._pilot.act(measurement)
+        self._buffer.push(t, measurement.x, u)
+        due = [i for i, period in enumerate(self._periods) if tick // period > self._ticks_offered[i]]
+        if due:
+            window = self._buffer.window()
+            for i in due:
+                self._ticks_offered[i] = tick // self._periods[i]
+                self._learners[i].learner.submit(window, tick)
+            self._apply(t, tick)  # skips are known at once
+        return u
+
+    def accepted(self, u: Command) -> None:
+        """Remember the command that the plant accepted, in the buffer and in the observation."""
+        self._buffer.accepted(u)
+        self._pilot.accepted(u)
+
+    def take_events(self) -> list[Event]:
+        """Return the events since the last call."""
+        found, self._new_events = self._new_events, []
+        return found
+
+    def _apply(self, t: float, tick: int) -> None:
+        for learner, _ in self._learners:
+            for update in learner.poll(tick):
+                self._publish(update)
+                self.events.append(Event.of(t, update))
+                self._new_events.append(self.events[-1])
+
+    def _publish(self, update: Update) -> None:
+        if isinstance(update, ResidualUpdate):
+            self.state = LearnerState(self.state.policy, update.state)
+        elif isinstance(update, PolicyUpdate):
+            self.state = LearnerState(update.state, self.state.residual)
+            self._pilot.controller = PolicyController(self._observation, update.state.policy.merged())
+        for learner, _ in self._learners:
+            learner.receive(update)

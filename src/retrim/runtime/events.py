@@ -1,0 +1,58 @@
+"""Events of a flight, and observers that follow it."""
+
+import json
+from pathlib import Path
+from typing import NamedTuple, Protocol, runtime_checkable
+
+from ..adapt.updates import KINDS, Update
+from ..physics.state import Command
+from ..plants.plant import Measurement
+
+
+class Event(NamedTuple):
+    """Something that adaptation did."""
+
+    t: float
+    """Time since the start of the flight at which it became visible [s]."""
+    kind: str
+    """``residual``, ``policy``, ``rejected`` (a result that must not be used) or ``skipped`` (the learner was busy)."""
+    note: str
+    """One line."""
+
+    @classmethod
+    def of(cls, t: float, update: Update) -> "Event":
+        """Return the event of an update that became visible at time ``t`` [s] of the flight."""
+        return cls(t, KINDS[type(update)], update.note())
+
+
+@runtime_checkable
+class Observer(Protocol):
+    """Follows a flight. It must not block."""
+
+    def measurement(self, measurement: Measurement, u: Command) -> None:
+        """Receive each measurement and the command accepted for the tick that it ended; hover for the first one."""
+        ...
+
+    def event(self, event: Event) -> None:
+        """Receive each event."""
+        ...
+
+
+class JsonlObserver:
+    """Writes events as lines of JSON, at once."""
+
+    def __init__(self, path: Path, **about: object) -> None:
+        """Open ``path`` to append; ``about`` stands in each line."""
+        self._file, self._about = path.open("a"), about
+
+    def measurement(self, measurement: Measurement, u: Command) -> None:
+        """Ignore it."""
+
+    def event(self, event: Event) -> None:
+        """Write one line."""
+        self._file.write(json.dumps({"event": event.kind, **self._about, "t": event.t, "note": event.note}) + "\n")
+        self._file.flush()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()

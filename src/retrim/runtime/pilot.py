@@ -1,0 +1,81 @@
+"""Pilots: what decides the next command of a flight, tick by tick."""
+
+import abc
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..control.controller import AbstractController
+from ..physics.state import Command, State
+from ..plants.plant import Measurement
+from .events import Event
+
+
+class Pilot(abc.ABC):
+    """Flies one vehicle. It may hold whatever it needs to."""
+
+    @abc.abstractmethod
+    def reset(self, measurement: Measurement) -> None:
+        """Start a flight. What was learnt before stays; what was remembered of an earlier flight does not.
+
+        Args:
+            measurement: The first one of the flight. Its time, by the plant's clock, is the flight's time zero.
+        """
+
+    @abc.abstractmethod
+    def act(self, measurement: Measurement) -> Command:
+        """Return the command for the next tick."""
+
+    def accepted(self, u: Command) -> None:
+        """Take note that the plant accepted ``u`` instead of the command that was issued last."""
+        del u
+
+    def take_events(self) -> list[Event]:
+        """Return what happened since the last call, and forget it."""
+        return []
+
+
+class FunctionPilot(Pilot):
+    """Any function of the measurement as a pilot."""
+
+    def __init__(self, function: Callable[[Measurement], Command]) -> None:
+        self._function = function
+
+    def reset(self, measurement: Measurement) -> None:
+        """Do nothing: a function remembers nothing."""
+
+    def act(self, measurement: Measurement) -> Command:
+        """Call the function."""
+        return self._function(measurement)
+
+
+class ControllerPilot(Pilot):
+    """Any controller as a pilot. ``controller`` may be replaced in flight; its memory goes on."""
+
+    def __init__(self, controller: AbstractController[Any]) -> None:
+        self.controller = controller
+        self._memory: Any = None
+        self._start = 0.0
+
+    def reset(self, measurement: Measurement) -> None:
+        """Initialise the controller's memory."""
+        self._memory, self._start = self.controller.init(measurement.x), measurement.t
+
+    def act(self, measurement: Measurement) -> Command:
+        """Call the controller once, with the time since the start of the flight."""
+        x = measurement.x
+        t = jnp.asarray(measurement.t - self._start, dtype=x.p.dtype)
+        u, self._memory = _decide(self.controller, self._memory, t, x)
+        return u
+
+    def accepted(self, u: Command) -> None:
+        """Correct the controller's memory of its last command."""
+        self._memory = self.controller.accepted(self._memory, u)
+
+
+@eqx.filter_jit
+def _decide(controller: AbstractController[Any], memory: Any, t: Float[Array, ""], x: State) -> tuple[Command, Any]:
+    return controller(memory, t, x)

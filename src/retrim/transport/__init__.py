@@ -1,0 +1,4 @@
+"""Parameters as bytes."""
+
+from .wire import pack as pack
+from .wire import unpack as unpack

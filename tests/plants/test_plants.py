@@ -1,0 +1,371 @@
+"""Conformance: what every plant must do. A new plant is one more row in PLANTS."""
+
+import importlib.util
+import os
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from helpers import random_state
+from retrim.adapt import ControllerPilot, Plant, PlantError, SimPlant, fly
+from retrim.config import factory as build
+from retrim.config import presets
+from retrim.config.registry import Scenario
+from retrim.control import AbstractController
+from retrim.physics import Command, Constant, LinearDragQuadrotor, Push, State, small, so3
+from retrim.plants import CrazyflowPlant, MujocoPlant, crazyflow
+
+EXTRAS = ("rotorpy", "mujoco", "crazyflow")
+PLANTS = {name: Scenario(name).make for name in ("bem", "simple", *EXTRAS)}
+START = State.at(jnp.array([0.3, -0.2, 1.5]))
+
+
+@pytest.fixture(params=list(PLANTS))
+def make(request):
+    """Plant in disturbances by name; skips, saying so, where its extra is not installed."""
+    if request.param in EXTRAS and importlib.util.find_spec(request.param) is None:
+        pytest.skip(f"the extra {request.param} is not installed")
+    return PLANTS[request.param]
+
+
+@pytest.fixture
+def plant(make):
+    return make("none")
+
+
+def after(plant, ticks, c=9.81, omega=(0.0, 0.0, 0.0)):
+    """State after that many ticks of one command."""
+    plant.reset(START)
+    for _ in range(ticks):
+        sample = plant.step(Command(jnp.array(c), jnp.array(omega)))
+    return sample.x
+
+
+def test_is_a_plant(plant):
+    assert isinstance(plant, Plant)
+
+
+def test_reset_puts_it_where_it_is_told(plant, key):
+    for x0 in (START, random_state(key, 0.3)):
+        sample = plant.reset(x0)
+        assert sample.t == 0.0
+        jax.tree.map(np.testing.assert_array_equal, sample.x, x0)
+
+
+def test_reset_without_a_state_is_a_metre_above_the_ground(plant):
+    sample = plant.reset(None)
+    np.testing.assert_array_equal(sample.x.vector(), State.at(jnp.array([0.0, 0.0, 1.0])).vector())
+    np.testing.assert_array_equal(sample.u.vector(), Command.hover().vector())
+
+
+def test_ticks(plant):
+    plant.reset(START)
+    times = [plant.step(Command.hover()).t for _ in range(5)]
+    np.testing.assert_allclose(times, plant.dt * np.arange(1, 6), atol=1e-12)
+
+
+def test_reset_forgets(plant):
+    def flight():
+        plant.reset(START)
+        return [plant.step(Command(jnp.array(11.0), jnp.array([1.0, 0.5, 0.2]))).x.vector() for _ in range(10)]
+
+    np.testing.assert_array_equal(flight(), flight())
+
+
+def test_hover_hovers(plant):
+    plant.reset(START)
+    for _ in range(10):
+        sample = plant.step(Command.hover())
+    assert float(jnp.linalg.norm(sample.x.p - START.p)) < 0.05
+
+
+def test_command_acts_after_the_delay_and_is_reported(plant):
+    """The command of tick k moves the vehicle from tick k + delay on, not before."""
+    rolling, plain = [], []
+    for rates, into in ((jnp.array([3.0, 0.0, 0.0]), rolling), (jnp.zeros(3), plain)):
+        plant.reset(START)
+        for _ in range(4):
+            u = Command(jnp.array(9.81), rates)
+            sample = plant.step(u)
+            np.testing.assert_array_equal(sample.u.vector(), u.vector())
+            into.append(np.asarray(sample.x.R))
+    assert np.array_equal(rolling[0], plain[0])  # 20 ms of delay: one tick
+    assert not np.array_equal(rolling[1], plain[1])
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_rates_turn_it_about_its_own_axes(plant, axis):
+    """1 rad/s for 0.4 s, less the delay and the rate loop's lag."""
+    turned = so3.log(after(plant, 20, omega=jnp.zeros(3).at[axis].set(1.0)).R)
+    assert 0.25 < float(turned[axis]) < 0.4
+    assert float(jnp.linalg.norm(turned)) == pytest.approx(float(turned[axis]), rel=0.05)
+
+
+def test_thrust_is_per_mass(plant):
+    """2 m/s^2 more than hover, for 0.1 s after the motors have settled."""
+    rise = [float(after(plant, ticks, c=11.81).v[2] - after(plant, ticks).v[2]) for ticks in (10, 15)]
+    assert 0.15 < rise[1] - rise[0] < 0.23
+
+
+def test_push_accelerates(make):
+    """0.5 m/s^2 per axis for 0.1 s."""
+    pushed, calm = after(make("small"), 5), after(make("none"), 5)
+    np.testing.assert_allclose(pushed.v - calm.v, 0.05, rtol=0.1)
+
+
+def test_wind_moves_it_downwind(make):
+    """It blows along (1, 1, 0)."""
+    blown, calm = after(make("wind"), 50), after(make("none"), 50)
+    moved = blown.p - calm.p
+    assert float(moved[0] + moved[1]) / 2**0.5 > 0.03
+    assert abs(float(moved[0] - moved[1])) < 0.1 * float(moved[0] + moved[1])
+
+
+def test_wind_is_in_the_world_frame(make):
+    """Whatever the heading."""
+    plant = make("wind")
+    plant.reset(State(START.p, so3.exp(jnp.array([0.0, 0.0, 2.5])), START.v))
+    for _ in range(50):
+        sample = plant.step(Command.hover())
+    moved = sample.x.p - START.p
+    assert float(moved[0]) > 0.02
+    assert float(moved[1]) > 0.02
+
+
+def supported(make, disturbance):
+    try:
+        return after(make(disturbance), 10)
+    except PlantError as error:
+        pytest.skip(str(error))
+
+
+def test_load_pulls_it_down(make):
+    """70 g more than the thrust carries."""
+    assert float(supported(make, "payload").v[2] - after(make("none"), 10).v[2]) < -0.3
+
+
+def test_weak_rotor_tilts_it_towards_itself(make):
+    """Front right."""
+    up = supported(make, "weak-rotor").R[:, 2] - after(make("none"), 10).R[:, 2]
+    assert float(up[0]) > 1e-3
+    assert float(up[1]) < -1e-3
+
+
+def test_what_a_plant_cannot_do_is_refused_before_anything_moves():
+    pytest.importorskip("rotorpy")
+    plant = Scenario("rotorpy").make("pickup")  # at 8 s
+    plant.reset(START)
+    for _ in range(400):
+        before = plant.step(Command.hover())
+    for _ in range(2):
+        with pytest.raises(PlantError, match="cannot carry a load or weaken rotors; it supports pushes and wind"):
+            plant.step(Command.hover())
+    assert before.t == pytest.approx(8.0)
+    with pytest.raises(PlantError, match="cannot carry a load"):
+        after(Scenario("rotorpy").make("weak-rotor"), 1)
+
+
+def test_flights_in_threads_are_the_same_flights(make):
+    def flight(_):
+        return after(make("wind"), 30, 10.0, (0.5, 0.2, 0.1)).vector()
+
+    with ThreadPoolExecutor(2) as pool:
+        for found in pool.map(flight, range(4)):
+            np.testing.assert_array_equal(found, flight(None))
+
+
+def test_flights_are_in_the_dtype_of_their_start(make):
+    plant = make("wind")
+    with jax.enable_x64(False):
+        plant32 = make("wind")
+        x0 = build.flight_starts(presets.load("fast"), 1)[0]
+        assert plant32.reset(x0).x.p.dtype == jnp.float32
+        assert plant32.step(Command.hover()).x.p.dtype == jnp.float32
+    assert plant.reset(START).x.p.dtype == jnp.float64
+    assert plant.step(Command.hover()).x.p.dtype == jnp.float64
+
+
+@pytest.mark.parametrize(
+    ("c", "omega", "name"),
+    [(float("nan"), [0, 0, 0], "c = nan"), (9.81, [0, float("inf"), 0], r"omega\[1\] = inf")],
+)
+def test_a_command_that_is_not_finite_is_refused_by_name(plant, c, omega, name):
+    plant.reset(START)
+    with pytest.raises(PlantError, match=f"command refused, {name} is not finite"):
+        plant.step(Command(jnp.array(c), jnp.array(omega, dtype=float)))
+    assert plant.step(Command.hover()).t == pytest.approx(plant.dt)  # and nothing was lost
+
+
+def test_stop_is_idempotent_and_final(plant):
+    plant.stop()
+    plant.reset(START)
+    plant.stop()
+    plant.stop()
+    with pytest.raises(PlantError, match="call reset first"):
+        plant.step(Command.hover())
+    assert plant.reset(START).t == 0.0
+
+
+class Broken(AbstractController[None]):
+    def init(self, x):
+        return None
+
+    def __call__(self, memory, t, x):
+        return Command(jnp.where(t > 0.05, jnp.nan, 9.81), jnp.zeros(3)), None
+
+
+def test_flight_stops_the_plant_whatever_happens(plant):
+    with pytest.raises(PlantError, match="c = nan is not finite"):
+        fly(plant, ControllerPilot(Broken()), START, ticks=10)
+    with pytest.raises(PlantError, match="call reset first"):
+        plant.step(Command.hover())
+
+
+class Witness:
+    def __init__(self):
+        self.samples = []
+
+    def state(self, sample):
+        self.samples.append(sample)
+
+    def event(self, kind, **data):
+        raise AssertionError(kind)
+
+
+def test_log_and_sinks_see_every_tick(plant):
+    witness = Witness()
+    log = fly(plant, lambda sample: Command.hover(), START, ticks=7, sinks=[witness])
+    assert log.t.shape == (8,)
+    assert log.p.shape == (8, 3)
+    assert log.R.shape == (8, 3, 3)
+    assert log.u.shape == (8, 4)
+    assert not log.crashed
+    np.testing.assert_array_equal(log.p[1:], [s.x.p for s in witness.samples])
+
+
+def test_a_crash_ends_the_flight_and_is_logged(plant):
+    log = fly(plant, lambda s: Command.hover(), START, ticks=50, alive=lambda s: s.t < 0.1)
+    assert log.crashed
+    assert log.t[-1] == pytest.approx(0.1)
+
+
+# ---- the simulated plant's own
+
+
+def flown(delay, ticks=40):
+    plant = SimPlant(LinearDragQuadrotor.of(small(), 0.02), Constant(jnp.zeros(3)), delay=delay)
+    plant.reset(START)
+    return [plant.step(Command(jnp.array(9.81), jnp.array([1.0, 0.0, 0.0]))).x.R for _ in range(ticks)]
+
+
+def test_delay_shifts_the_response():
+    now, late, later = flown(0.0), flown(0.02), flown(0.04)
+    np.testing.assert_allclose(late[1:], now[:-1], atol=1e-12)
+    np.testing.assert_allclose(later[2:], now[:-2], atol=1e-12)
+    between = flown(0.025)  # not a whole tick: between one and two
+    angle = lambda Rs: float(Rs[4][2, 1])  # noqa: E731
+    assert angle(later) < angle(between) < angle(late)
+
+
+@pytest.mark.parametrize("delay", [-0.01, 0.0205])
+def test_impossible_delays(delay):
+    with pytest.raises(ValueError, match="whole, non-negative number of milliseconds"):
+        SimPlant(LinearDragQuadrotor.of(small(), 0.02), Constant(jnp.zeros(3)), delay=delay)
+
+
+def test_disturbance_accelerates():
+    push = jnp.array([0.5, 0.0, 0.0])
+    plant = SimPlant(LinearDragQuadrotor.of(small(), 0.02), Constant(push))
+    plant.reset(START)
+    for _ in range(5):
+        sample = plant.step(Command.hover())
+    assert float(sample.x.v[0]) == pytest.approx(0.05, rel=0.05)
+
+
+def test_any_function_of_time_and_state_is_a_disturbance():
+    plant = SimPlant(
+        LinearDragQuadrotor.of(small(), 0.02), Push(lambda t, x: -10.0 * x.v + jnp.where(t < 0.1, 1.0, 0.0))
+    )
+    plant.reset(START)
+    for _ in range(100):
+        sample = plant.step(Command.hover())
+    assert np.isfinite(sample.x.vector()).all()
+
+
+# ---- plants that need an extra
+
+
+IMPORTED = {"rotorpy": "rotorpy.vehicles.hummingbird_params", "mujoco": "mujoco", "crazyflow": "crazyflow.sim.sim"}
+
+
+@pytest.mark.parametrize("name", EXTRAS)
+def test_missing_extra_names_the_command_that_installs_it(name, monkeypatch):
+    monkeypatch.setitem(sys.modules, IMPORTED[name], None)
+    monkeypatch.setattr(crazyflow, "_simulator", crazyflow._simulator.__wrapped__)  # which remembers what it imported
+    with pytest.raises(PlantError, match=rf"plant {name} needs the extra: pip install 'retrim\[{name}\]'") as error:
+        PLANTS[name]("none")
+    assert isinstance(error.value.__cause__, ImportError)
+
+
+def python(code):
+    """Run ``code`` in a process that has not imported anything; what it printed."""
+    env = {key: value for key, value in os.environ.items() if key != "SCIPY_ARRAY_API"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=env, capture_output=True, text=True, check=True, timeout=120
+    )
+    return done.stdout
+
+
+def test_extras_are_not_imported_with_retrim():
+    heavy = {*EXTRAS, "scipy"}
+    assert python(f"import sys, retrim, retrim.testbed; print({heavy} & set(sys.modules))") == "set()\n"
+
+
+def test_scipy_without_its_array_api_is_refused_with_what_to_do():
+    pytest.importorskip("crazyflow")
+    code = """
+import scipy
+from retrim import PlantError
+from retrim.testbed import Setting
+try:
+    Setting("crazyflow").make("none")
+except PlantError as error:
+    print(error)
+"""
+    assert "plant crazyflow: scipy has already been imported" in python(code)
+
+
+def test_crazyflow_leaves_jax_as_it_was():
+    pytest.importorskip("crazyflow")
+    after(Scenario("crazyflow").make("none"), 1)
+    config = jax.config.values
+    assert config["jax_enable_x64"]
+    assert (config["jax_numpy_dtype_promotion"], config["jax_numpy_rank_promotion"]) == ("strict", "raise")
+    assert jnp.zeros(1).dtype == jnp.float64
+    with pytest.raises(ValueError, match="rank"):
+        jnp.zeros(3) + jnp.zeros((2, 3))
+
+
+def test_mujoco_drag_is_that_of_the_vehicle():
+    """Falling at 5 m/s along each axis: density / 2 c A v^2."""
+    pytest.importorskip("mujoco")
+    vehicle = small()
+    plant = MujocoPlant(vehicle, Constant(jnp.zeros(3)))
+    for axis in range(3):
+        v = jnp.zeros(3).at[axis].set(5.0)
+        plant.reset(State(START.p, START.R, v))
+        slower = 5.0 - float(plant.step(Command.hover()).x.v[axis])
+        drag = 0.5 * 1.225 * float(vehicle.drag_area[axis]) * 25.0 / float(vehicle.mass)
+        assert slower / plant.dt == pytest.approx(drag, rel=0.01)
+
+
+@pytest.mark.parametrize(("name", "cls"), [("mujoco", MujocoPlant), ("crazyflow", CrazyflowPlant)])
+def test_tick_must_be_whole_steps(name, cls):
+    pytest.importorskip(name)
+    with pytest.raises(ValueError, match="no multiple of the simulator's step"):
+        cls(*([small()] if cls is MujocoPlant else []), Constant(jnp.zeros(3)), dt=0.003)

@@ -1,0 +1,161 @@
+"""What a vehicle sees of itself: noise as stated, late by the latency, held where samples are lost, and repeatable."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import random
+
+from helpers import random_state
+from retrim.adapt import SimPlant, fly
+from retrim.physics import AbstractSubstepDynamics, Command, Constant, PointMass, State, so3
+from retrim.plants.sensors import SensorModel
+
+START = State.at(jnp.array([0.3, -0.2, 1.5]))
+TURN = Command(jnp.array(11.0), jnp.array([1.0, -0.5, 0.5]))
+
+
+class Simple(AbstractSubstepDynamics[State]):
+    """Eq. (1) at 1 kHz: the cheapest model that moves."""
+
+    dt: float = eqx.field(static=True)
+
+    def init(self, x):
+        return x
+
+    def state(self, s):
+        return s
+
+    def with_state(self, s, x):
+        return x
+
+    def substep(self, s, u, effects):
+        return PointMass(1e-3).step(s, u, effects.push)
+
+
+def plant(sensors=None, seed=0, dt=0.02):
+    return SimPlant(Simple(dt), Constant(jnp.zeros(3)), sensors=sensors, seed=seed)
+
+
+def samples(plant, ticks=30, u=TURN):
+    return [plant.reset(START), *(plant.step(u) for _ in range(ticks))]
+
+
+def stack(states):
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *states)
+
+
+def same(a, b):
+    jax.tree.map(np.testing.assert_array_equal, a, b)
+
+
+def test_ideal_sensing_is_the_truth():
+    """With and without sensors; and what the sensors do never moves the vehicle."""
+    plain, ideal, rough = (
+        samples(plant(sensors))
+        for sensors in (None, SensorModel.of(), SensorModel.of(position=0.1, dropout=0.5, latency=20))
+    )
+    for a, b, c in zip(plain[1:], ideal[1:], rough[1:], strict=True):
+        same(a.x, a.truth)
+        same(b.x, a.truth)
+        same(b.truth, a.truth)
+        same(c.truth, a.truth)
+
+
+def test_noise_has_the_stated_deviation(key):
+    sensors, x, n = SensorModel.of(position=0.01, velocity=0.2, attitude=0.03), random_state(key), 20_000
+    seen = jax.jit(jax.vmap(lambda k: sensors.noisy(x, k)))(random.split(key, n))
+    turned = jax.vmap(lambda R: so3.log(x.R.T @ R))(seen.R)
+    for error, sigma in ((seen.p - x.p[None], 0.01), (seen.v - x.v[None], 0.2), (turned, 0.03)):
+        np.testing.assert_allclose(jnp.std(error, axis=0), sigma, rtol=0.03)
+        np.testing.assert_allclose(jnp.mean(error, axis=0), 0.0, atol=5 * sigma / n**0.5)
+        correlation = np.corrcoef(np.asarray(error).T) - np.eye(3)
+        assert np.abs(correlation).max() < 0.05
+    np.testing.assert_allclose(jnp.linalg.det(seen.R), 1.0, atol=1e-12)
+
+
+def test_samples_of_a_flight_are_noisy():
+    """Through the plant: fresh noise every tick."""
+    flight = samples(plant(SensorModel.of(position=0.01)), ticks=400, u=Command.hover())[1:]
+    error = np.stack([s.x.p - s.truth.p for s in flight])
+    np.testing.assert_allclose(error.std(axis=0), 0.01, rtol=0.15)
+    assert np.abs(np.corrcoef(error[1:, 0], error[:-1, 0])[0, 1]) < 0.2
+    same(flight[0].x.v, flight[0].truth.v)
+
+
+def test_latency():
+    """A sample shows the vehicle as it was 20 ms ago; before the first arrives, the start."""
+    flight = samples(plant(SensorModel.of(latency=20)))
+    same(flight[1].x, START)
+    for late, then in zip(flight[2:], flight[1:-1], strict=True):
+        same(late.x, then.truth)
+    assert not np.array_equal(flight[-1].x.p, flight[-1].truth.p)
+
+
+def test_latency_between_ticks():
+    """Samples are 10 ms apart: of those 5 ms late, the newest that has arrived is half a tick of 20 ms old."""
+    fine, coarse = samples(plant(dt=0.01), ticks=20), samples(plant(SensorModel.of(latency=5)), ticks=10)
+    for i in range(1, 11):
+        np.testing.assert_allclose(coarse[i].x.vector(), fine[2 * i - 1].x.vector(), atol=1e-12)
+
+
+def test_dropout_holds_the_last_sample():
+    flight = samples(plant(SensorModel.of(dropout=0.5), seed=3), ticks=400)
+    seen = np.stack([s.x.vector() for s in flight[1:]])
+    held = np.mean((seen[1:] == seen[:-1]).all(axis=1))
+    assert held == pytest.approx(0.25, abs=0.08)  # both samples of a tick lost
+    fresh = np.mean((seen == np.stack([s.truth.vector() for s in flight[1:]])).all(axis=1))
+    assert fresh == pytest.approx(0.5, abs=0.1)
+
+
+def test_held_sample_and_its_noise_do_not_change(key):
+    """Nothing is drawn anew while samples are lost."""
+    sensors = SensorModel.of(position=0.1, dropout=0.999999)
+    first = sensors.noisy(START, key)
+    queue = jax.tree.map(lambda leaf: leaf[None], first)
+    moving = stack([START, random_state(key), random_state(key, 2.0)])
+    same(sensors.received(queue, jax.tree.map(jnp.asarray, moving), key), queue)
+
+
+def test_a_seed_repeats_bit_for_bit():
+    rough = SensorModel.of(position=0.01, velocity=0.1, attitude=0.01, dropout=0.2, latency=20)
+    one = plant(rough, seed=1)
+    first, again = samples(one), samples(one)
+    other, different = samples(plant(rough, seed=1)), samples(plant(rough, seed=2))
+    for a, b, c, d in zip(first[1:], again[1:], other[1:], different[1:], strict=True):
+        same(a.x, b.x)
+        same(a.x, c.x)
+        same(a.truth, d.truth)
+    assert not np.array_equal(first[-1].x.p, different[-1].x.p)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("position", -1e-3), ("velocity", -1.0), ("attitude", float("nan")), ("dropout", 1.0), ("dropout", -0.1)],
+)
+def test_impossible_sensors(field, value):
+    with pytest.raises(ValueError, match=rf"SensorModel\.{field} = {value}"):
+        SensorModel.of(**{field: value})
+
+
+def test_impossible_times():
+    with pytest.raises(ValueError, match="latency = -1 ms"):
+        SensorModel.of(latency=-1)
+    zero = jnp.array(0.0)
+    with pytest.raises(ValueError, match="period = 0 ms"):
+        SensorModel(zero, zero, zero, zero, 0, 0)
+    with pytest.raises(ValueError, match="no multiple of the 10 ms of SensorModel"):
+        plant(SensorModel.of(), dt=0.025)
+
+
+def test_log_keeps_the_truth():
+    seen = []
+    rough = SensorModel.of(position=0.05, latency=20)
+    log = fly(plant(rough), lambda sample: seen.append(sample) or TURN, START, ticks=10)
+    truth = samples(plant(), ticks=10)
+    np.testing.assert_array_equal(log.p, np.stack([s.x.p for s in truth]))
+    np.testing.assert_array_equal(log.R, np.stack([s.x.R for s in truth]))
+    assert seen[0].truth is None  # at the reset
+    assert not np.array_equal(seen[-1].x.p, log.p[-2])  # the pilot sees what the sensors show
+    same(seen[-1].true_state.p, log.p[-2])
