@@ -4,8 +4,8 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
-from ..experiments.bench.measure import bench as measure
-from ..experiments.bench.works import WORKS
+from ..bench.measure import bench as measure
+from ..bench.works import WORKS
 from ..experiments.run import Run
 from .console import RichReporter, show_paths
 

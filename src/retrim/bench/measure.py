@@ -9,10 +9,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ...errors import ConfigError
-from ..reporter import Reporter
-from ..run import Run
-from ..tables.document import Document, TableSection
+from ..errors import ConfigError
+from ..experiments.reporter import Reporter
+from ..experiments.run import Run
+from ..experiments.tables.document import Document, TableSection
 from .works import WORKS
 
 COLUMNS = ("work", "run, s", "compile, s", "goal", "paper", "peak, MB", "remarks")
@@ -67,7 +67,7 @@ def _measured(name: str, cache: Path) -> dict[str, Any]:
             "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
         }
     ran = subprocess.run(
-        [sys.executable, "-m", "retrim.experiments.bench.works", name],
+        [sys.executable, "-m", "retrim.bench.works", name],
         env=environment,
         capture_output=True,
         text=True,

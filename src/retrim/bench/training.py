@@ -4,12 +4,12 @@ from typing import Any
 
 from jax import random
 
-from ...config.loading import load
-from ...config.setup import Setup
-from ...learn.bptt import PolicyState
-from ...learn.pretrain import train_chunk
-from ..stopwatch import Stopwatch
-from ..training import nominal_error, train
+from ..config.loading import load
+from ..config.setup import Setup
+from ..experiments.stopwatch import Stopwatch
+from ..experiments.training import nominal_error, train
+from ..learn.bptt import PolicyState
+from ..learn.pretrain import train_chunk
 from .timing import compiled, timed
 
 

@@ -1,4 +1,4 @@
-"""The works of the bench. ``python -m retrim.experiments.bench.works NAME`` does one and prints JSON."""
+"""The works of the bench. ``python -m retrim.bench.works NAME`` does one and prints JSON."""
 
 import json
 import resource
@@ -14,23 +14,23 @@ import jax.numpy as jnp
 from jax import lax, random
 from jaxtyping import Array, Key
 
-from ...adapt.buffer import RollingBuffer
-from ...adapt.gate import Verdict
-from ...adapt.learner import LearnerState, OnlineLearner
-from ...config.disturbances import disturbance
-from ...config.loading import load
-from ...config.scenario import Scenario
-from ...config.setup import Setup
-from ...control.controller import PolicyController
-from ...learn.bptt import PolicyState
-from ...learn.window import Window
-from ...physics.bem import BemQuadrotor
-from ...physics.state import Command, State
-from ...physics.vehicle import small
-from ...runtime.batch import batch_flight
-from ...runtime.flight import fly
-from ..fleet import Fleet
-from ..stopwatch import Stopwatch
+from ..adapt.buffer import RollingBuffer
+from ..adapt.gate import Verdict
+from ..adapt.learner import LearnerState, OnlineLearner
+from ..config.disturbances import disturbance
+from ..config.loading import load
+from ..config.scenario import Scenario
+from ..config.setup import Setup
+from ..control.controller import PolicyController
+from ..experiments.fleet import Fleet
+from ..experiments.stopwatch import Stopwatch
+from ..learn.bptt import PolicyState
+from ..learn.window import Window
+from ..physics.bem import BemQuadrotor
+from ..physics.state import Command, State
+from ..physics.vehicle import small
+from ..runtime.batch import batch_flight
+from ..runtime.flight import fly
 from .timing import Work, compiled, timed
 from .training import encode_and_pretrain, pretrain
 
