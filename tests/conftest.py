@@ -9,7 +9,7 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
-from retrim.experiments.provenance import enable_compile_cache  # noqa: E402  (after the configuration)
+from retrim.experiments.compile_cache import enable_compile_cache  # noqa: E402  (after the configuration)
 
 enable_compile_cache()  # shared by the workers
 settings.register_profile("repeatable", derandomize=True)  # the same examples on every machine

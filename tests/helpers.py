@@ -7,8 +7,9 @@ import jax
 import jax.numpy as jnp
 from jax import random
 
-from retrim.config import presets
-from retrim.physics import Command, State, small, so3
+from retrim.config import changed, load
+from retrim.learn import Env
+from retrim.physics import Command, PointMass, State, small, so3
 from retrim.tasks import Hover, StateObs
 
 GOAL = (0.0, 0.0, 1.0)
@@ -24,20 +25,26 @@ def random_command(key):
     return Command(9.81 + random.normal(kc, ()), random.normal(kw, (3,)))
 
 
-def hover_task(*, horizon=5, history=0, heading=math.pi, box=5.0):
+def hover_task(*, horizon=5, history=0, heading=math.pi, box=5.0, dt=0.02):
     goal = jnp.array(GOAL)
     observation = StateObs(goal, small().omega_max, history)
-    return Hover(goal, observation, jnp.array(box), jnp.array(heading), 0.02, horizon)
+    return Hover(goal, observation, jnp.array(box), jnp.array(heading), dt, horizon)
+
+
+def hover_env(dynamics=None, *, delay_ticks=0, **task):
+    """A hover task with a model of its rate, the point mass unless another is given."""
+    small_task = hover_task(**task)
+    return Env(PointMass(small_task.dt) if dynamics is None else dynamics, small_task, delay_ticks)
 
 
 def tiny_preset(**changes):
-    """The fast preset with a network and bursts so small that a test can afford them."""
-    preset = presets.changed(
-        presets.load("fast"),
-        pretrain={"hidden": (32, 32), "epochs": 60, "envs": 8, "horizon": 60},
-        adapt={"iters": 20, "epochs": 3, "envs": 4},
+    """The fast preset with a network and updates so small that a test can afford them."""
+    preset = changed(
+        load("hover/fast"),
+        pretrain={"hidden_sizes": (32, 32), "num_updates": 60, "num_envs": 8, "horizon": 60},
+        adapt={"fit_steps": 20, "num_updates": 3, "num_envs": 4},
     )
-    return presets.changed(preset, **changes) if changes else preset
+    return changed(preset, **changes) if changes else preset
 
 
 def stacked(trees):
