@@ -2,7 +2,7 @@
 
 import math
 from types import TracebackType
-from typing import NamedTuple, Protocol, Self, runtime_checkable
+from typing import NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +10,8 @@ from jaxtyping import Array, Float
 
 from ..errors import PlantError
 from ..physics.state import Command, State
+
+P = TypeVar("P")
 
 
 class Measurement(NamedTuple):
@@ -96,7 +98,7 @@ class Plant(Protocol):
         """Bring the vehicle to a safe state. Idempotent; always called at the end of a flight."""
         ...
 
-    def __enter__(self) -> Self:
+    def __enter__(self: P) -> P:
         """Return the plant."""
         return self
 
