@@ -4,7 +4,7 @@ A worker's state advances only when its own update comes back to it as published
 the way (a new flight, a lost message) never becomes the base of the next one.
 """
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -17,6 +17,7 @@ from .learner import LearnerState, OnlineLearner
 from .updates import Layer, PolicyUpdate, Rejection, ResidualUpdate, Update
 
 
+@runtime_checkable
 class Worker(Protocol):
     """One layer of learning."""
 

@@ -2,12 +2,13 @@
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 Advance = Callable[[float, str], None]
 """From the share that is done (0 to 1) and a short text to nothing."""
 
 
+@runtime_checkable
 class Reporter(Protocol):
     """Receives lines and progress."""
 
