@@ -12,16 +12,24 @@ import numpy as np
 import pytest
 
 from helpers import random_state
-from retrim.adapt import ControllerPilot, Plant, PlantError, SimPlant, fly
-from retrim.config import factory as build
-from retrim.config import presets
-from retrim.config.registry import Scenario
+from retrim import PlantError
+from retrim.config import PRESETS, Scenario, Setup
 from retrim.control import AbstractController
-from retrim.physics import Command, Constant, LinearDragQuadrotor, Push, State, small, so3
-from retrim.plants import CrazyflowPlant, MujocoPlant, crazyflow
+from retrim.physics import Command, Constant, State, small, so3
+from retrim.plants import Plant, crazyflow
+from retrim.plants.crazyflow import CrazyflowPlant
+from retrim.plants.mujoco import MujocoPlant
+from retrim.runtime import ControllerPilot, FunctionPilot, fly
 
 EXTRAS = ("rotorpy", "mujoco", "crazyflow")
-PLANTS = {name: Scenario(name).make for name in ("bem", "simple", *EXTRAS)}
+
+
+def maker(plant):
+    """From a disturbance by name to the plant."""
+    return lambda disturbance: Scenario(disturbance, plant).make()
+
+
+PLANTS = {name: maker(name) for name in ("bem", "simple", *EXTRAS)}
 START = State.at(jnp.array([0.3, -0.2, 1.5]))
 
 
@@ -42,8 +50,8 @@ def after(plant, ticks, c=9.81, omega=(0.0, 0.0, 0.0)):
     """State after that many ticks of one command."""
     plant.reset(START)
     for _ in range(ticks):
-        sample = plant.step(Command(jnp.array(c), jnp.array(omega)))
-    return sample.x
+        measurement, _ = plant.step(Command(jnp.array(c), jnp.array(omega)))
+    return measurement.x
 
 
 def test_is_a_plant(plant):
@@ -52,48 +60,45 @@ def test_is_a_plant(plant):
 
 def test_reset_puts_it_where_it_is_told(plant, key):
     for x0 in (START, random_state(key, 0.3)):
-        sample = plant.reset(x0)
-        assert sample.t == 0.0
-        jax.tree.map(np.testing.assert_array_equal, sample.x, x0)
+        measurement = plant.reset(x0)
+        assert measurement.t == 0.0
+        jax.tree.map(np.testing.assert_array_equal, measurement.x, x0)
+        jax.tree.map(np.testing.assert_array_equal, measurement.truth, x0)
 
 
 def test_reset_without_a_state_is_a_metre_above_the_ground(plant):
-    sample = plant.reset(None)
-    np.testing.assert_array_equal(sample.x.vector(), State.at(jnp.array([0.0, 0.0, 1.0])).vector())
-    np.testing.assert_array_equal(sample.u.vector(), Command.hover().vector())
+    measurement = plant.reset(None)
+    np.testing.assert_array_equal(measurement.x.vector(), State.at(jnp.array([0.0, 0.0, 1.0])).vector())
 
 
 def test_ticks(plant):
     plant.reset(START)
-    times = [plant.step(Command.hover()).t for _ in range(5)]
+    times = [plant.step(Command.hover())[0].t for _ in range(5)]
     np.testing.assert_allclose(times, plant.dt * np.arange(1, 6), atol=1e-12)
 
 
 def test_reset_forgets(plant):
     def flight():
         plant.reset(START)
-        return [plant.step(Command(jnp.array(11.0), jnp.array([1.0, 0.5, 0.2]))).x.vector() for _ in range(10)]
+        return [plant.step(Command(jnp.array(11.0), jnp.array([1.0, 0.5, 0.2])))[0].x.vector() for _ in range(10)]
 
     np.testing.assert_array_equal(flight(), flight())
 
 
 def test_hover_hovers(plant):
-    plant.reset(START)
-    for _ in range(10):
-        sample = plant.step(Command.hover())
-    assert float(jnp.linalg.norm(sample.x.p - START.p)) < 0.05
+    assert float(jnp.linalg.norm(after(plant, 10).p - START.p)) < 0.05
 
 
-def test_command_acts_after_the_delay_and_is_reported(plant):
+def test_command_acts_after_the_delay_and_is_accepted(plant):
     """The command of tick k moves the vehicle from tick k + delay on, not before."""
     rolling, plain = [], []
     for rates, into in ((jnp.array([3.0, 0.0, 0.0]), rolling), (jnp.zeros(3), plain)):
         plant.reset(START)
         for _ in range(4):
             u = Command(jnp.array(9.81), rates)
-            sample = plant.step(u)
-            np.testing.assert_array_equal(sample.u.vector(), u.vector())
-            into.append(np.asarray(sample.x.R))
+            measurement, accepted = plant.step(u)
+            assert accepted is u
+            into.append(np.asarray(measurement.x.R))
     assert np.array_equal(rolling[0], plain[0])  # 20 ms of delay: one tick
     assert not np.array_equal(rolling[1], plain[1])
 
@@ -131,8 +136,8 @@ def test_wind_is_in_the_world_frame(make):
     plant = make("wind")
     plant.reset(State(START.p, so3.exp(jnp.array([0.0, 0.0, 2.5])), START.v))
     for _ in range(50):
-        sample = plant.step(Command.hover())
-    moved = sample.x.p - START.p
+        measurement, _ = plant.step(Command.hover())
+    moved = measurement.x.p - START.p
     assert float(moved[0]) > 0.02
     assert float(moved[1]) > 0.02
 
@@ -158,16 +163,16 @@ def test_weak_rotor_tilts_it_towards_itself(make):
 
 def test_what_a_plant_cannot_do_is_refused_before_anything_moves():
     pytest.importorskip("rotorpy")
-    plant = Scenario("rotorpy").make("pickup")  # at 8 s
+    plant = PLANTS["rotorpy"]("pickup")  # at 8 s
     plant.reset(START)
     for _ in range(400):
-        before = plant.step(Command.hover())
+        before, _ = plant.step(Command.hover())
     for _ in range(2):
         with pytest.raises(PlantError, match="cannot carry a load or weaken rotors; it supports pushes and wind"):
             plant.step(Command.hover())
     assert before.t == pytest.approx(8.0)
     with pytest.raises(PlantError, match="cannot carry a load"):
-        after(Scenario("rotorpy").make("weak-rotor"), 1)
+        after(PLANTS["rotorpy"]("weak-rotor"), 1)
 
 
 def test_flights_in_threads_are_the_same_flights(make):
@@ -183,11 +188,11 @@ def test_flights_are_in_the_dtype_of_their_start(make):
     plant = make("wind")
     with jax.enable_x64(False):
         plant32 = make("wind")
-        x0 = build.flight_starts(presets.load("fast"), 1)[0]
+        x0 = Setup.of(PRESETS["hover/fast"]).flight_starts(1)[0]
         assert plant32.reset(x0).x.p.dtype == jnp.float32
-        assert plant32.step(Command.hover()).x.p.dtype == jnp.float32
+        assert plant32.step(Command.hover())[0].x.p.dtype == jnp.float32
     assert plant.reset(START).x.p.dtype == jnp.float64
-    assert plant.step(Command.hover()).x.p.dtype == jnp.float64
+    assert plant.step(Command.hover())[0].x.p.dtype == jnp.float64
 
 
 @pytest.mark.parametrize(
@@ -198,7 +203,7 @@ def test_a_command_that_is_not_finite_is_refused_by_name(plant, c, omega, name):
     plant.reset(START)
     with pytest.raises(PlantError, match=f"command refused, {name} is not finite"):
         plant.step(Command(jnp.array(c), jnp.array(omega, dtype=float)))
-    assert plant.step(Command.hover()).t == pytest.approx(plant.dt)  # and nothing was lost
+    assert plant.step(Command.hover())[0].t == pytest.approx(plant.dt)  # and nothing was lost
 
 
 def test_stop_is_idempotent_and_final(plant):
@@ -226,75 +231,40 @@ def test_flight_stops_the_plant_whatever_happens(plant):
         plant.step(Command.hover())
 
 
-class Witness:
-    def __init__(self):
-        self.samples = []
-
-    def state(self, sample):
-        self.samples.append(sample)
-
-    def event(self, kind, **data):
-        raise AssertionError(kind)
+def test_leaving_the_context_stops_the_plant(plant):
+    with plant as entered:
+        assert entered is plant
+        plant.reset(START)
+        plant.step(Command.hover())
+    with pytest.raises(PlantError, match="call reset first"):
+        plant.step(Command.hover())
 
 
-def test_log_and_sinks_see_every_tick(plant):
-    witness = Witness()
-    log = fly(plant, lambda sample: Command.hover(), START, ticks=7, sinks=[witness])
+def test_log_has_every_tick(plant):
+    log = fly(plant, FunctionPilot(lambda measurement: Command.hover()), START, ticks=7)
     assert log.t.shape == (8,)
     assert log.p.shape == (8, 3)
     assert log.R.shape == (8, 3, 3)
     assert log.u.shape == (8, 4)
-    assert not log.crashed
-    np.testing.assert_array_equal(log.p[1:], [s.x.p for s in witness.samples])
+    assert log.dt == plant.dt
+    assert log.missed_ticks == 0
+    assert not log.terminated
 
 
-def test_a_crash_ends_the_flight_and_is_logged(plant):
-    log = fly(plant, lambda s: Command.hover(), START, ticks=50, alive=lambda s: s.t < 0.1)
-    assert log.crashed
-    assert log.t[-1] == pytest.approx(0.1)
-
-
-# ---- the simulated plant's own
-
-
-def flown(delay, ticks=40):
-    plant = SimPlant(LinearDragQuadrotor.of(small(), 0.02), Constant(jnp.zeros(3)), delay=delay)
-    plant.reset(START)
-    return [plant.step(Command(jnp.array(9.81), jnp.array([1.0, 0.0, 0.0]))).x.R for _ in range(ticks)]
-
-
-def test_delay_shifts_the_response():
-    now, late, later = flown(0.0), flown(0.02), flown(0.04)
-    np.testing.assert_allclose(late[1:], now[:-1], atol=1e-12)
-    np.testing.assert_allclose(later[2:], now[:-2], atol=1e-12)
-    between = flown(0.025)  # not a whole tick: between one and two
-    angle = lambda Rs: float(Rs[4][2, 1])  # noqa: E731
-    assert angle(later) < angle(between) < angle(late)
-
-
-@pytest.mark.parametrize("delay", [-0.01, 0.0205])
-def test_impossible_delays(delay):
-    with pytest.raises(ValueError, match="whole, non-negative number of milliseconds"):
-        SimPlant(LinearDragQuadrotor.of(small(), 0.02), Constant(jnp.zeros(3)), delay=delay)
-
-
-def test_disturbance_accelerates():
-    push = jnp.array([0.5, 0.0, 0.0])
-    plant = SimPlant(LinearDragQuadrotor.of(small(), 0.02), Constant(push))
-    plant.reset(START)
-    for _ in range(5):
-        sample = plant.step(Command.hover())
-    assert float(sample.x.v[0]) == pytest.approx(0.05, rel=0.05)
-
-
-def test_any_function_of_time_and_state_is_a_disturbance():
-    plant = SimPlant(
-        LinearDragQuadrotor.of(small(), 0.02), Push(lambda t, x: -10.0 * x.v + jnp.where(t < 0.1, 1.0, 0.0))
-    )
-    plant.reset(START)
-    for _ in range(100):
-        sample = plant.step(Command.hover())
-    assert np.isfinite(sample.x.vector()).all()
+@pytest.mark.parametrize("name", ["bem", "simple"])
+def test_a_command_beyond_the_limits_is_clipped_and_reported(name):
+    """What is reported is what flies: the same motion as under the clipped command itself."""
+    low, high = small().command_min, small().command_max
+    plant = PLANTS[name]("none")
+    for wild, within in (
+        (Command(jnp.array(500.0), jnp.array([50.0, 0.0, -50.0])), (high.c, high.omega[0], 0.0, low.omega[2])),
+        (Command(jnp.array(-5.0), jnp.array([0.0, -50.0, 0.0])), (low.c, 0.0, low.omega[1], 0.0)),
+    ):
+        plant.reset(START)
+        _, accepted = plant.step(wild)
+        np.testing.assert_allclose(accepted.vector(), within)
+        moved = after(plant, 5, wild.c, wild.omega)
+        np.testing.assert_array_equal(moved.vector(), after(plant, 5, accepted.c, accepted.omega).vector())
 
 
 # ---- plants that need an extra
@@ -307,7 +277,8 @@ IMPORTED = {"rotorpy": "rotorpy.vehicles.hummingbird_params", "mujoco": "mujoco"
 def test_missing_extra_names_the_command_that_installs_it(name, monkeypatch):
     monkeypatch.setitem(sys.modules, IMPORTED[name], None)
     monkeypatch.setattr(crazyflow, "_simulator", crazyflow._simulator.__wrapped__)  # which remembers what it imported
-    with pytest.raises(PlantError, match=rf"plant {name} needs the extra: pip install 'retrim\[{name}\]'") as error:
+    wanted = rf"plant '{name}' needs the package '{name}' .*`uv pip install -e '\.\[{name}\]'`.*`pip install {name}`"
+    with pytest.raises(PlantError, match=wanted) as error:
         PLANTS[name]("none")
     assert isinstance(error.value.__cause__, ImportError)
 
@@ -323,7 +294,7 @@ def python(code):
 
 def test_extras_are_not_imported_with_retrim():
     heavy = {*EXTRAS, "scipy"}
-    assert python(f"import sys, retrim, retrim.testbed; print({heavy} & set(sys.modules))") == "set()\n"
+    assert python(f"import sys, retrim, retrim.config; print({heavy} & set(sys.modules))") == "set()\n"
 
 
 def test_scipy_without_its_array_api_is_refused_with_what_to_do():
@@ -331,9 +302,9 @@ def test_scipy_without_its_array_api_is_refused_with_what_to_do():
     code = """
 import scipy
 from retrim import PlantError
-from retrim.testbed import Setting
+from retrim.config import Scenario
 try:
-    Setting("crazyflow").make("none")
+    Scenario("none", "crazyflow").make()
 except PlantError as error:
     print(error)
 """
@@ -342,7 +313,7 @@ except PlantError as error:
 
 def test_crazyflow_leaves_jax_as_it_was():
     pytest.importorskip("crazyflow")
-    after(Scenario("crazyflow").make("none"), 1)
+    after(PLANTS["crazyflow"]("none"), 1)
     config = jax.config.values
     assert config["jax_enable_x64"]
     assert (config["jax_numpy_dtype_promotion"], config["jax_numpy_rank_promotion"]) == ("strict", "raise")
@@ -359,7 +330,7 @@ def test_mujoco_drag_is_that_of_the_vehicle():
     for axis in range(3):
         v = jnp.zeros(3).at[axis].set(5.0)
         plant.reset(State(START.p, START.R, v))
-        slower = 5.0 - float(plant.step(Command.hover()).x.v[axis])
+        slower = 5.0 - float(plant.step(Command.hover())[0].x.v[axis])
         drag = 0.5 * 1.225 * float(vehicle.drag_area[axis]) * 25.0 / float(vehicle.mass)
         assert slower / plant.dt == pytest.approx(drag, rel=0.01)
 

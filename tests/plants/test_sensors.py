@@ -8,9 +8,9 @@ import pytest
 from jax import random
 
 from helpers import random_state
-from retrim.adapt import SimPlant, fly
 from retrim.physics import AbstractSubstepDynamics, Command, Constant, PointMass, State, so3
-from retrim.plants.sensors import SensorModel
+from retrim.plants import SensorModel, SimPlant
+from retrim.runtime import FunctionPilot, fly
 
 START = State.at(jnp.array([0.3, -0.2, 1.5]))
 TURN = Command(jnp.array(11.0), jnp.array([1.0, -0.5, 0.5]))
@@ -39,7 +39,7 @@ def plant(sensors=None, seed=0, dt=0.02):
 
 
 def samples(plant, ticks=30, u=TURN):
-    return [plant.reset(START), *(plant.step(u) for _ in range(ticks))]
+    return [plant.reset(START), *(plant.step(u)[0] for _ in range(ticks))]
 
 
 def stack(states):
@@ -149,13 +149,14 @@ def test_impossible_times():
         plant(SensorModel.of(), dt=0.025)
 
 
-def test_log_keeps_the_truth():
+def test_log_keeps_what_was_true_and_what_was_measured():
     seen = []
     rough = SensorModel.of(position=0.05, latency=20)
-    log = fly(plant(rough), lambda sample: seen.append(sample) or TURN, START, ticks=10)
+    pilot = FunctionPilot(lambda measurement: seen.append(measurement) or TURN)
+    log = fly(plant(rough), pilot, START, ticks=10)
     truth = samples(plant(), ticks=10)
     np.testing.assert_array_equal(log.p, np.stack([s.x.p for s in truth]))
     np.testing.assert_array_equal(log.R, np.stack([s.x.R for s in truth]))
-    assert seen[0].truth is None  # at the reset
+    np.testing.assert_array_equal(log.measured.p[:-1], np.stack([s.x.p for s in seen]))
     assert not np.array_equal(seen[-1].x.p, log.p[-2])  # the pilot sees what the sensors show
     same(seen[-1].true_state.p, log.p[-2])

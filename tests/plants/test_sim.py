@@ -1,0 +1,127 @@
+"""The simulated plant: command delay, disturbances, and what it measures beside the state."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from retrim.config.sensors import SENSORS
+from retrim.physics import BemQuadrotor, Command, Constant, LinearDragQuadrotor, Push, State, small, so3
+from retrim.plants import SensorModel, SimPlant
+
+START = State.at(jnp.array([0.3, -0.2, 1.5]))
+CALM = Constant(jnp.zeros(3))
+MODELS = {"bem": BemQuadrotor, "simple": LinearDragQuadrotor}
+WILD = Command(jnp.array(12.0), jnp.array([1.0, -0.5, 0.3]))
+
+
+def simulated(model="simple", **options):
+    return SimPlant(MODELS[model].of(small(), 0.02), CALM, **options)
+
+
+def flown(delay_s, ticks=40):
+    plant = simulated(delay_s=delay_s)
+    plant.reset(START)
+    return [plant.step(Command(jnp.array(9.81), jnp.array([1.0, 0.0, 0.0])))[0].x.R for _ in range(ticks)]
+
+
+def test_delay_shifts_the_response():
+    now, late, later = flown(0.0), flown(0.02), flown(0.04)
+    np.testing.assert_allclose(late[1:], now[:-1], atol=1e-12)
+    np.testing.assert_allclose(later[2:], now[:-2], atol=1e-12)
+    between = flown(0.025)  # not a whole tick: between one and two
+    angle = lambda Rs: float(Rs[4][2, 1])  # noqa: E731
+    assert angle(later) < angle(between) < angle(late)
+
+
+@pytest.mark.parametrize("delay_s", [-0.01, 0.0205])
+def test_impossible_delays(delay_s):
+    with pytest.raises(ValueError, match="whole, non-negative number of milliseconds"):
+        simulated(delay_s=delay_s)
+
+
+def test_disturbance_accelerates():
+    push = jnp.array([0.5, 0.0, 0.0])
+    plant = SimPlant(LinearDragQuadrotor.of(small(), 0.02), Constant(push))
+    plant.reset(START)
+    for _ in range(5):
+        measurement, _ = plant.step(Command.hover())
+    assert float(measurement.x.v[0]) == pytest.approx(0.05, rel=0.05)
+
+
+def test_any_function_of_time_and_state_is_a_disturbance():
+    plant = SimPlant(
+        LinearDragQuadrotor.of(small(), 0.02), Push(lambda t, x: -10.0 * x.v + jnp.where(t < 0.1, 1.0, 0.0))
+    )
+    plant.reset(START)
+    for _ in range(100):
+        measurement, _ = plant.step(Command.hover())
+    assert np.isfinite(measurement.x.vector()).all()
+
+
+# ---- what it measures
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_rates_acceleration_and_rotor_speeds_are_the_models(name):
+    """Rates turn the attitude, the acceleration moves the velocity, and the rotors carry the weight at hover."""
+    plant = simulated(name)
+    first = plant.reset(START)
+    np.testing.assert_array_equal(first.omega, 0.0)
+    np.testing.assert_array_equal(first.a, 0.0)
+    model = MODELS[name].of(small(), 0.02)
+    np.testing.assert_allclose(first.motor_speeds, model.rotor_state(model.init(START)).motors)
+    before = first
+    for _ in range(10):
+        measurement, _ = plant.step(WILD)
+        np.testing.assert_allclose(measurement.a, (measurement.v - before.v) / 0.02, atol=1e-9)
+        turned = so3.log(before.R.T @ measurement.R) / 0.02  # the mean over the tick
+        low, high = jnp.minimum(before.omega, measurement.omega), jnp.maximum(before.omega, measurement.omega)
+        assert bool(jnp.all((turned > low - 0.1) & (turned < high + 0.1)))
+        before = measurement
+    np.testing.assert_allclose(measurement.omega, WILD.omega, atol=0.35)
+    assert bool(jnp.all(measurement.motor_speeds > first.motor_speeds))
+
+
+def test_rotor_speeds_give_the_thrust():
+    """Of the simple model: 4 c_T Omega^2 (1 + thrust error) = m c, once the motors have settled."""
+    vehicle, plant = small(), simulated()
+    plant.reset(START)
+    for _ in range(25):
+        measurement, _ = plant.step(Command(jnp.array(11.0), jnp.zeros(3)))
+    thrust = float(jnp.sum(vehicle.thrust_coefficient * measurement.motor_speeds**2))
+    assert thrust == pytest.approx(11.0 * float(vehicle.mass), rel=1e-3)
+
+
+def test_the_first_sample_is_as_noisy_as_the_others():
+    sensors = SensorModel.of(position=0.01, gyro=0.1, accelerometer=0.5)
+    firsts = [simulated(sensors=sensors, seed=seed).reset(START) for seed in range(60)]
+    errors = np.stack([m.x.p - START.p for m in firsts])
+    np.testing.assert_allclose(errors.std(), 0.01, rtol=0.25)
+    for m in firsts:
+        jax.tree.map(np.testing.assert_array_equal, m.truth, START)
+    np.testing.assert_allclose(np.stack([m.omega for m in firsts]).std(), 0.1, rtol=0.25)
+    np.testing.assert_allclose(np.stack([m.a for m in firsts]).std(), 0.5, rtol=0.25)
+
+
+def test_inertial_noise_has_the_stated_deviation():
+    """Around the true rates and accelerations, fresh every tick, and never in the state or the motion."""
+    sensors = SensorModel.of(gyro=0.05, accelerometer=0.4)
+    noisy, exact = simulated(sensors=sensors), simulated()
+    pairs = [(noisy.reset(START), exact.reset(START))]
+    pairs += [(noisy.step(Command.hover())[0], exact.step(Command.hover())[0]) for _ in range(400)]
+    for name, sigma in (("omega", 0.05), ("a", 0.4)):
+        error = np.stack([getattr(m, name) - getattr(true, name) for m, true in pairs])
+        np.testing.assert_allclose(error.std(axis=0), sigma, rtol=0.15)
+        np.testing.assert_allclose(error.mean(axis=0), 0.0, atol=4 * sigma / 20)
+        assert np.abs(np.corrcoef(error[1:, 0], error[:-1, 0])[0, 1]) < 0.2
+    for m, true in pairs:
+        np.testing.assert_array_equal(m.x.vector(), true.x.vector())
+        np.testing.assert_array_equal(m.motor_speeds, true.motor_speeds)
+
+
+@pytest.mark.parametrize(("name", "age"), [("mocap", 0.0), ("rough", 0.01)])
+def test_a_measurement_tells_its_age(name, age):
+    plant = simulated(sensors=SENSORS.find(name)())
+    assert plant.reset(START).age == age
+    assert plant.step(WILD)[0].age == age
