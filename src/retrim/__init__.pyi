@@ -7,6 +7,8 @@ from .adapt import Update as Update
 from .adapt import pack_update as pack_update
 from .adapt import unpack_update as unpack_update
 from .config import PRESETS as PRESETS
+from .config import MethodEntry as MethodEntry
+from .config import MethodRequest as MethodRequest
 from .config import PlantEntry as PlantEntry
 from .config import PlantRequest as PlantRequest
 from .config import Preset as Preset
@@ -22,6 +24,7 @@ from .config import load as load
 from .config import overlaid as overlaid
 from .config import read_vehicle as read_vehicle
 from .config import register_disturbance as register_disturbance
+from .config import register_method as register_method
 from .config import register_plant as register_plant
 from .config import register_reference as register_reference
 from .config import register_residual as register_residual

@@ -4,13 +4,12 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from ..adapt.learner import LearnerState
 from ..config.loading import changed, overlaid
 from ..config.presets import Preset
 from ..config.scenario import Scenario
-from ..config.setup import Latency, Method, Setup
+from ..config.setup import Latency, Setup
 from ..control.policy import Policy
 from ..errors import ConfigError
 from ..experiments.figures import picture
@@ -33,7 +32,7 @@ class Order:
     preset: Preset
     policy: Policy
     scenario: Scenario
-    methods: tuple[Method, ...]
+    methods: tuple[str, ...]
     seconds: float
     starts: int
     seed: int
@@ -48,7 +47,7 @@ def fly(
     delta: Path | None = None,
     disturbance: str = "large",
     plant: str = "bem",
-    adapt: Literal["none", "full", "lora"] = "full",
+    adapt: str = "full",
     reference: str | None = None,
     vehicle: str | None = None,
     sensors: str = "ideal",
@@ -73,7 +72,8 @@ def fly(
             wind+payload=0.1, or module:name.
         plant: bem: blade-element rotors; simple: rotors with linear drag; rotorpy, mujoco, crazyflow: independent
             simulators, each an extra to install; or module:name.
-        adapt: full: re-train all weights in flight; lora: a low-rank delta (ranks 4, 10, 1); none: fly as it is.
+        adapt: full: re-train all weights in flight; lora: a low-rank delta (ranks 4, 10, 1); base-i: integral action;
+            base-do: a disturbance observer; none: fly as it is; or module:name. The policy flies as it is, too.
         reference: What a tracking policy follows: circle, figure8, star, a CSV file of t, x, y, z[, yaw], or
             module:name; what it was trained on by default. Another one needs a policy that sees its reference.
         vehicle: Vehicle that the plant simulates: small, large, kingfisher, a vehicle file or module:name; that which
@@ -102,7 +102,7 @@ def fly(
             preset = changed(preset, adapt={"residual": residual})
         follows = _flown_reference(preset, reference)
         scenario = Scenario(disturbance, plant, vehicle, sensors, thrust_error, follows)
-        methods: tuple[Method, ...] = ("base",) if adapt == "none" else ("base", adapt)
+        methods: tuple[str, ...] = ("base",) if adapt == "none" else ("base", adapt)
         setup = Setup.of(preset, follows)
         length = setup.flown.flight_seconds if seconds is None else seconds
         if not 3.0 <= length <= 36_000.0 or not 1 <= starts <= 100_000:

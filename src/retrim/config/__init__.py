@@ -5,6 +5,9 @@ from .disturbances import register_disturbance as register_disturbance
 from .loading import changed as changed
 from .loading import load as load
 from .loading import overlaid as overlaid
+from .methods import MethodEntry as MethodEntry
+from .methods import MethodRequest as MethodRequest
+from .methods import register_method as register_method
 from .plants import PlantEntry as PlantEntry
 from .plants import PlantRequest as PlantRequest
 from .plants import register_plant as register_plant
@@ -14,7 +17,6 @@ from .residuals import ResidualRequest as ResidualRequest
 from .residuals import register_residual as register_residual
 from .scenario import Scenario as Scenario
 from .sensors import register_sensor as register_sensor
-from .setup import Method as Method
 from .setup import Setup as Setup
 from .tasks import TaskEntry as TaskEntry
 from .tasks import TaskRequest as TaskRequest

@@ -16,7 +16,6 @@ from jaxtyping import Array, Float, Key
 
 from ..adapt.learner import LearnerState, OnlineLearner
 from ..adapt.workers import PolicyWorker, ResidualWorker
-from ..control.controller import PolicyController
 from ..control.lora import LoraPolicy
 from ..control.policy import Policy
 from ..errors import ConfigError
@@ -29,7 +28,7 @@ from ..physics.state import State
 from ..physics.vehicle import Vehicle
 from ..runtime.adaptive import AdaptivePilot, Scheduled
 from ..runtime.lockstep import LockstepLearner
-from ..runtime.pilot import ControllerPilot, Pilot
+from ..runtime.pilot import Pilot
 from ..tasks.hover import TILT, Hover
 from ..tasks.keypoints import Keypoints
 from ..tasks.reference import Reference
@@ -40,8 +39,6 @@ from .residuals import ResidualRequest, make_residual
 from .tasks import TaskRequest, find_task, make_reference
 from .vehicles import make_vehicle
 
-Method = Literal["base", "full", "lora"]
-"""How a policy flies: as it is, re-training all weights, or a low-rank delta."""
 Latency = Literal["fixed", "measured"]
 """What learning costs in flight time: the preset's fixed figures, or the time that the clock shows."""
 
@@ -143,7 +140,7 @@ class Setup:
     def pilot(
         self,
         policy: Policy | LoraPolicy,
-        method: Method = "base",
+        method: str = "base",
         key: Key[Array, ""] | None = None,
         *,
         latency: Latency = "fixed",
@@ -153,19 +150,18 @@ class Setup:
 
         Args:
             policy: A policy of this preset.
-            method: ``base`` flies it as it is; ``full`` and ``lora`` re-train it in flight.
-            key: Seed of the learners; consumed. Only ``base`` needs none.
+            method: ``base`` flies it as it is, ``full`` and ``lora`` re-train it in flight; or another registered name.
+            key: Seed of the learners; consumed. A method that does not learn needs none.
             latency: What learning costs in flight time.
             state: What an earlier flight learnt, to go on from.
 
         Raises:
+            ConfigError: There is no such method, or it does not suit the task.
             ValueError: The method needs a key.
         """
-        if method == "base":
-            return ControllerPilot(PolicyController(self.flown.observation_in_flight, policy.merged()))
-        if key is None:
-            raise ValueError(f"Setup.pilot: method {method!r} needs a key")
-        return self.adaptive_pilot(self.low_rank(policy, key) if method == "lora" else policy, key, latency, state)
+        from .methods import MethodRequest, find_method  # they are made of a set-up, too
+
+        return find_method(method).make(MethodRequest(self, policy, key, latency, state))
 
     def low_rank(self, policy: Policy | LoraPolicy, key: Key[Array, ""]) -> LoraPolicy:
         """Return ``policy`` with a fresh low-rank delta (ranks 4, 10, 1 and scale 4, as in the paper)."""

@@ -14,9 +14,10 @@ from jax import random
 from ..adapt.buffer import RollingBuffer
 from ..adapt.learner import LearnerState
 from ..config.loading import dump
+from ..config.methods import find_method
 from ..config.presets import Preset
 from ..config.scenario import Scenario
-from ..config.setup import Latency, Method, Setup, setup_for
+from ..config.setup import Latency, Setup, setup_for
 from ..control.lora import LoraPolicy
 from ..control.policy import Policy
 from ..errors import ConfigError
@@ -52,7 +53,7 @@ class Fleet:
         policies: Policy | Mapping[int, Policy],
         scenarios: Sequence[Scenario],
         *,
-        methods: Sequence[Method] = ("base", "full"),
+        methods: Sequence[str] = ("base", "full"),
         starts: int = 8,
         seconds: float | None = None,
         latency: Latency = "fixed",
@@ -78,6 +79,8 @@ class Fleet:
             raise ConfigError(
                 f"{starts} starts of {len(scenarios)} scenarios by {len(methods)} methods cannot be flown"
             )
+        for method in methods:
+            find_method(method)
         self.preset = preset
         self.policies = dict(policies) if isinstance(policies, Mapping) else {0: policies}
         self._setups = {name: setup_for(dump(preset), name) for name in {s.reference for s in scenarios}}
@@ -109,7 +112,7 @@ class Fleet:
                 done.add(spec.scenario)
                 pilot = setup.pilot(policy)
                 fly(spec.scenario.make(self.preset.vehicle, dt=self.preset.dt), pilot, x0, ticks=2)
-            if spec.method != "base" and (spec.scenario.reference, spec.method) not in done:
+            if find_method(spec.method).learns and (spec.scenario.reference, spec.method) not in done:
                 done.add((spec.scenario.reference, spec.method))
                 adaptive = setup.low_rank(policy, spec.key()) if spec.method == "lora" else policy
                 buffer = RollingBuffer(self.preset.adapt.window)

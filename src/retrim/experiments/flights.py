@@ -12,7 +12,7 @@ from jaxtyping import Array, Key
 
 from ..adapt.learner import LearnerState
 from ..config.scenario import Scenario
-from ..config.setup import Latency, Method, Setup
+from ..config.setup import Latency, Setup
 from ..control.lora import LoraPolicy
 from ..control.policy import Policy
 from ..physics.state import State
@@ -29,7 +29,7 @@ class FlightSpec:
     """One flight to fly."""
 
     scenario: Scenario
-    method: Method
+    method: str
     start: int
     """Number of the start; it also seeds the learners, the gusts and the noise of the flight."""
     seed: int = 0

@@ -15,7 +15,7 @@ from ..config.loading import changed as changed_preset
 from ..config.loading import dump, load, read_toml, suggestion
 from ..config.presets import Preset
 from ..config.scenario import Scenario
-from ..config.setup import Method, Setup
+from ..config.setup import Setup
 from ..control.policy import Policy
 from ..errors import ConfigError
 from ..io.files import write_whole
@@ -41,7 +41,7 @@ class Sweep:
     """Presets to train a policy with, for each seed."""
     seeds: tuple[int, ...] = Field(default=(0,), min_length=1)
     """Training seeds; each also seeds starts, disturbances and learners of its flights."""
-    methods: tuple[Method, ...] = Field(default=("base", "full"), min_length=1)
+    methods: tuple[str, ...] = Field(default=("base", "full"), min_length=1)
     disturbances: tuple[str, ...] = Field(default=("none",), min_length=1)
     plants: tuple[str, ...] = Field(default=("bem",), min_length=1)
     vehicles: tuple[str, ...] = ()

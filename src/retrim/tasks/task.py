@@ -65,6 +65,10 @@ class AbstractTask(eqx.Module):
     def home(self) -> Float[Array, "3"]:
         """Return the position around which flights start, world [m]."""
 
+    def target(self, t: Float[Array, ""]) -> Float[Array, "3"]:
+        """Return where the vehicle should be at time ``t`` [s], world [m]."""
+        return self.home()
+
     @abc.abstractmethod
     def reset(self, key: Key[Array, ""]) -> Start:
         """Return a random start; the key is consumed."""

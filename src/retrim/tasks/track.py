@@ -62,6 +62,10 @@ class AbstractTrack(AbstractTask):
         """Return the start of the reference, world [m]."""
         return self.reference(jnp.array(0.0)).p
 
+    def target(self, t: Float[Array, ""]) -> Float[Array, "3"]:
+        """Return where the reference is at time ``t`` [s], world [m]."""
+        return self.reference(t).p
+
     def terminated(self, t: Float[Array, ""], x: State) -> Bool[Array, ""]:
         """Return whether the vehicle is outside the box around the reference, or its state not finite."""
         return ~within(self.box, x, self.reference(t).p)

@@ -25,6 +25,7 @@ def hover(
     sensors: str = "ideal",
     seconds: float = 30.0,
     starts: int = 8,
+    methods: Sequence[str] = ("base", "base-i", "base-do", "full", "lora"),
 ) -> None:
     """Make ``hover.md``: three disturbances, for each preset, over several training seeds."""
     loaded = [load(name) for name in presets]
@@ -32,8 +33,8 @@ def hover(
     intro = (
         f"Made by `retrim reproduce hover`. Steady-state error [m], the mean over the last 2 s of {seconds:g} s:\n"
         f"mean ± standard deviation over {len(seeds)} training seeds x {starts} starts. Plant `{plant}`, sensors\n"
-        f"`{sensors}`, small quadrotor. Learning is charged to flight time by the preset's fixed latencies. The paper's\n"
-        "rows are from its own plant."
+        f"`{sensors}`, small quadrotor. Learning is charged to flight time by the preset's fixed latencies. The\n"
+        "paper's rows are from its own plant."
     )
     document = Document(run, "hover", "Hover (Table I of the paper)", intro, seeds, reporter)
     for preset in loaded:
@@ -45,6 +46,7 @@ def hover(
             scenario,
             run,
             reporter,
+            methods=methods,
             starts=starts,
             seconds=seconds,
             paper=PAPER,

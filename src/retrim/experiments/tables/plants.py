@@ -38,7 +38,8 @@ GROUPS: tuple[tuple[str, Scenario, tuple[str, ...]], ...] = (
     ("mujoco", Scenario(plant="mujoco"), ("large", "wind")),
     ("crazyflow, its cf21B_500 (0.04 kg)", Scenario(plant="crazyflow"), ("large", "wind")),
 )
-COLUMNS = ("disturbance", "base [m]", "adapted [m]", "adapted, peak after 5 s [m]", "crashed")
+METHODS = ("base", "base-i", "base-do", "full")
+COLUMNS = ("disturbance", "base", "integral action", "disturbance observer", "adapted", "its peak after 5 s", "crashed")
 
 
 def plants(
@@ -71,7 +72,7 @@ def plants(
             continue
         scenarios = [replace(scenario, disturbance=name) for name in disturbances]
         try:
-            flown = fly_all(study, scenarios, run, reporter, starts=starts, seconds=seconds).flown
+            flown = fly_all(study, scenarios, run, reporter, methods=METHODS, starts=starts, seconds=seconds).flown
         except PlantError as error:
             document.add(TableSection((), (), title, f"Left out: {error}"))
             continue
@@ -79,10 +80,10 @@ def plants(
         by = {(row["disturbance"], row["method"]): row for row in found}
         lines = []
         for name in disturbances:
-            pair = [by.get((name, method)) for method in ("base", "full")]
-            cells = ["-" if row is None else cell(row) for row in pair]
-            peak = pair[1] and pair[1]["peak_after_5s"]
-            n, crashes = (sum(row[key] for row in pair if row) for key in ("n", "crashes"))
+            ours = [by.get((name, method)) for method in METHODS]
+            cells = ["-" if row is None else cell(row) for row in ours]
+            peak = ours[-1] and ours[-1]["peak_after_5s"]
+            n, crashes = (sum(row[key] for row in ours if row) for key in ("n", "crashes"))
             lines.append((name, *cells, "-" if peak is None else f"{peak:.3f}", f"{crashes} of {n}"))
         document.add(TableSection(COLUMNS, tuple(lines), title), found)
     document.write()

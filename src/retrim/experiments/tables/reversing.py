@@ -9,7 +9,7 @@ import numpy as np
 from ...config.loading import load
 from ...config.presets import Adapt
 from ...config.scenario import Scenario
-from ...config.setup import Method, Setup
+from ...config.setup import Setup
 from ...errors import ConfigError
 from ..figures import picture
 from ..flights import Flight
@@ -20,7 +20,12 @@ from .document import Document, TableSection
 from .study import fly_all, train_all
 
 PERIOD = 15.0  # [s]
-METHODS: dict[Method, str] = {"base": "base policy", "full": "**adapted**"}
+METHODS: dict[str, str] = {
+    "base": "base policy",
+    "base-i": "integral action",
+    "base-do": "disturbance observer",
+    "full": "**adapted**",
+}
 INTRO = """\
 Made by `retrim reproduce reversing`. ±0.5 m/s² on each axis, reversed every 15 s. Mean error [m] over a second:
 that before the reversal, that before the next update takes effect, and that before each later one or the next
@@ -47,19 +52,21 @@ def reversing(
     )
     study = train_all(loaded, seeds, run, reporter)
     scenario = Scenario("reversing", plant=plant)
-    flown = fly_all(study, [scenario], run, reporter, starts=starts, seconds=seconds).flown
+    flown = fly_all(study, [scenario], run, reporter, methods=tuple(METHODS), starts=starts, seconds=seconds).flown
     if not flown:
         document.write()
         return
     moments = _moments(loaded.adapt, seconds)
-    errors: dict[Method, list[np.ndarray]] = {
+    errors: dict[str, list[np.ndarray]] = {
         m: [_errors(f, moments) for f in flown if f.spec.method == m and not f.log.terminated] for m in METHODS
     }
     found = rows(flown)
     peaks = "; ".join(f"{METHODS[row['method']].strip('*')} {_peak(row)}" for row in found)
     crashed = sum(row["crashes"] for row in found)
-    about = f"{study.about()} Median of the largest error after 5 s [m]: {peaks}. {crashed} of {len(flown)} flights crashed."
-    drawn = picture(flown, Setup.of(loaded), scenario, run.folder)
+    about = f"{study.about()} Median of the largest error after 5 s [m]: {peaks}. "
+    about += f"{crashed} of {len(flown)} flights crashed."
+    pictured = [f for f in flown if f.spec.method in ("base", "full")]
+    drawn = picture(pictured, Setup.of(loaded), scenario, run.folder)
     document.more = {"moments_s": moments.tolist(), "errors_m": {m: np.array(e).tolist() for m, e in errors.items()}}
     document.add(_section(errors, moments, about, drawn[0]), found)
 
@@ -83,7 +90,7 @@ def _errors(flight: Flight, moments: np.ndarray) -> np.ndarray:
     return np.array(found).reshape(moments.shape)
 
 
-def _section(errors: dict[Method, list[np.ndarray]], moments: np.ndarray, about: str, drawn: Path) -> TableSection:
+def _section(errors: dict[str, list[np.ndarray]], moments: np.ndarray, about: str, drawn: Path) -> TableSection:
     updates = [f"after update {i}" for i in range(1, moments.shape[1] - 1)]
     lines = list[tuple[str, ...]]()
     for i, reversal in enumerate(moments[:, 0]):

@@ -4,9 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from ...config.methods import find_method
 from ...config.presets import Preset
 from ...config.scenario import Scenario
-from ...config.setup import Method, Setup
+from ...config.setup import Setup
 from ...control.policy import Policy
 from ..figures import picture
 from ..fleet import Fleet, Flights
@@ -18,7 +19,6 @@ from .document import TableSection
 
 LEVELS = ("none", "small", "large")
 COLUMNS = ("error [m]", "no disturbance", "small, 0.5 m/s² per axis", "large, 2 m/s² per axis")
-NAMES: dict[Method, str] = {"base": "base policy", "full": "**adapted, all weights**", "lora": "**adapted, LoRA**"}
 PaperRows = tuple[tuple[str, tuple[str, str, str]], ...]
 """Label and figures of the paper for the three levels [m]."""
 
@@ -58,7 +58,7 @@ def fly_all(
     run: Run,
     reporter: Reporter,
     *,
-    methods: Sequence[Method] = ("base", "full"),
+    methods: Sequence[str] = ("base", "full"),
     starts: int,
     seconds: float | None,
 ) -> Flights:
@@ -83,7 +83,7 @@ def level_section(
     run: Run,
     reporter: Reporter,
     *,
-    methods: Sequence[Method] = ("base", "full"),
+    methods: Sequence[str] = ("base", "full"),
     starts: int,
     seconds: float | None,
     paper: PaperRows = (),
@@ -106,21 +106,19 @@ def level_section(
         f"{crashed} of {len(flown)} flights crashed."
     )
     setup = Setup.of(study.preset, base.reference)
-    first = [f for f in flown if f.spec.seed == flown[0].spec.seed and f.spec.method != "lora"]
+    first = [f for f in flown if f.spec.seed == flown[0].spec.seed and f.spec.method in ("base", "full")]
     drawn = picture(first, setup, scenarios[-1], run.folder, stem=stem)
     table = level_table(found, methods, paper, title)
     return replace(table, about=about, picture=drawn[0] if drawn else None), found
 
 
-def level_table(
-    found: Sequence[dict[str, Any]], methods: Sequence[Method], paper: PaperRows, title: str
-) -> TableSection:
+def level_table(found: Sequence[dict[str, Any]], methods: Sequence[str], paper: PaperRows, title: str) -> TableSection:
     """Lay rows of results out as the paper does: methods down, levels of disturbance across, its own rows below."""
     by = {(row["method"], row["disturbance"]): row for row in found}
     cells = list[tuple[str, ...]]()
     for method in methods:
         ours = [by.get((method, level)) for level in LEVELS]
-        cells.append((NAMES[method], *("-" if row is None else cell(row) for row in ours)))
+        cells.append((find_method(method).label, *("-" if row is None else cell(row) for row in ours)))
         cross = ["-" if row is None or "cross_track_m" not in row else f"{row['cross_track_m']:.3f}" for row in ours]
         if set(cross) != {"-"}:
             cells.append(("... cross-track", *cross))

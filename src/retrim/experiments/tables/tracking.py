@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from ...config.loading import changed, load
 from ...config.presets import Preset
 from ...config.scenario import Scenario
-from ...config.setup import Method
 from ...errors import ConfigError
 from ..reporter import Reporter
 from ..run import Run
@@ -38,7 +37,7 @@ s: mean ± standard deviation over flights. Cross-track: distance from the neare
 quadrotor. Preset `track/preview`: one policy, trained on all three references, sees them ahead. `track/paper`:
 the paper's observation o = [p, R, v] and reward, one policy per reference. Learning is charged to flight time
 by the preset's fixed latencies. The paper's rows are from its own plant; its circle and ours take 3 s."""
-ALL: tuple[Method, ...] = ("base", "full", "lora")
+ALL: tuple[str, ...] = ("base", "full", "lora")
 
 
 def tracking(
@@ -72,7 +71,7 @@ def tracking(
     document.write()
 
 
-def _sections(preset: Preset) -> list[tuple[str, Preset, str, tuple[Method, ...], PaperRows]]:
+def _sections(preset: Preset) -> list[tuple[str, Preset, str, tuple[str, ...], PaperRows]]:
     """Title, preset, reference, methods and the paper's rows of each section of a preset."""
     if preset.track is None:
         raise ConfigError(f"preset {preset.name!r} is for {preset.task}, not for track")

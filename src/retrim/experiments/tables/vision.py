@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 from ...config.loading import load
 from ...config.scenario import Scenario
-from ...config.setup import Method
 from ..reporter import Reporter
 from ..run import Run
 from .document import Document
@@ -43,7 +42,7 @@ def vision(
     for preset in loaded:
         study = train_all(preset, seeds, run, reporter)
         # An update of the paper's size takes seconds; its preset adapts all weights only.
-        methods: tuple[Method, ...] = ("base", "full") if preset.name == "vision/paper" else ("base", "full", "lora")
+        methods: tuple[str, ...] = ("base", "full") if preset.name == "vision/paper" else ("base", "full", "lora")
         stem = f"vision_{preset.name.rpartition('/')[2]}"
         made = level_section(
             study, TITLES.get(preset.name, preset.name), Scenario(plant=plant), run, reporter,

@@ -1,0 +1,118 @@
+"""Ways to fly a policy, by name: as it is, with classical compensation, or re-trained in flight."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import jax.numpy as jnp
+from jaxtyping import Array, Key
+
+from ..adapt.learner import LearnerState
+from ..control.controller import PolicyController
+from ..control.gravity_frame import GravityFrame
+from ..control.integral import IntegralAction
+from ..control.lora import LoraPolicy
+from ..control.policy import Policy
+from ..errors import ConfigError
+from ..estimation.disturbance_observer import DisturbanceObserver
+from ..physics.dynamics import PointMass
+from ..runtime.pilot import ControllerPilot, Pilot
+from ..tasks.keypoints import Keypoints
+from ..tasks.observation import StateObs
+from .registry import Registry
+
+if TYPE_CHECKING:
+    from .setup import Latency, Setup
+
+
+@dataclass(frozen=True)
+class MethodRequest:
+    """What is asked of a method."""
+
+    setup: "Setup"
+    policy: Policy | LoraPolicy
+    key: Key[Array, ""] | None = None
+    """Seed of what is random in the method; None where nothing is."""
+    latency: "Latency" = "fixed"
+    state: LearnerState | None = None
+    """What an earlier flight learnt, to go on from."""
+
+    def controller(self) -> PolicyController:
+        """Return the policy behind the observation of flight."""
+        return PolicyController(self.setup.flown.observation_in_flight, self.policy.merged())
+
+    def needed_key(self) -> Key[Array, ""]:
+        """Return the key.
+
+        Raises:
+            ValueError: There is none.
+        """
+        if self.key is None:
+            raise ValueError("a method that learns needs a key")
+        return self.key
+
+
+@dataclass(frozen=True)
+class MethodEntry:
+    """A way to fly a policy."""
+
+    make: Callable[[MethodRequest], Pilot]
+    label: str
+    """Name in tables."""
+    learns: bool = False
+    """Whether it re-trains the policy in flight."""
+
+
+METHODS: Registry[MethodEntry] = Registry("method", example="module:name of a MethodEntry")
+register_method = METHODS.register
+
+
+def find_method(name: str) -> MethodEntry:
+    """Return the entry of a method.
+
+    Raises:
+        ConfigError: There is none of that name.
+    """
+    entry = METHODS.find(name)
+    if not isinstance(entry, MethodEntry):
+        raise ConfigError(f"method {name!r} is a {type(entry).__name__}, not a retrim.config.MethodEntry")
+    return entry
+
+
+def _base(request: MethodRequest) -> Pilot:
+    return ControllerPilot(request.controller())
+
+
+def _integral(request: MethodRequest) -> Pilot:
+    if isinstance(request.setup.env.task.observation, Keypoints):
+        raise ConfigError("method 'base-i' shifts the measured position; a policy that sees keypoints is shown none")
+    return ControllerPilot(
+        IntegralAction(request.controller(), request.setup.flown, gain=jnp.array(0.8), limit=jnp.array(2.0))
+    )
+
+
+def _gravity_frame(request: MethodRequest) -> Pilot:
+    setup = request.setup
+    if not isinstance(setup.env.task.observation, StateObs) or setup.preset.track is not None:
+        raise ConfigError("method 'base-do' turns the frame about a hover goal; it needs a policy that sees its state")
+    observer = DisturbanceObserver(
+        PointMass(setup.preset.dt), jnp.array(0.2), jnp.array(6.0), delay_ticks=setup.preset.plant_delay_ticks
+    )
+    return ControllerPilot(GravityFrame(request.controller(), observer, setup.flown.home()))
+
+
+def _full(request: MethodRequest) -> Pilot:
+    return request.setup.adaptive_pilot(request.policy, request.needed_key(), request.latency, request.state)
+
+
+def _lora(request: MethodRequest) -> Pilot:
+    key = request.needed_key()
+    policy = request.setup.low_rank(request.policy, key)
+    return request.setup.adaptive_pilot(policy, key, request.latency, request.state)
+
+
+register_method("base", MethodEntry(_base, "base policy"))
+register_method("base-i", MethodEntry(_integral, "base policy + integral action"))
+register_method("base-do", MethodEntry(_gravity_frame, "base policy + disturbance observer"))
+register_method("full", MethodEntry(_full, "**adapted, all weights**", learns=True))
+register_method("lora", MethodEntry(_lora, "**adapted, LoRA**", learns=True))

@@ -1,0 +1,46 @@
+"""Integral action on the position of an unchanged policy: the baseline that learning has to beat in hover."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..physics.state import Command, State
+from ..tasks.task import AbstractTask
+from .controller import AbstractController
+
+
+class IntegralState(eqx.Module):
+    """Integral of the position error, and the memory of the controller inside."""
+
+    integral: Float[Array, "3"]
+    """[m s]"""
+    inner: Any
+
+
+class IntegralAction(AbstractController[IntegralState]):
+    """Shows a controller the position p + gain * integral of (p - target)."""
+
+    inner: AbstractController[Any]
+    task: AbstractTask
+    """It says where the vehicle should be."""
+    gain: Float[Array, ""]
+    """[1/s]"""
+    limit: Float[Array, ""]
+    """Clamp of the integral per axis [m s]."""
+
+    def init(self, x: State) -> IntegralState:
+        """Return the memory at the start of a flight: the integral is zero."""
+        return IntegralState(jnp.zeros_like(x.p), self.inner.init(x))
+
+    def __call__(self, memory: IntegralState, t: Float[Array, ""], x: State) -> tuple[Command, IntegralState]:
+        """Integrate one tick, and let the controller act on the shifted position."""
+        grown = memory.integral + self.task.dt * (x.p - self.task.target(t))
+        integral = jnp.clip(grown, -self.limit, self.limit)
+        u, inner = self.inner(memory.inner, t, State(x.p + self.gain * integral, x.R, x.v))
+        return u, IntegralState(integral, inner)
+
+    def accepted(self, memory: IntegralState, u: Command) -> IntegralState:
+        """Pass the accepted command on."""
+        return IntegralState(memory.integral, self.inner.accepted(memory.inner, u))

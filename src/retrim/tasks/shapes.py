@@ -1,0 +1,79 @@
+"""Built-in trajectories: the circle, figure-8 and star of the paper, each with a smooth start from rest."""
+
+import math
+from collections.abc import Callable
+
+from .reference import Reference
+
+RAMP = 3.0  # [s], of a smooth start
+
+
+def smooth_start(t: float, ramp: float = RAMP) -> float:
+    """Slow the time along a lap so that it starts from rest (7th-order smooth step).
+
+    Args:
+        t: Time since take-off [s].
+        ramp: Time until the lap is flown at its own speed [s].
+
+    Returns:
+        Time along the lap [s]; from ``ramp`` on it is ``t - ramp / 2``.
+    """
+    x = min(t / ramp, 1.0)
+    return ramp * (7.0 * x**5 - 14.0 * x**6 + 10.0 * x**7 - 2.5 * x**8) + max(t - ramp, 0.0)
+
+
+def circle(radius: float = 1.0, period: float = 3.0, ramp: float = RAMP) -> Reference:
+    """Return a horizontal circle through (0, 0, 1) about (radius, 0, 1), first towards -y (paper, Fig. 4: 1 m, 3 s).
+
+    Args:
+        radius: Radius [m].
+        period: Time of a lap [s].
+        ramp: Time of the smooth start [s].
+    """
+
+    def path(t: float) -> list[float]:
+        phi = 2.0 * math.pi * smooth_start(t, ramp) / period
+        return [radius - radius * math.cos(phi), -radius * math.sin(phi), 1.0]
+
+    return Reference.of(path, seconds=ramp + period, lap=ramp)
+
+
+def figure8(length: float = 3.0, width: float = 1.0, period: float = 5.0, ramp: float = RAMP) -> Reference:
+    """Return a horizontal figure-8 from (0, 0, 1) (paper, Fig. 4: 5 s).
+
+    Args:
+        length: Extent along x [m].
+        width: Extent along y [m].
+        period: Time of a lap [s].
+        ramp: Time of the smooth start [s].
+    """
+
+    def path(t: float) -> list[float]:
+        phi = 2.0 * math.pi * smooth_start(t, ramp) / period
+        return [0.5 * length * (1.0 - math.cos(phi)), -0.5 * width * math.sin(2.0 * phi), 1.0]
+
+    return Reference.of(path, seconds=ramp + period, lap=ramp)
+
+
+def star(radius: float = 1.0, period: float = 6.0, ramp: float = RAMP) -> Reference:
+    """Return a horizontal pentagram about (radius, 0, 1), from (0, 0, 1), at constant speed once it is spun up.
+
+    Args:
+        radius: Circumradius [m].
+        period: Time of a lap [s].
+        ramp: Time of the smooth start [s].
+    """
+    corners = [math.pi + k * math.radians(216.0) for k in range(6)]
+    vertices = [(radius + radius * math.cos(a), radius * math.sin(a)) for a in corners]
+
+    def path(t: float) -> list[float]:
+        edge = 5.0 * (smooth_start(t, ramp) / period % 1.0)
+        k, part = min(int(edge), 4), edge - min(int(edge), 4)
+        (x0, y0), (x1, y1) = vertices[k], vertices[k + 1]
+        return [x0 + part * (x1 - x0), y0 + part * (y1 - y0), 1.0]
+
+    return Reference.of(path, seconds=ramp + period, lap=ramp)
+
+
+REFERENCES: dict[str, Callable[[], Reference]] = {"circle": circle, "figure8": figure8, "star": star}
+"""What makes each built-in trajectory, by name."""
