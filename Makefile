@@ -7,7 +7,7 @@ STAMP := $(VENV)/.installed
 
 DEV := $(VENV)/.installed-dev
 
-.PHONY: setup dev demo test check bench tables pins clean
+.PHONY: setup dev demo test check docs bench tables pins clean
 
 setup: $(STAMP)
 
@@ -19,11 +19,15 @@ demo: setup
 test: dev
 	$(BIN)/pytest
 
-check: dev
+check: dev docs
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+# The documentation site, into site/; a link or name that does not resolve is an error.
+docs: dev
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 bench: setup
 	$(BIN)/retrim bench
@@ -47,15 +51,16 @@ $(STAMP): pyproject.toml constraints.txt | $(UV)
 	$(UV) pip install --quiet --python $(VENV) --constraints constraints.txt --editable .
 	@touch $@
 
-# The developers' tools, and the independent plants that the tests fly.
+# The developers' tools, the site's tools, and the independent plants that the tests fly.
 $(DEV): $(STAMP)
-	$(UV) pip install --quiet --python $(VENV) --constraints constraints.txt --group dev --editable '.[plants]'
+	$(UV) pip install --quiet --python $(VENV) --constraints constraints.txt --group dev --group docs --editable '.[plants]'
 	@touch $@
 
-# After a change of dependencies in pyproject.toml: names, versions and markers only.
+# After a change of dependencies in pyproject.toml: names, versions and markers only. Versions that still fit stay;
+# `make pins UPGRADE=--upgrade` takes the newest.
 pins: | $(UV)
-	$(UV) pip compile --quiet --upgrade --universal --all-extras --group dev --python-version 3.11 \
+	$(UV) pip compile --quiet $(UPGRADE) --universal --all-extras --group dev --group docs --python-version 3.11 \
 		--no-header --no-annotate pyproject.toml --output-file constraints.txt
 
 clean:
-	rm -rf $(VENV) .uv runs .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf $(VENV) .uv runs site .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
