@@ -13,22 +13,26 @@ from ..tasks.hover import Hover, L2Hover
 from ..tasks.keypoints import Keypoints
 from ..tasks.observation import AbstractObservation, StateObs
 from ..tasks.preview import Preview
-from ..tasks.reference import REFERENCES as BUILT_IN
-from ..tasks.reference import Reference, from_csv, joined
+from ..tasks.reference import Reference, joined
+from ..tasks.shapes import REFERENCES as BUILT_IN
 from ..tasks.task import AbstractTask
 from ..tasks.track import L2Track
 from ..tasks.track import Track as PaperTrack
+from ..tasks.trajectory_csv import from_csv
 from .presets import Preset
 from .presets import Track as TrackTable
 from .presets import Vision as VisionTable
 from .registry import Registry
 
 REFERENCES: Registry[Callable[[], Reference]] = Registry(
-    "reference", example="a CSV file of t, x, y, z, or module:name"
+    "reference", example="a CSV file of t, x, y, z, as my.csv or my.csv:once, or module:name"
 )
 for _name, _make in BUILT_IN.items():
     REFERENCES.register(_name, _make)
 register_reference = REFERENCES.register
+
+LAPS = {"": None, "laps": True, "once": False}
+"""What may stand behind a CSV file and a colon: whether it repeats."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +84,12 @@ def find_task(name: str) -> TaskEntry:
 
 
 def make_reference(names: str) -> Reference:
-    """Return a reference by name or CSV file; several, joined by +, become a family.
+    """Return a reference by name.
+
+    Args:
+        names: A registered name, ``module:name`` of a function that makes one, or a CSV file. A closed file repeats as
+            laps, and any other is flown once; ``my.csv:laps`` insists on laps, ``my.csv:once`` flies it once. Several
+            of them, joined by ``+``, become a family.
 
     Raises:
         ConfigError: There is no such reference, or its file cannot be used.
@@ -90,12 +99,20 @@ def make_reference(names: str) -> Reference:
 
 
 def _one_reference(name: str) -> Reference:
+    file, _, how = name.rpartition(":") if ".csv:" in name.lower() else (name, "", "")
     try:
-        return from_csv(Path(name)) if name.lower().endswith(".csv") else REFERENCES.find(name)()
+        if file.lower().endswith(".csv"):
+            if how not in LAPS:
+                raise ConfigError(f"{name}: {how!r} is not 'laps' or 'once'")
+            return from_csv(Path(file), LAPS[how])
+        made: Any = REFERENCES.find(name)()
     except OSError as error:
-        raise ConfigError(f"{name}: {error.strerror or error}") from error
-    except ValueError as error:
-        raise error if isinstance(error, ConfigError) else ConfigError(str(error)) from error
+        raise ConfigError(f"{file}: {error.strerror or error}") from error
+    except (TypeError, ValueError) as error:
+        raise error if isinstance(error, ConfigError) else ConfigError(f"reference {name}: {error}") from error
+    if not isinstance(made, Reference):
+        raise ConfigError(f"reference {name!r} is a {type(made).__name__}, not a function that gives a Reference")
+    return made
 
 
 def _hover(request: TaskRequest) -> AbstractTask:

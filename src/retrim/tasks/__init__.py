@@ -7,13 +7,14 @@ from .keypoints import Keypoints as Keypoints
 from .observation import AbstractObservation as AbstractObservation
 from .observation import StateObs as StateObs
 from .preview import Preview as Preview
-from .reference import REFERENCES as REFERENCES
 from .reference import Reference as Reference
-from .reference import from_csv as from_csv
 from .reference import joined as joined
+from .shapes import REFERENCES as REFERENCES
+from .shapes import smooth_start as smooth_start
 from .task import AbstractTask as AbstractTask
 from .task import Start as Start
 from .task import huber as huber
 from .track import AbstractTrack as AbstractTrack
 from .track import L2Track as L2Track
 from .track import Track as Track
+from .trajectory_csv import from_csv as from_csv

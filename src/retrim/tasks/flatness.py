@@ -51,10 +51,9 @@ def flat_row(path: Path3, t: float, last: float) -> np.ndarray:
     closer = (at(middle + 0.1 * h) - 2.0 * points[2] + at(middle - 0.1 * h))[:3] / (0.1 * h) ** 2
     if max(np.linalg.norm(a - closer) for a in accelerations) > JUMP:  # a jump does not look the same from nearer
         return hover
-    attitudes = [_attitude(a, point[3]) for a, point in zip(accelerations, points[1:4], strict=True)]
-    if any(R is None for R in attitudes):
+    R_before, R, R_after = (_attitude(a, point[3]) for a, point in zip(accelerations, points[1:4], strict=True))
+    if R_before is None or R is None or R_after is None:
         return hover
-    R_before, R, R_after = attitudes
     turn = R.T @ (R_after - R_before) / (2.0 * h)
     thrust = np.linalg.norm(accelerations[1] + UP)
     return np.concatenate([here[:3], v, [thrust, turn[2, 1], turn[0, 2], turn[1, 0]], here[3:]])

@@ -1,0 +1,160 @@
+"""References through the points of a file: laps that repeat, or a path that is flown once and held."""
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import ConfigError
+from ..physics.state import STANDARD_GRAVITY
+from .feasibility import REST
+from .reference import POINTS, Reference
+from .shapes import RAMP, smooth_start
+from .trajectory_table import read_table
+
+CLOSED = 0.01  # [m]: ends that are nearer coincide
+CLOSED_YAW = 0.02  # [rad]
+SHORTEST_LAP = 0.5  # [s]
+ALONGSIDE = 0.1  # share of the speed by which two passes of one lap may differ
+ROW = 0.02  # [s]: rows are not farther apart
+AROUND = 12  # points beyond a lap's end that shape its spline: the end of a spline is felt for about as many
+
+
+def from_csv(file: Path, laps: bool | None = None) -> Reference:
+    """Make a reference through the points of a file, by cubic splines.
+
+    A file is closed if its last point is within 1 cm of its first, and its yaw the same but for whole turns; it repeats
+    as laps. A file that ends in motion where its path was before, in the same direction and as fast, repeats from
+    there. Laps that start in motion are given a smooth start of 3 s along the path, as the built-in shapes have. Any
+    other file is flown once, from rest to rest, and its end is held. Points that are too near each other for a vehicle
+    to come to rest between them stay in motion at that end, and :meth:`Reference.infeasibility` says so.
+
+    Args:
+        file: Times, positions and headings; for the format see :func:`retrim.tasks.trajectory_table.read_table`.
+        laps: True to insist on laps, False to fly any file once; None to decide by its ends.
+
+    Returns:
+        The reference, its rows at most 20 ms apart. Its time 0 is that of the first point.
+
+    Raises:
+        ConfigError: The file cannot be used, with the line; or ``laps`` is asked of a file that does not repeat.
+        OSError: The file cannot be opened.
+    """
+    table = read_table(Path(file))
+    start = None if laps is False else _lap_start(table)
+    if start is not None:
+        return _repeated(table, start)
+    if laps:
+        raise ConfigError(f"{file}: {_why_no_lap(table)}; a lap ends with the point that it starts with")
+    return _once(table)
+
+
+def _once(table: np.ndarray) -> Reference:
+    seconds = float(table[-1, 0])
+    spline = _spline(table, (_end(table, 0), _end(table, -1)))
+    return Reference.of(spline, seconds=seconds, points=_points(seconds))
+
+
+def _repeated(table: np.ndarray, start: float) -> Reference:
+    """Repeat the part of the table from ``start`` [s] on, after what is before."""
+    period = float(table[-1, 0]) - start
+    spline, winding = _lap_spline(table, start)
+    in_motion = float(np.linalg.norm((spline(1e-3) - spline(0.0))[:3])) / 1e-3 > REST
+
+    def path(t: float) -> np.ndarray:
+        s = smooth_start(t) if in_motion else t
+        turns = max(math.floor((s - start) / period), 0)
+        return np.asarray(spline(s - turns * period) + turns * winding)
+
+    lap = max(start + 0.5 * RAMP, RAMP) if in_motion else start
+    return Reference.of(path, seconds=lap + period, lap=lap, points=_points(lap + period))
+
+
+def _lap_spline(table: np.ndarray, start: float) -> tuple[Callable[[float], np.ndarray], np.ndarray]:
+    """Return a spline that is smooth from lap to lap, and what a lap adds to its values: whole turns of yaw."""
+    table, period = table.copy(), float(table[-1, 0]) - start
+    first = table[0, 1:] if start == 0.0 else _spline(table, (_end(table, 0), "not-a-knot"))(start)
+    winding = np.array([0.0, 0.0, 0.0, 2.0 * math.pi * round((table[-1, 4] - first[3]) / (2.0 * math.pi))])
+    along = np.clip((table[:, 0] - start) / period, 0.0, None)[:, None]
+    table[:, 1:] += along * (first + winding - table[-1, 1:])  # all points share the gap: no step at the seam
+    if start == 0.0:
+        turning = winding / period
+        table[:, 1:] -= table[:, :1] * turning
+        table[-1, 1:] = table[0, 1:]
+        periodic = _spline(table, "periodic")
+        return (lambda t: periodic(t) + t * turning), winding
+    after = table[table[:, 0] > start + 0.1 * (table[-1, 0] - table[-2, 0])][:AROUND].copy()
+    after[:, 0] += period
+    after[:, 1:] += winding
+    return _spline(np.concatenate([table, after]), (_end(table, 0), "not-a-knot")), winding
+
+
+def _lap_start(table: np.ndarray) -> float | None:
+    """Return the time [s] from which on the table can repeat: 0 for a closed one, None for one that cannot."""
+    if len(table) < 4:
+        return None
+    if _ends_meet(table) and _end(table, 0) == _end(table, -1):
+        return 0.0
+    if _end(table, -1) == "clamped":
+        return None
+    from scipy.optimize import minimize_scalar  # here: it takes as long to import as all of retrim
+
+    spline, end, last = _spline(table, (_end(table, 0), "not-a-knot")), float(table[-1, 0]), table[-1, 1:]
+    times = np.linspace(0.0, end, 8 * len(table))
+    far = np.linalg.norm(spline(times)[:, :3] - last[:3], axis=1)
+    nearest = 1 + np.flatnonzero((far[1:-1] <= far[:-2]) & (far[1:-1] <= far[2:]))
+    v_end = spline(end, 1)[:3]
+    for k in reversed(nearest):
+        if times[k] > end - SHORTEST_LAP or np.sum(table[:, 0] > times[k]) < 4:
+            continue
+        t = minimize_scalar(
+            lambda t: float(np.sum((spline(t)[:3] - last[:3]) ** 2)),
+            bounds=(times[k - 1], times[k + 1]),
+            method="bounded",
+            options={"xatol": 1e-9},
+        ).x
+        as_fast = np.linalg.norm(spline(t, 1)[:3] - v_end) <= ALONGSIDE * np.linalg.norm(v_end)
+        if as_fast and _same(spline(t), last):
+            return float(t)
+    return None
+
+
+def _why_no_lap(table: np.ndarray) -> str:
+    gap = float(np.linalg.norm(table[-1, 1:4] - table[0, 1:4]))
+    if len(table) < 4:
+        return f"{len(table)} points; a lap needs at least four"
+    if gap > CLOSED:
+        return f"its last point is {gap:.3f} m from its first"
+    if not _ends_meet(table):
+        return "its last point is where its first is, but with another yaw"
+    return "it rests at one of its ends and moves at the other"
+
+
+def _ends_meet(table: np.ndarray) -> bool:
+    return _same(table[0, 1:], table[-1, 1:])
+
+
+def _same(a: np.ndarray, b: np.ndarray) -> bool:
+    near = bool(np.linalg.norm(a[:3] - b[:3]) <= CLOSED)
+    return near and abs(math.remainder(a[3] - b[3], 2.0 * math.pi)) <= CLOSED_YAW
+
+
+def _end(table: np.ndarray, which: int) -> str:
+    """Return how a spline ends there: at rest, or in motion if a vehicle could not come to rest between the points."""
+    near = table[:4] if which == 0 else table[-4:]
+    at, beside = near[which, 0], near[1 if which == 0 else -2, 0]
+    speed = float(np.linalg.norm(_spline(near, "not-a-knot")(at, 1)[:3]))
+    return "not-a-knot" if speed > REST and speed / abs(beside - at) > STANDARD_GRAVITY else "clamped"
+
+
+def _spline(table: np.ndarray, ends: str | tuple[str, str]) -> Any:
+    from scipy.interpolate import CubicSpline  # here: it takes as long to import as all of retrim
+
+    return CubicSpline(table[:, 0], table[:, 1:], bc_type=ends)
+
+
+def _points(seconds: float) -> int:
+    """Return how many rows are near enough to each other, as a multiple of those of the built-in shapes."""
+    return POINTS * math.ceil(seconds / (ROW * (POINTS - 1)))

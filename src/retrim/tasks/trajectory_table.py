@@ -1,0 +1,180 @@
+"""Text files of a trajectory: separators, comments, header, numbers; every fault is named with its line."""
+
+import csv
+import math
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import ConfigError
+
+EXPECTED = "t [s], x, y, z [m] and, if wanted, yaw [rad]"
+COLUMNS = ("t", "x", "y", "z", "yaw")
+ALIASES = {"time": "t", "timestamp": "t", "heading": "yaw", "psi": "yaw"}
+UNITS = {
+    "t": ("s", "sec", "second", "seconds"),
+    **dict.fromkeys("xyz", ("m", "meter", "meters", "metre", "metres")),
+    "yaw": ("rad", "radian", "radians"),
+}
+FARTHEST = 1000.0  # [m]
+LARGEST_YAW = 2.0 * math.pi + 0.1  # [rad]: what is beyond looks like degrees
+LONGEST = 600.0  # [s]
+FASTEST = 100.0  # [m/s] between points
+SLOWEST = 0.02  # [m/s]: a vehicle of 20 m/s whose times are in ms seems to be slower
+
+
+def read_table(file: Path) -> np.ndarray:
+    """Read the points of a trajectory file.
+
+    Args:
+        file: UTF-8 text with one point a line. Columns are separated by comma, semicolon, tab or spaces; ``#`` starts a
+            comment; blank lines, quotes and separators at the end of a line do not count. A header names the columns,
+            in any order: t (time, timestamp), x, y, z, yaw (heading, psi), with units in brackets or without. Without
+            a header the order is t, x, y, z[, yaw]. A comment of column names before the first point is a header, too.
+
+    Returns:
+        One row a point: time since the first point [s], x, y, z, world [m], and yaw [rad], unwrapped; 0 without yaw.
+
+    Raises:
+        ConfigError: The file cannot be read as that, with the line; times do not rise; or values are not plausible.
+        OSError: The file cannot be opened.
+    """
+    try:
+        text = file.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{file} is not UTF-8 text; {EXPECTED} are expected, one point a line") from error
+    columns: list[str] | None = None
+    points, numbers = list[list[float]](), list[int]()
+    for number, line, comment in _lines(text):
+        where = f"{file}, line {number}"
+        try:
+            words = _words(line)
+            if not points and columns is None:
+                columns = _header(words, comment=comment)
+                if columns is not None:
+                    continue
+            if comment:
+                continue
+            point = _point(words, columns or list(COLUMNS[: max(4, len(words))]))
+            if points and len(point) != len(points[0]):
+                raise ConfigError(f"{line!r} has {len(words)} columns, the first point {len(points[0])}")
+            if points and point[0] <= points[-1][0]:
+                raise ConfigError(f"time {point[0]:g} s does not come after {points[-1][0]:g} s")
+        except ConfigError as error:
+            raise ConfigError(f"{where}: {error}") from error
+        points.append(point)
+        numbers.append(number)
+    if len(points) < 2:
+        raise ConfigError(f"{file}: {len(points)} points; a trajectory needs at least two")
+    table = np.array([[*point, 0.0][:5] for point in points])
+    table[:, 0] -= table[0, 0]
+    table[:, 4] = np.unwrap(table[:, 4])
+    _check_times(table, numbers, file)
+    return table
+
+
+def _lines(text: str) -> Iterator[tuple[int, str, bool]]:
+    """Yield number and content of every line that has any, and whether all of it is a comment."""
+    for number, line in enumerate(text.splitlines(), start=1):
+        content, _, comment = line.partition("#")
+        if content.strip():
+            yield number, content.strip(), False
+        elif comment.strip():
+            yield number, comment.strip(), True
+
+
+def _words(line: str) -> list[str]:
+    """Split a line at its separator: a tab, semicolon or comma if there is one, else spaces.
+
+    Raises:
+        ConfigError: A quoted field is too long to be a number.
+    """
+    separator = next((sign for sign in "\t;," if sign in line), " ")
+    if separator == " ":
+        line = " ".join(re.sub(r"\s+(?=[\[(])", "", line).split())  # a unit belongs to its name
+    try:
+        words = [word.strip() for word in next(csv.reader([line], delimiter=separator, skipinitialspace=True))]
+    except csv.Error as error:
+        raise ConfigError(f"{error}; {EXPECTED} are expected") from error
+    while words and not words[-1]:
+        words.pop()
+    return words
+
+
+def _header(words: list[str], *, comment: bool) -> list[str] | None:
+    """Return the columns that a header names; None if the line is no header.
+
+    Raises:
+        ConfigError: It names what is not expected, or not all that is needed.
+    """
+    if not words or any(_number(word) is not None for word in words):
+        return None
+    parts = [re.fullmatch(r"([^\[(]*?)\s*(?:[\[(]\s*(.*?)\s*[\])])?", word) for word in words]
+    names = [part[1].lower() if part else word for part, word in zip(parts, words, strict=True)]
+    names = [ALIASES.get(name, name) for name in names]
+    if comment and not set(COLUMNS[:4]) <= set(names):
+        return None  # a remark
+    for word, name, part in zip(words, names, parts, strict=True):
+        if name not in COLUMNS:
+            raise ConfigError(f"column {word!r} is not known; {EXPECTED} are expected")
+        if names.count(name) > 1:
+            raise ConfigError(f"column {name!r} is there twice; {EXPECTED} are expected")
+        unit = part[2] if part else None
+        if unit is not None and unit.lower() not in UNITS[name]:
+            raise ConfigError(f"column {word!r}: {name} is expected in {UNITS[name][0]}, not in {unit}")
+    if missing := [name for name in COLUMNS[:4] if name not in names]:
+        raise ConfigError(f"no column {', '.join(missing)}; {EXPECTED} are expected")
+    return names
+
+
+def _number(word: str) -> float | None:
+    try:
+        return float(word)
+    except ValueError:
+        return None
+
+
+def _point(words: list[str], columns: list[str]) -> list[float]:
+    """Return t, x, y, z and, if there is one, yaw.
+
+    Raises:
+        ConfigError: They are not that many plausible numbers.
+    """
+    shown = ", ".join(words) if len(words) <= 6 else ", ".join(words[:6]) + ", ..."
+    if len(words) != len(columns) or len(words) > len(COLUMNS):
+        raise ConfigError(f"'{shown}' has {len(words)} columns; {', '.join(columns)} are expected: {EXPECTED}")
+    values = dict[str, float]()
+    for name, word in zip(columns, words, strict=True):
+        value = _number(word)
+        if value is None:
+            raise ConfigError(f"{name} = {word!r} in '{shown}' is not a number; {EXPECTED} are expected")
+        if not math.isfinite(value):
+            raise ConfigError(f"{name} = {word!r} in '{shown}' is not finite")
+        values[name] = value
+    if far := [name for name in "xyz" if abs(values[name]) > FARTHEST]:
+        raise ConfigError(f"{far[0]} = {values[far[0]]:g} m is beyond {FARTHEST:g} m; are the positions in m?")
+    if abs(values.get("yaw", 0.0)) > LARGEST_YAW:
+        raise ConfigError(
+            f"yaw = {values['yaw']:g} looks like degrees; radians between -2 pi and 2 pi are expected "
+            "(a wrapped yaw is unwrapped)"
+        )
+    return [values[name] for name in COLUMNS if name in values]
+
+
+def _check_times(table: np.ndarray, numbers: list[int], file: Path) -> None:
+    steps = np.diff(table[:, 0])
+    speeds = np.linalg.norm(np.diff(table[:, 1:4], axis=0), axis=1) / steps
+    seconds, step = float(table[-1, 0]), float(np.median(steps))
+    in_ms = "; are the times in ms? They are expected in s" if step >= 1.0 else ""
+    if seconds > LONGEST:
+        raise ConfigError(f"{file}: it lasts {seconds:g} s; at most {LONGEST:g} s can be flown{in_ms}")
+    if in_ms and 0.0 < speeds.max() < SLOWEST:
+        raise ConfigError(f"{file}: its points are {step:g} s and {1e3 * speeds.max() * step:.1f} mm apart{in_ms}")
+    k = int(np.argmax(speeds))
+    if speeds[k] > FASTEST:
+        raise ConfigError(
+            f"{file}, line {numbers[k + 1]}: {speeds[k] * steps[k]:.3g} m in {steps[k]:.3g} s after the point before, "
+            f"{speeds[k]:.3g} m/s; are the positions in m and the times in s?"
+        )
