@@ -20,7 +20,6 @@ from ..experiments.run import INTERRUPTED, Run
 from ..experiments.tables.document import TableSection
 from ..io.checkpoint import load_delta
 from ..io.trained import load_learnt, load_policy
-from ..tasks.reference import Reference
 from .console import RichReporter, console, show_paths, show_table
 from .pretrain import checked_seed
 
@@ -74,8 +73,9 @@ def fly(
             simulators, each an extra to install; or module:name.
         adapt: full: re-train all weights in flight; lora: a low-rank delta (ranks 4, 10, 1); base-i: integral action;
             base-do: a disturbance observer; none: fly as it is; or module:name. The policy flies as it is, too.
-        reference: What a tracking policy follows: circle, figure8, star, a CSV file of t, x, y, z[, yaw], or
-            module:name; what it was trained on by default. Another one needs a policy that sees its reference.
+        reference: What a tracking policy follows: circle, figure8, star, a CSV file of t, x, y, z[, yaw] or module:name;
+            what it was trained on by default. my.csv:laps repeats a file, my.csv:once does not; by default a closed one
+            repeats. Another reference than that of training needs a policy that sees it.
         vehicle: Vehicle that the plant simulates: small, large, kingfisher, a vehicle file or module:name; that which
             the policy was trained for by default. rotorpy and crazyflow fly their own.
         sensors: What the policy is shown of the state: ideal, mocap (0.3 mm, 3 mm/s, 1 mrad), rough (1 mm, 10 mm/s,
@@ -109,7 +109,7 @@ def fly(
             raise ConfigError(
                 f"--seconds {length:g} --starts {starts}: 3 to 36000 s and 1 to 100000 starts can be flown"
             )
-        _warn(setup, follows)
+        _warn(setup, scenario)
         order = Order(preset, weights, scenario, methods, length, starts, checked_seed(seed), latency, state, out)
         return _fly(order, setup, stop)
 
@@ -184,10 +184,11 @@ def _flown_reference(preset: Preset, name: str | None) -> str | None:
     return name or trained_on
 
 
-def _warn(setup: Setup, name: str | None) -> None:
-    followed = getattr(setup.flown, "reference", None)
-    if isinstance(followed, Reference) and (wrong := followed.infeasibility(setup.vehicle)):
-        console.print(f"[yellow]warning:[/] reference {name}: {wrong}")
+def _warn(setup: Setup, scenario: Scenario) -> None:
+    """Say what the vehicle that flies cannot fly of the reference."""
+    if wrong := setup.limits_exceeded(scenario.make_vehicle(setup.preset.vehicle)):
+        who = scenario.vehicle_name(setup.preset.vehicle)
+        console.print(f"[yellow]warning:[/] vehicle {who} cannot fly all of reference {scenario.reference}: {wrong}")
 
 
 def _same_policy(trained: Preset, changed_one: Preset, config: Path) -> Preset:

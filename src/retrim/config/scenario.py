@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ..errors import ConfigError
+from ..physics.vehicle import Vehicle
 from ..plants.plant import Plant
 from .disturbances import disturbance
 from .plants import PLANTS, PlantEntry, PlantRequest
@@ -58,6 +59,14 @@ class Scenario:
     def vehicle_name(self, trained_for: str | VehicleSpec) -> str:
         """Return the name of the vehicle that flies a policy trained for ``trained_for``."""
         return self.entry.own_vehicle or name_of(self.vehicle or trained_for)
+
+    def make_vehicle(self, trained_for: str | VehicleSpec) -> Vehicle:
+        """Build the vehicle that flies a policy trained for ``trained_for``.
+
+        A plant with a vehicle of its own does not tell its limits: there it is the vehicle of training, to whose limits
+        the policy keeps.
+        """
+        return make_vehicle(self.vehicle or trained_for)
 
     def make(self, trained_for: str | VehicleSpec = "small", *, dt: float = 0.02, seed: int = 0) -> Plant:
         """Build the plant.

@@ -201,10 +201,14 @@ class Setup:
         batch = jax.jit(lambda key: jax.vmap(nearby.reset)(random.split(key, n)).x)(key)
         return [jax.tree.map(lambda leaf, i=i: jnp.asarray(np.asarray(leaf)[i]), batch) for i in range(n)]
 
-    def limits_exceeded(self) -> str | None:
-        """Return what the vehicle of training cannot fly of the flown reference; None if it can fly all of it."""
+    def limits_exceeded(self, vehicle: Vehicle | None = None) -> str | None:
+        """Return what a vehicle cannot fly of the flown reference, in words; None if it can fly all of it.
+
+        Args:
+            vehicle: Vehicle that flies; by default that of training.
+        """
         followed = getattr(self.flown, "reference", None)
-        return followed.infeasibility(self.vehicle) if isinstance(followed, Reference) else None
+        return followed.infeasibility(vehicle or self.vehicle) if isinstance(followed, Reference) else None
 
 
 @functools.lru_cache(maxsize=16)

@@ -50,8 +50,9 @@ class AbstractTrack(AbstractTask):
 
     @property
     def flight_seconds(self) -> float:
-        """Default length of a flight [s], as in the paper."""
-        return 60.0
+        """Default length of a flight [s]: the paper's; less where the reference does not repeat and ends earlier."""
+        start, end = (round(float(t), 3) for t in self.reference.lap)
+        return 60.0 if start < end else min(60.0, max(end, 3.0))
 
     @property
     def steady_seconds(self) -> float:
