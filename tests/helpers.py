@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import random
 
 from retrim.config import changed, load
-from retrim.learn import Env
+from retrim.learn import Env, Window
 from retrim.physics import Command, PointMass, State, small, so3
 from retrim.tasks import Hover, StateObs
 
@@ -35,6 +35,21 @@ def hover_env(dynamics=None, *, delay_ticks=0, **task):
     """A hover task with a model of its rate, the point mass unless another is given."""
     small_task = hover_task(**task)
     return Env(PointMass(small_task.dt) if dynamics is None else dynamics, small_task, delay_ticks)
+
+
+def random_field_flight(field, key, *, n=100, delay_ticks=0):
+    """A window of flight under random commands in a world that is Eq. (1) plus ``field`` (x, u) [m/s^2].
+
+    Commands act ``delay_ticks`` ticks after they were issued.
+    """
+    model, commands, states = PointMass(0.02), [], [State.at(jnp.array(GOAL))]
+    step = jax.jit(lambda x, u: model.step(x, u, field(x, u)))
+    for k in random.split(key, n):
+        kc, kw = random.split(k)
+        commands.append(Command(9.81 + random.normal(kc, ()), 0.5 * random.normal(kw, (3,))))
+        acting = commands[-1 - delay_ticks] if len(commands) > delay_ticks else Command.hover()
+        states.append(step(states[-1], acting))
+    return Window(0.02 * jnp.arange(float(n)), stacked(states[:n]), stacked(commands), jnp.ones(n, dtype=bool))
 
 
 def tiny_preset(**changes):

@@ -8,16 +8,16 @@ import optax
 import pytest
 from jax import random
 
-from helpers import hover_task, tiny_preset
-from retrim.adapt import learner as adapter_module
+from helpers import hover_env, tiny_preset
+from retrim.adapt import learner as learner_module
 from retrim.adapt.buffer import RollingBuffer
 from retrim.adapt.gate import judge
-from retrim.config import factory as build
+from retrim.config import Setup
 from retrim.control import LoraPolicy, Policy
 from retrim.control.lora import LowRankFactors
 from retrim.learn import PolicyState, bptt, policy_gradient, policy_loss
-from retrim.learn.pretrain import starts
-from retrim.physics import Command, PointMass, State, small
+from retrim.learn.pretrain import random_starts
+from retrim.physics import Command, State, small
 
 RANKS = (3, 4, 1)
 
@@ -104,16 +104,16 @@ def test_scale_counts(base, key):
 
 @pytest.mark.parametrize("touched", [False, True])
 def test_gradient_through_the_pull_is_exact(touched, lora, key):
-    """What bptt does, taps and then back through the merger, against autodiff of the loss in the delta."""
-    task, model = hover_task(horizon=5), PointMass(0.02)
+    """What bptt does, perturbations and then back through the merger, against autodiff of the loss in the delta."""
+    env = hover_env(horizon=5, delay_ticks=1)
     lora = moved(lora, key) if touched else lora
-    x0 = jax.vmap(task.reset)(random.split(key, 3))
+    x0 = jax.vmap(env.task.reset)(random.split(key, 3))
 
     @eqx.filter_jit
     def both(lora):
         layers, pull = jax.vjp(lambda delta: lora.with_params(delta).merged().layers, lora.params)
-        value, by_layers = policy_gradient(lora.merged().with_params(layers), model, task, x0, delay=1)
-        loss = lambda delta: policy_loss(lora.with_params(delta).merged(), model, task, x0, delay=1)  # noqa: E731
+        value, by_layers = policy_gradient(lora.merged().with_params(layers), env, x0)
+        loss = lambda delta: policy_loss(lora.with_params(delta).merged(), env, x0)  # noqa: E731
         return (value, pull(by_layers)[0]), jax.value_and_grad(loss)(lora.delta)
 
     (value, found), (expected, wanted) = both(lora)
@@ -137,13 +137,13 @@ def test_no_gradient_reaches_the_base(lora, key):
 
 @pytest.mark.usefixtures("optax_promotion")
 def test_training_moves_the_delta_only_and_lowers_the_loss(key):
-    task, model = hover_task(horizon=40, heading=0.3), PointMass(0.02)
+    env = hover_env(horizon=40, heading=0.3)
     base = Policy.of(15, small(), key=key, hidden=(32, 32))
     lora = LoraPolicy.of(base, key=key)
     before = jax.tree.map(np.array, base)
     optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(3e-2))
-    train = eqx.filter_jit(lambda s, x0: bptt(s, model, task, x0, optimiser=optimiser))
-    state, losses = train(PolicyState(lora, optimiser.init(lora.params)), starts(task, key, 40, 8))
+    train = eqx.filter_jit(lambda s, x0: bptt(s, env, x0, optimiser=optimiser))
+    state, losses = train(PolicyState(lora, optimiser.init(lora.params)), random_starts(env.task, key, 40, 8))
     assert losses.shape == (40,)
     trained = state.policy
     same(trained.base, before)
@@ -151,41 +151,41 @@ def test_training_moves_the_delta_only_and_lowers_the_loss(key):
     for thin, fresh in zip(trained.delta, lora.delta, strict=True):
         assert float(jnp.abs(thin.up - fresh.up).max()) > 1e-3
         assert float(jnp.abs(thin.down - fresh.down).max()) > 1e-4
-    x0 = jax.vmap(task.reset)(random.split(random.key(9), 32))
-    loss = eqx.filter_jit(lambda policy: policy_loss(policy, model, task, x0))
+    x0 = jax.vmap(env.task.reset)(random.split(random.key(9), 32))
+    loss = eqx.filter_jit(lambda policy: policy_loss(policy, env, x0))
     assert float(loss(trained.merged())) < 0.9 * float(loss(base))
 
 
 @pytest.mark.usefixtures("optax_promotion")
 def test_a_gradient_that_is_not_finite_changes_nothing(lora, key):
-    task, optimiser = hover_task(horizon=3), optax.adam(1e-2)
+    env, optimiser = hover_env(horizon=3), optax.adam(1e-2)
     state = PolicyState(lora, optimiser.init(lora.params))
-    x0 = starts(task, key, 1, 2)
+    x0 = random_starts(env.task, key, 1, 2)
     broken = eqx.tree_at(lambda s: s.x.v, x0, x0.x.v.at[0, 0, 0].set(jnp.nan))
-    after, losses = eqx.filter_jit(lambda s, x: bptt(s, PointMass(0.02), task, x, optimiser=optimiser))(state, broken)
+    after, losses = eqx.filter_jit(lambda s, x: bptt(s, env, x, optimiser=optimiser))(state, broken)
     assert not np.isfinite(losses).all()
     same(after, state)
 
 
 @pytest.mark.usefixtures("optax_promotion")
 def test_the_learner_beside_the_flight_takes_it(key, monkeypatch):
-    """Improve returns a low-rank policy with the same base; the gate is given plain policies."""
-    preset = tiny_preset(pretrain={"horizon": 20, "hidden": (12, 12)})
+    """An update returns a low-rank policy with the same base; the gate is given plain policies."""
+    preset = tiny_preset(pretrain={"horizon": 20, "hidden_sizes": (12, 12)})
     judged = []
 
     def noting(candidate, incumbent, *rest, **options):
         judged.extend([candidate, incumbent])
         return judge(candidate, incumbent, *rest, **options)
 
-    monkeypatch.setattr("retrim.adapt.adapter.judge", noting)
-    adapter = build.adapter(preset)
-    base = build.policy(preset, random.key(0))
-    state = adapter.init(build.lora(base, random.key(1)), build.residual(preset, random.key(2)))
+    monkeypatch.setattr("retrim.adapt.learner.judge", noting)
+    setup = Setup.of(preset)
+    base = setup.new_policy(random.key(0))
+    state = setup.learner.init(setup.low_rank(base, random.key(1)), random.key(2))
     buffer = RollingBuffer(preset.adapt.window)
     for i in range(20):
         buffer.push(0.02 * i, State.at(jnp.array([0.3, 0.0, 1.0])), Command.hover())
     k = random.key(3)
-    after, verdict = adapter.update_policy(state.policy, state.residual.residual, buffer.window(), k)
+    after, verdict = setup.learner.update_policy(state.policy, state.residual, buffer.window(), k)
     assert isinstance(after.policy, LoraPolicy)
     same(after.policy.base, base)
     assert any(float(jnp.abs(thin.up).max()) > 0.0 for thin in after.policy.delta)
@@ -193,10 +193,9 @@ def test_the_learner_beside_the_flight_takes_it(key, monkeypatch):
     assert bool(verdict.finite)
     assert bool(verdict.admitted) == (float(verdict.candidate) <= float(verdict.incumbent))
     # a broken delta is found in the merged weights
-    task = build.task(preset)
-    x0 = jax.vmap(task.reset)(random.split(key, 2))
+    x0 = jax.vmap(setup.env.task.reset)(random.split(key, 2))
     bad = eqx.tree_at(lambda p: p.delta[0].up, after.policy, jnp.full_like(after.policy.delta[0].up, jnp.nan))
-    found = judge(bad.merged(), base, build.nominal(preset), task, x0)
+    found = judge(bad.merged(), base, setup.env, x0)
     assert found.reason() == "a weight is not finite"
 
 
@@ -205,7 +204,7 @@ def test_starts_are_drawn_from_what_was_flown(key):
     buffer = RollingBuffer(5)
     for i in range(3):
         buffer.push(0.02 * (i + 1), State.at(jnp.array([float(i + 1), 0.0, 1.0])), Command.hover())
-    found = adapter_module._drawn(buffer.window(), key, 60)
+    found = learner_module._drawn(buffer.window(), key, 60)
     np.testing.assert_allclose(found.t, 0.02 * found.x.p[:, 0])
     assert set(np.asarray(found.x.p[:, 0]).tolist()) == {1.0, 2.0, 3.0}
     assert found.x.R.shape == (60, 3, 3)

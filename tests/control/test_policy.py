@@ -8,7 +8,7 @@ from jax import random
 
 from retrim.control import Policy
 from retrim.control.policy import Policy as PolicyType
-from retrim.learn import EnsembleResidual
+from retrim.learn.residuals import EnsembleResidual
 from retrim.physics import large, small
 
 
@@ -51,7 +51,7 @@ def test_fresh_policy_hovers(key):
     np.testing.assert_allclose(policy(o).vector(), [9.81, 0, 0, 0], atol=0.05)
 
 
-def test_zero_taps_change_nothing(key):
+def test_zero_perturbations_change_nothing(key):
     policy: PolicyType = Policy.of(15, small(), key=key, hidden=(8, 8))
     policy = jax.tree.map(lambda leaf: leaf + 0.2, policy)
     o = random.normal(key, (15,))

@@ -162,16 +162,16 @@ def window(key, n, delay):
 
 @pytest.mark.parametrize("delay", [0, 1, 2])
 def test_a_lagged_flight_leaves_no_residual(delay, key):
-    rows = residual_targets(window(key, 40, delay), lagged(), delay=delay)
+    rows = residual_targets(window(key, 40, delay), lagged(), delay_ticks=delay)
     np.testing.assert_allclose(rows.a_res, 0.0, atol=1e-10)
-    unaware = residual_targets(window(key, 40, delay), PointMass(DT), delay=delay)
+    unaware = residual_targets(window(key, 40, delay), PointMass(DT), delay_ticks=delay)
     assert float(jnp.abs(unaware.a_res).max()) > 0.3
 
 
 def test_a_window_from_mid_flight_settles(key):
     """What acts at its first tick is not known; the mistake dies with the lag: 4 % after five ticks."""
     late = jax.tree.map(lambda leaf: leaf[23:], window(key, 80, 1))
-    away = np.linalg.norm(residual_targets(late, lagged(), delay=1).a_res, axis=1)
+    away = np.linalg.norm(residual_targets(late, lagged(), delay_ticks=1).a_res, axis=1)
     assert away[0] > 0.05
     assert away[5:].max() < 0.1
     assert away[35:].max() < 1e-6
@@ -182,7 +182,7 @@ def test_a_filling_window_settles_too(key):
     whole = window(key, 60, 1)
     padded = jax.tree.map(lambda leaf: jnp.concatenate([jnp.repeat(leaf[:1], 20, axis=0), leaf]), whole)
     padded = replaced(padded, valid=jnp.arange(80) >= 20)
-    rows = residual_targets(padded, lagged(), delay=1)
+    rows = residual_targets(padded, lagged(), delay_ticks=1)
     away = np.linalg.norm(rows.a_res, axis=1)
     assert away[27:].max() < 0.1
     assert away[57:].max() < 1e-6

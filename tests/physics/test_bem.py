@@ -176,10 +176,10 @@ def test_air_takes_energy(bem, key):
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_rate_step_response(bem, axis):
-    """Reaches 63 % within 60 ms (yaw 200 ms), overshoots by less than 25 %, holds the other rates."""
+    """Reaches 63 % within 60 ms (yaw 200 ms), overshoots by less than 35 % (no feed-forward, slow motors), holds the others."""
     rates = path(bem, start(bem, state()), command(G, np.eye(3)[axis]), effects()).body.omega
     assert rates[200 if axis == 2 else 60, axis] > 0.63
-    assert rates[:, axis].max() < 1.25
+    assert rates[:, axis].max() < 1.35
     assert rates[-1, axis] == pytest.approx(1.0, abs=0.15)
     assert np.abs(np.delete(rates, axis, axis=1)).max() < 0.05
 
@@ -314,3 +314,13 @@ def test_hybrid_and_straight_through(key):
 def test_tick_must_be_whole_milliseconds(dt):
     with pytest.raises(ValueError, match=r"BemQuadrotor\.dt"):
         BemQuadrotor.of(small(), dt)
+
+
+@pytest.mark.parametrize("name", ["small", "large"])
+def test_the_integral_removes_the_steady_rate_error_of_a_weak_rotor(name):
+    """With the firmware's scaling the integral holds the commanded rates against a constant torque."""
+    bem = BemQuadrotor.of({"small": small, "large": large}[name](), 0.02)
+    weak = ExternalEffects.of(jnp.zeros(3).dtype, gain=jnp.array([0.9, 1.0, 1.0, 1.0]))
+    rates = path(bem, start(bem, state()), command(G, np.zeros(3)), weak).body.omega
+    assert np.abs(rates[:200]).max() > 0.05  # the torque is felt
+    np.testing.assert_allclose(rates[-1], 0.0, atol=0.01)

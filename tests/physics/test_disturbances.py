@@ -7,7 +7,7 @@ import pytest
 from jax import lax, random
 
 from helpers import random_state
-from retrim.config.registry import DISTURBANCES
+from retrim.config.disturbances import DISTURBANCES
 from retrim.physics import (
     BatterySag,
     BemQuadrotor,
@@ -53,7 +53,7 @@ def same(a, b, **tolerance):
 def test_all(name, double):
     """Finite, of the right shapes, in the dtype of the state, jitted and mapped, at once and after an hour."""
     with jax.enable_x64(double):
-        disturbance = DISTURBANCES[name](random.key(1))
+        disturbance = DISTURBANCES[name](random.key(1), None)
         assert isinstance(disturbance, Disturbance)
         found = over(disturbance, [0.0, 0.01, 10.0, 100.0, 3600.0], at(0.3, -0.2, 1.0))
         for field, shape in SHAPES.items():

@@ -121,7 +121,7 @@ def test_lift_and_project(exact, key):
 
 @pytest.mark.parametrize("dt", [0.0005, 0.0205, 0.0])
 def test_tick_must_be_whole_milliseconds(dt):
-    with pytest.raises(ValueError, match=r"Rotors\.dt"):
+    with pytest.raises(ValueError, match=r"LinearDragQuadrotor\.dt"):
         LinearDragQuadrotor.of(small(), dt)
 
 

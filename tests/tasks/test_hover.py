@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from jax import random
 
-from helpers import GOAL, hover_task, random_command, random_state, replaced
-from retrim.adapt import ControllerPilot, Measurement
-from retrim.config import factory as build
-from retrim.config import presets
+from helpers import GOAL, hover_env, hover_task, random_command, random_state, replaced
+from retrim.config import PRESETS, Setup
 from retrim.control import Policy, PolicyController
 from retrim.learn import rollout
-from retrim.physics import Command, PointMass, State, small, so3
+from retrim.physics import Command, State, small, so3
+from retrim.plants import Measurement
+from retrim.runtime import ControllerPilot
 from retrim.tasks import StateObs, huber
 
 
@@ -63,13 +63,13 @@ def test_starts_keep_to_their_bounds(heading):
     assert np.asarray(x.v).std() == pytest.approx(0.1, rel=0.05)
 
 
-def test_alive():
+def test_termination():
     task, t = hover_task(box=2.0), jnp.array(0.0)
-    assert task.alive(t, State.at(jnp.array([1.9, 0.0, 1.0])))
-    assert not task.alive(t, State.at(jnp.array([2.1, 0.0, 1.0])))
-    assert not task.alive(t, State.at(jnp.array([jnp.nan, 0.0, 1.0])))
+    assert not task.terminated(t, State.at(jnp.array([1.9, 0.0, 1.0])))
+    assert task.terminated(t, State.at(jnp.array([2.1, 0.0, 1.0])))
+    assert task.terminated(t, State.at(jnp.array([jnp.nan, 0.0, 1.0])))
     x = State.at(jnp.array(GOAL))
-    assert not task.alive(t, replaced(x, v=jnp.array([jnp.inf, 0.0, 0.0])))
+    assert task.terminated(t, replaced(x, v=jnp.array([jnp.inf, 0.0, 0.0])))
 
 
 def test_error_is_the_distance():
@@ -94,20 +94,22 @@ def test_observation_layout(history, key):
 
 def test_simulation_and_flight_see_the_same(key):
     """Fly the states of a simulated roll-out through the pilot: it must issue the very commands of the roll-out."""
-    task = hover_task(horizon=12, history=3)
+    env = hover_env(horizon=12, history=3)
+    task = env.task
     policy = Policy.of(task.observation.size, small(), key=key, hidden=(8,))
     policy = jax.tree.map(lambda leaf: leaf + 0.1, policy)  # so that what is seen matters
     x0 = task.reset(key)
-    simulated = rollout(PointMass(0.02), task, policy, x0)
+    simulated = rollout(env, policy, x0)
     pilot = ControllerPilot(PolicyController(task.observation, policy))
+    pilot.reset(Measurement(0.0, x0.x))
     for k in range(task.horizon):
         x = jax.tree.map(lambda leaf, k=k: leaf[k], simulated.x)
-        u = pilot(Measurement(k * 0.02, x, Command.hover()))
+        u = pilot.act(Measurement(k * 0.02, x))
         np.testing.assert_allclose(u.vector(), Command(simulated.u.c[k], simulated.u.omega[k]).vector(), rtol=1e-12)
 
 
 def test_flight_starts_are_the_same_for_every_preset():
-    starts = [build.flight_starts(presets.load(name), 8) for name in presets.PRESETS]
+    starts = [Setup.of(preset).flight_starts(8) for preset in PRESETS.values()]
     for others in starts[1:]:
         jax.tree.map(np.testing.assert_array_equal, starts[0], others)
     for x in starts[0]:

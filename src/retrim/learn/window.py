@@ -3,6 +3,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..physics.state import Command, State
@@ -22,12 +23,12 @@ class Window(eqx.Module):
     @classmethod
     def of(
         cls,
-        t: Float[Array, " n"],
-        p: Float[Array, "n 3"],
-        R: Float[Array, "n 3 3"],
-        v: Float[Array, "n 3"],
-        c: Float[Array, " n"],
-        omega: Float[Array, "n 3"],
+        t: Float[Array | np.ndarray, " n"],
+        p: Float[Array | np.ndarray, "n 3"],
+        R: Float[Array | np.ndarray, "n 3 3"],
+        v: Float[Array | np.ndarray, "n 3"],
+        c: Float[Array | np.ndarray, " n"],
+        omega: Float[Array | np.ndarray, "n 3"],
     ) -> "Window":
         """Build a window from the columns of a flight log.
 

@@ -73,4 +73,4 @@ def _regular(window: Window, dt: float, delay_ticks: int) -> Bool[Array, " rows"
 
 def _settled(window: Window, ticks: int | Float[Array, ""]) -> Bool[Array, " n"]:
     """Whether at least ``ticks`` valid ticks lie before this one in the window."""
-    return jnp.cumsum(window.valid) > ticks
+    return jnp.cumsum(window.valid.astype(window.t.dtype)) > ticks

@@ -1,0 +1,214 @@
+"""The ensemble: recovery of known fields, warm starts, spread, the spectral penalty against the exact norm."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from jax import random
+
+from helpers import GOAL, random_command, random_field_flight, random_state, replaced
+from retrim.learn import EnsembleModel, FittedResidual, ResidualModel, residual_targets
+from retrim.learn.residuals import EnsembleResidual, EnsembleState, fit_ensemble
+from retrim.learn.residuals.ensemble import _spectral
+from retrim.physics import Command, PointMass, State, small
+
+OPTIMISER = optax.adam(1e-2)
+
+pytestmark = pytest.mark.usefixtures("optax_promotion")
+
+
+def ensemble(key, members=3, hidden=(128, 128)):
+    return EnsembleResidual.of(jnp.array(GOAL), small().omega_max, key=key, members=members, hidden=hidden)
+
+
+def linear_drag(x, u):
+    return -0.4 * x.v + jnp.array([0.5, 0.0, 0.2])
+
+
+def test_a_filling_window_counts_only_what_was_flown(key):
+    window = random_field_flight(lambda x, u: jnp.array([1.0, 0.0, 0.0]), key, n=40)
+    spoilt = eqx.tree_at(lambda w: (w.x.v, w.valid), window, (window.x.v.at[:10].set(100.0), jnp.arange(40) >= 11))
+    state = EnsembleState.of(ensemble(key), OPTIMISER)
+    rows = residual_targets(spoilt, PointMass(0.02))
+    fitted, errors = fit_ensemble(state, rows, optimiser=OPTIMISER, steps=100, spectral_weight=1e-4)
+    assert float(errors[-1]) < 1e-2
+    predicted = jax.vmap(fitted.residual)(rows.x, rows.u)[np.asarray(rows.valid)]
+    np.testing.assert_allclose(predicted, np.broadcast_to([1.0, 0.0, 0.0], predicted.shape), atol=0.3)
+
+
+def fitted_on(field, key, fits=3):
+    state = EnsembleState.of(ensemble(key), OPTIMISER)
+    rows = residual_targets(random_field_flight(field, key), PointMass(0.02))
+    fit = jax.jit(lambda s: fit_ensemble(s, rows, optimiser=OPTIMISER, steps=100, spectral_weight=1e-4))
+    for _ in range(fits):  # warm starts
+        state, errors = fit(state)
+    return state, rows, errors
+
+
+def test_recovers_a_constant(key):
+    a = jnp.array([2.0, -0.5, 0.3])
+    state, rows, _ = fitted_on(lambda x, u: a, key)
+    predicted = jax.vmap(state.residual)(rows.x, rows.u)
+    np.testing.assert_allclose(predicted, np.broadcast_to(a, predicted.shape), atol=0.05)
+
+
+def test_recovers_a_field_linear_in_velocity(key):
+    state, rows, _ = fitted_on(linear_drag, key)
+    predicted = jax.vmap(state.residual)(rows.x, rows.u)
+    spread = float(jnp.std(rows.a_res))
+    assert float(jnp.sqrt(jnp.mean((predicted - rows.a_res) ** 2))) < 0.1 * spread
+
+
+def test_warm_start_continues(key):
+    once, rows, first = fitted_on(linear_drag, key, fits=1)
+    _, second = fit_ensemble(once, rows, optimiser=OPTIMISER, steps=100, spectral_weight=1e-4)
+    assert float(second[0]) < 3.0 * float(first[-1]) < 0.1 * float(first[0])
+
+
+def test_fresh_ensemble_predicts_nothing_and_its_members_differ(key):
+    residual, x, u = ensemble(key), random_state(key), random_command(key)
+    np.testing.assert_array_equal(residual(x, u), 0.0)
+    assert not np.allclose(residual.layers[0][0].weight, residual.layers[1][0].weight)
+
+
+def test_prediction_is_the_mean_of_the_members(key):
+    state, rows, _ = fitted_on(linear_drag, key, fits=1)
+    x, u = jax.tree.map(lambda leaf: leaf[5], (rows.x, rows.u))
+    np.testing.assert_allclose(state.residual(x, u), state.residual.members(x, u).mean(axis=0))
+
+
+def test_power_iteration_finds_the_spectral_norm_and_its_gradient(key):
+    W = random.normal(key, (30, 20))
+    v = jnp.ones(20) / jnp.sqrt(20.0)
+    for _ in range(300):
+        squared, v = _spectral(W, v)
+    U, S, Vt = np.linalg.svd(W)
+    assert float(squared) == pytest.approx(S[0] ** 2, rel=1e-6)
+    gradient = jax.grad(lambda W: _spectral(W, v)[0])(W)
+    np.testing.assert_allclose(gradient, 2 * S[0] * np.outer(U[:, 0], Vt[0]), atol=1e-4 * S[0])
+
+
+def test_the_penalty_of_a_zero_matrix_is_zero_and_finite():
+    squared, v = _spectral(jnp.zeros((3, 5)), jnp.ones(5))
+    assert float(squared) == 0.0
+    np.testing.assert_array_equal(v, 1.0)
+    assert np.isfinite(jax.grad(lambda W: _spectral(W, jnp.ones(5))[0])(jnp.zeros((3, 5)))).all()
+
+
+def test_the_penalty_shrinks_the_spectral_norm(key):
+    rows = residual_targets(random_field_flight(linear_drag, key), PointMass(0.02))
+
+    def norm(spectral_weight):
+        state = EnsembleState.of(ensemble(key, members=1), OPTIMISER)
+        state, _ = fit_ensemble(state, rows, optimiser=OPTIMISER, steps=200, spectral_weight=spectral_weight)
+        return np.linalg.norm(state.residual.layers[0][1].weight, 2)
+
+    assert norm(1.0) < 0.7 * norm(0.0)
+
+
+def test_features_are_of_order_one(key):
+    residual = ensemble(key)
+    x = State(jnp.array([1.0, -1.0, 2.0]), jnp.eye(3), jnp.array([3.0, -3.0, 1.0]))
+    u = Command(jnp.array(15.0), jnp.array([5.0, -5.0, 3.0]))
+    features = (jnp.concatenate([x.vector(), u.vector()]) - residual.offset) / residual.scale
+    assert float(jnp.abs(features).max()) <= 1.0
+
+
+# ---- as the online learner takes it
+
+
+@pytest.fixture
+def model():
+    weights = jnp.array(1e-2), jnp.array(1e-4)
+    return EnsembleModel(jnp.array(GOAL), small().omega_max, *weights, steps=30)
+
+
+def test_a_fresh_model_predicts_zero_and_is_sure_of_it(model, key):
+    assert isinstance(model, ResidualModel)
+    state, x, u = model.init(key), random_state(key), random_command(key)
+    np.testing.assert_array_equal(model.predict(state, x, u), 0.0)
+    np.testing.assert_array_equal(model.spread(state, x, u), 0.0)
+    np.testing.assert_array_equal(FittedResidual(model, state)(x, u), 0.0)
+
+
+def test_a_fit_goes_on_where_the_last_one_ended(model, key):
+    """Two fits of 30 steps are one of 60: weights, Adam's moments and the vectors of the power iteration go on."""
+    rows = residual_targets(random_field_flight(linear_drag, key), PointMass(0.02))
+    fit = eqx.filter_jit(lambda model, state: model.fit(state, rows))
+    fresh = model.init(key)
+    once, first = fit(model, fresh)
+    twice, second = fit(model, once)
+    assert float(second) < float(first)
+    (adam, _), (adam_fresh, _) = twice.optimiser, fresh.optimiser
+    assert int(adam_fresh.count) == 0
+    assert int(adam.count) == 60
+    for v, v_fresh in zip(jax.tree.leaves(twice.vectors), jax.tree.leaves(fresh.vectors), strict=True):
+        assert float(jnp.abs(v - v_fresh).max()) > 1e-3
+        assert float(jnp.linalg.norm(v)) == pytest.approx(1.0)
+    at_once, _ = fit(replaced(model, steps=60), fresh)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-9), twice, at_once)
+
+
+def test_a_fit_reports_the_error_before_its_last_step(model, key):
+    rows = residual_targets(random_field_flight(linear_drag, key, n=30), PointMass(0.02))
+    one = replaced(model, steps=1)
+    _, rms = one.fit(one.init(key), rows)
+    assert float(rms) == pytest.approx(float(jnp.sqrt(jnp.mean(jnp.sum(rows.a_res**2, axis=1)))))
+
+
+def test_the_spread_is_the_standard_deviation_of_the_members(model, key):
+    rows = residual_targets(random_field_flight(linear_drag, key), PointMass(0.02))
+    state, _ = eqx.filter_jit(lambda state: model.fit(state, rows))(model.init(key))
+    x, u = random_state(key, spread=3.0), random_command(key)
+    members = np.stack([np.asarray(state.residual.members(x, u)[i]) for i in range(3)])
+    expected = np.sqrt(((members - members.mean(axis=0)) ** 2).mean(axis=0))
+    np.testing.assert_allclose(model.spread(state, x, u), expected, rtol=1e-9)
+    np.testing.assert_allclose(model.predict(state, x, u), members.mean(axis=0), rtol=1e-9)
+    assert (expected > 1e-4).all()
+
+
+def test_the_spectral_weight_reaches_every_layer_of_every_member(key):
+    """Without any row that counts, the penalty alone moves the weights: one step of plain descent shows its gradient.
+
+    Each weight matrix then moves along its leading singular vectors, by 2 w sigma u v^T; no bias moves.
+    """
+    descent = optax.sgd(1e-2)
+    residual = ensemble(key, hidden=(16, 16))
+    residual = jax.tree.map(lambda leaf: leaf + 0.02, residual)  # the last layer of a fresh one is zero
+    state = EnsembleState.of(residual, descent)
+    exact = jax.tree.map(
+        lambda l: jnp.asarray(np.linalg.svd(np.asarray(l.weight))[2][0]),
+        residual.layers,
+        is_leaf=lambda l: isinstance(l, eqx.nn.Linear),
+    )
+    state = replaced(state, vectors=exact)
+    rows = residual_targets(random_field_flight(linear_drag, key, n=20), PointMass(0.02))
+    rows = replaced(rows, valid=jnp.zeros_like(rows.valid))
+    after, _ = fit_ensemble(state, rows, optimiser=descent, steps=1, spectral_weight=0.5)
+    still, _ = fit_ensemble(state, rows, optimiser=descent, steps=1, spectral_weight=0.0)
+    for member, moved, unmoved in zip(residual.layers, after.residual.layers, still.residual.layers, strict=True):
+        for layer, new, same in zip(member, moved, unmoved, strict=True):
+            U, S, Vt = np.linalg.svd(np.asarray(layer.weight))
+            step = 1e-2 * 0.5 * 2.0 * S[0] * np.outer(U[:, 0], Vt[0])
+            assert np.abs(step).max() > 1e-4
+            np.testing.assert_allclose(layer.weight - new.weight, step, atol=1e-9)
+            np.testing.assert_array_equal(new.bias, layer.bias)
+            np.testing.assert_array_equal(same.weight, layer.weight)
+
+
+def test_the_weight_of_the_model_is_the_weight_of_the_fit(model, key):
+    rows = residual_targets(random_field_flight(linear_drag, key, n=30), PointMass(0.02))
+    heavy = replaced(model, spectral_weight=jnp.array(0.3), steps=5)
+    fresh = heavy.init(key)
+    found, _ = eqx.filter_jit(heavy.fit)(fresh, rows)
+    by_weight = eqx.filter_jit(lambda w: fit_ensemble(fresh, rows, optimiser=OPTIMISER, steps=5, spectral_weight=w)[0])
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-12), found, by_weight(jnp.array(0.3)))
+    without = by_weight(jnp.array(0.0)).residual.layers[0][1].weight
+    assert float(jnp.abs(found.residual.layers[0][1].weight - without).max()) > 1e-3
+
+
+def test_a_fit_has_a_step():
+    with pytest.raises(ValueError, match=r"EnsembleModel\.steps = 0 must be at least 1"):
+        EnsembleModel(jnp.zeros(3), small().omega_max, jnp.array(0.01), jnp.array(0.0), steps=0)

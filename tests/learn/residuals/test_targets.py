@@ -1,0 +1,94 @@
+"""Targets of the residual: to the digit, under the command that acted; what a gap and a settling lag take away."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from helpers import random_field_flight, replaced
+from retrim.learn import Window, residual_targets
+from retrim.physics import Lagged, PointMass
+
+DT = 0.02
+
+
+def linear_drag(x, u):
+    return -0.4 * x.v + jnp.array([0.5, 0.0, 0.2])
+
+
+def paused(window, at, seconds=7.0):
+    """The same ticks, with ``seconds`` lost between the ticks ``at - 1`` and ``at``."""
+    return replaced(window, t=window.t.at[at:].add(seconds))
+
+
+@pytest.mark.parametrize("delay", [0, 1, 2])
+def test_targets_are_exact_when_the_delay_is_right(delay, key):
+    window = random_field_flight(linear_drag, key, n=20, delay_ticks=delay)
+    rows = residual_targets(window, PointMass(DT), delay_ticks=delay)
+    assert rows.a_res.shape == (19 - delay, 3)
+    assert rows.valid.all()
+    np.testing.assert_allclose(rows.a_res, jax.vmap(linear_drag)(rows.x, rows.u), atol=1e-10)
+    for wrong in {max(delay - 1, 0), delay + 1} - {delay}:
+        other = residual_targets(window, PointMass(DT), delay_ticks=wrong)
+        assert float(jnp.abs(other.a_res - jax.vmap(linear_drag)(other.x, other.u)).max()) > 0.1
+
+
+def test_a_row_holds_the_state_at_its_tick_and_the_command_that_acted(key):
+    window = random_field_flight(linear_drag, key, n=20, delay_ticks=2)
+    rows = residual_targets(window, PointMass(DT), delay_ticks=2)
+    np.testing.assert_array_equal(rows.x.p, window.x.p[2:19])
+    np.testing.assert_array_equal(rows.u.c, window.u.c[:17])
+
+
+def test_a_window_must_be_longer_than_the_delay(key):
+    with pytest.raises(ValueError, match="window of 3 ticks is too short for a delay of 2"):
+        residual_targets(random_field_flight(linear_drag, key, n=3), PointMass(DT), delay_ticks=2)
+
+
+@pytest.mark.parametrize("delay", [0, 1, 2])
+def test_a_gap_in_time_masks_the_rows_that_straddle_it(delay, key):
+    """Seven seconds between the ticks 11 and 12: row k takes the ticks k to k + delay + 1, so delay + 1 rows go."""
+    window = paused(random_field_flight(linear_drag, key, n=30, delay_ticks=delay), at=12)
+    rows = residual_targets(window, PointMass(DT), delay_ticks=delay)
+    straddling = [k for k in range(29 - delay) if k < 12 <= k + delay + 1]
+    assert len(straddling) == delay + 1
+    np.testing.assert_array_equal(np.flatnonzero(~np.asarray(rows.valid)), straddling)
+
+
+def test_jitter_of_the_clock_masks_nothing(key):
+    """A tick may be up to a quarter longer or shorter; one that was lost may not."""
+    window = random_field_flight(linear_drag, key, n=30)
+    jittery = replaced(window, t=window.t + 0.1 * DT * jnp.sin(jnp.arange(30.0)))
+    assert residual_targets(jittery, PointMass(DT)).valid.all()
+    lost = residual_targets(paused(window, at=12, seconds=DT), PointMass(DT))
+    np.testing.assert_array_equal(np.flatnonzero(~np.asarray(lost.valid)), [11])
+
+
+@pytest.mark.parametrize("tau", [0.033, 0.1])
+@pytest.mark.parametrize("filling", [0, 9])
+def test_rows_wait_until_the_lag_has_settled(tau, filling, key):
+    """The first ceil(3 tau / dt) valid rows: until then the lag still remembers the hover that it assumed."""
+    window = random_field_flight(linear_drag, key, n=60, delay_ticks=1)
+    window = replaced(window, valid=jnp.arange(60) >= filling)
+    settled = residual_targets(window, Lagged(PointMass(DT), jnp.array(tau)), delay_ticks=1).valid
+    plain = residual_targets(window, PointMass(DT), delay_ticks=1).valid
+    assert int(jnp.argmax(plain)) == filling  # without a lag every valid row counts
+    assert int(plain.sum()) == 58 - filling
+    ticks = math.ceil(3.0 * tau / DT)
+    np.testing.assert_array_equal(np.flatnonzero(settled), np.arange(filling + ticks, 58))
+
+
+# ---- windows
+
+
+def test_a_window_of_columns_and_back(key):
+    """From the columns of a log; what it holds is what was given, and every tick counts."""
+    flown = random_field_flight(linear_drag, key, n=10)
+    columns = [np.asarray(a) for a in (flown.t, flown.x.p, flown.x.R, flown.x.v, flown.u.c, flown.u.omega)]
+    window = Window.of(*columns)
+    jax.tree.map(np.testing.assert_array_equal, window, flown)
+    assert window.valid.all()
+    again = Window.of(window.t, window.x.p, window.x.R, window.x.v, window.u.c, window.u.omega)
+    jax.tree.map(np.testing.assert_array_equal, again, window)
