@@ -1,8 +1,9 @@
 """What learners send to pilots: frozen, typed messages that turn into bytes and back."""
 
 import json
+import math
 from dataclasses import dataclass, fields
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from ..errors import MessageError
 from ..learn.bptt import PolicyState
@@ -104,8 +105,23 @@ def unpack_update(data: bytes, like: LearnerState, *, source: str) -> Update:
     expected: Any = {"residual": like.residual, "policy": like.policy}.get(kind, ())
     state = wire.unpack(data, expected, kind=kind, source=source)
     try:
-        plain = json.loads(wire.describe(data, kind=kind, source=source)["update"])
+        plain = _checked(json.loads(wire.describe(data, kind=kind, source=source)["update"]), types[kind])
         update: Update = types[kind](**plain, **({"state": state} if kind in ("residual", "policy") else {}))
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, RecursionError) as error:
         raise MessageError(f"{source}: not the fields of a {kind!r} update ({error})") from error
     return update
+
+
+def _checked(plain: Any, cls: type) -> dict[str, Any]:
+    """Return the plain fields of a message; raise ``TypeError`` or ``ValueError``, with its name, for a wrong one."""
+    wanted = {f.name: f.type for f in fields(cls) if f.name != "state"}
+    if not isinstance(plain, dict) or plain.keys() != wanted.keys():
+        raise TypeError(f"expected {', '.join(wanted)}")
+    for name, value in plain.items():
+        if wanted[name] is float:
+            # A policy may replace one whose cost was not finite.
+            if type(value) not in (int, float) or not (math.isfinite(value) or name == "incumbent_cost"):
+                raise ValueError(f"{name} = {value!r} is no finite number")
+        elif not isinstance(value, str) or (wanted[name] is Layer and value not in get_args(Layer)):
+            raise ValueError(f"{name} = {value!r}")
+    return plain

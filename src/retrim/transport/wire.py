@@ -117,7 +117,7 @@ def unpack(data: bytes, like: T, *, kind: str, source: str) -> T:
 
 def _metadata(data: bytes) -> dict[str, str]:
     size = int.from_bytes(data[:8], "little")
-    return dict(json.loads(data[8 : 8 + size]).get("__metadata__", {}))
+    return dict(json.loads(data[8 : 8 + size]).get("__metadata__") or {})
 
 
 def _checksum(tensors: Mapping[str, np.ndarray], header: Mapping[str, str]) -> str:

@@ -1,0 +1,182 @@
+"""The online learner: sizes, a fresh optimiser under a cosine, starts of the gate, and fits that must be dropped."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from jax import random
+
+from helpers import replaced, tiny_preset
+from retrim.adapt import OnlineLearner, RollingBuffer
+from retrim.adapt import learner as module
+from retrim.config import Setup
+from retrim.learn import bptt
+from retrim.physics import Command, PointMass, State
+
+pytestmark = pytest.mark.usefixtures("optax_promotion")
+
+
+@pytest.fixture(scope="module")
+def setup():
+    return Setup.of(tiny_preset())
+
+
+@pytest.fixture(scope="module")
+def window(setup):
+    """Ticks of a point mass that is pushed along x."""
+    buffer, x, model = RollingBuffer(40), State.at(jnp.array([0.0, 0.0, 1.2])), PointMass(setup.preset.dt)
+    step = jax.jit(model.step)
+    for i in range(40):
+        buffer.push(0.02 * i, x, Command.hover())
+        x = step(x, Command.hover(), jnp.array([0.5, 0.0, 0.0]))
+    return buffer.window()
+
+
+@pytest.mark.parametrize(("field", "value"), [("num_updates", 0), ("num_envs", -1), ("plant_delay_ticks", -1)])
+def test_impossible_sizes_are_refused_at_construction(setup, field, value):
+    fields = {f.name: getattr(setup.learner, f.name) for f in dataclasses.fields(setup.learner)}
+    with pytest.raises(ValueError, match=rf"OnlineLearner\.{field} = {value}"):
+        OnlineLearner(**(fields | {field: value}))
+
+
+def test_a_residual_fit_without_steps_is_refused(setup):
+    with pytest.raises(ValueError, match=r"EnsembleModel\.steps = 0"):
+        replaced(setup.learner.residual_model, steps=0)
+
+
+def test_a_fresh_residual_predicts_nothing(setup, key):
+    learner = setup.learner
+    state = learner.init(setup.new_policy(key), key)
+    x = State.at(jnp.array([0.3, -0.2, 1.5]))
+    np.testing.assert_array_equal(learner.residual_model.predict(state.residual, x, Command.hover()), 0.0)
+
+
+def test_a_fit_finds_the_push_and_goes_on_from_where_it_ended(setup, window, key):
+    learner = setup.learner
+    state = learner.init(setup.new_policy(key), key)
+    errors, residual = [], state.residual
+    for _ in range(5):
+        residual, report = learner.fit_residual(residual, window)
+        assert bool(report.accepted)
+        errors.append(float(report.rms_error))
+    assert errors[-1] < 0.5 * errors[0]
+    found = learner.residual_model.predict(residual, jax.tree.map(lambda leaf: leaf[20], window.x), Command.hover())
+    np.testing.assert_allclose(found, [0.5, 0.0, 0.0], atol=0.1)
+
+
+def test_a_fit_that_is_not_finite_is_dropped(setup, key):
+    learner = setup.learner
+    state = learner.init(setup.new_policy(key), key)
+    buffer = RollingBuffer(setup.preset.adapt.window)
+    for i in range(10):
+        buffer.push(0.02 * i, State.at(jnp.array([0.0, 0.0, 1.0 + float("nan") * (i == 5)])), Command.hover())
+    kept, report = learner.fit_residual(state.residual, buffer.window())
+    assert not bool(report.accepted)
+    jax.tree.map(np.testing.assert_array_equal, kept, state.residual)
+
+
+def test_a_window_without_a_whole_row_is_dropped(setup, key):
+    learner = setup.learner
+    state = learner.init(setup.new_policy(key), key)
+    buffer = RollingBuffer(setup.preset.adapt.window)
+    buffer.push(0.0, State.at(jnp.array([0.0, 0.0, 1.0])), Command.hover())
+    kept, report = learner.fit_residual(state.residual, buffer.window())
+    assert not bool(report.accepted)
+    jax.tree.map(np.testing.assert_array_equal, kept, state.residual)
+
+
+def test_the_rate_falls_along_a_cosine(setup):
+    """Adam's first step is the rate along each coordinate; under constant gradients so is each later one."""
+    learner = replaced(setup.learner, num_updates=10, policy_rate=jnp.array(0.01), max_grad_norm=jnp.array(jnp.inf))
+    optimiser = learner._optimiser()
+    params = jnp.zeros(3)
+    memory, steps = optimiser.init(params), []
+    for _ in range(10):
+        change, memory = optimiser.update(jnp.ones(3), memory, params)
+        steps.append(-float(change[0]))
+    np.testing.assert_allclose(steps, 0.01 * 0.5 * (1.0 + np.cos(np.pi * np.arange(10) / 10)), rtol=1e-5)
+    assert steps[-1] < 0.03 * steps[0]
+
+
+def test_a_gradient_is_clipped_by_its_norm(setup):
+    """A huge gradient after small ones moves Adam no farther than one at the limit."""
+
+    def moved(huge):
+        optimiser = replaced(setup.learner, max_grad_norm=jnp.array(0.5))._optimiser()
+        params = jnp.zeros(4)
+        memory = optimiser.init(params)
+        for gradient in (0.01, 0.01, huge):
+            change, memory = optimiser.update(jnp.full(4, gradient), memory, params)
+        return change
+
+    np.testing.assert_allclose(moved(1e6), moved(0.25))  # four of 0.25 have the norm 0.5
+    assert not np.allclose(moved(0.1), moved(0.25))
+
+
+def test_each_update_starts_a_fresh_optimiser(setup, window, key):
+    """Moments and counters of an earlier update have no say, nor does the step of the schedule."""
+    learner = setup.learner
+    state = learner.init(setup.new_policy(key), key)
+    used, _ = learner.update_policy(state.policy, state.residual, window, random.key(1))
+    assert any(int(leaf) == 3 for leaf in jax.tree.leaves(used.optimiser) if leaf.ndim == 0)  # it did count its steps
+    stale = eqx.tree_at(lambda s: s.policy, used, state.policy.policy)
+    again, _ = learner.update_policy(stale, state.residual, window, random.key(1))
+    jax.tree.map(np.testing.assert_array_equal, again, used)
+
+
+def test_an_update_trains_in_the_corrected_model(setup, window, key):
+    """With a residual that was fitted to a push, the same update gives another policy than without."""
+    learner = setup.learner
+    state = learner.init(setup.new_policy(key), key)
+    fitted, _ = learner.fit_residual(state.residual, window)
+    plain, before = learner.update_policy(state.policy, state.residual, window, random.key(1))
+    pushed, after = learner.update_policy(state.policy, fitted, window, random.key(1))
+    assert float(after.incumbent) > float(before.incumbent)  # it is pushed away from the goal
+    assert not np.array_equal(plain.policy.layers[0].weight, pushed.policy.layers[0].weight)
+
+
+def test_the_gate_flies_other_starts_than_training(setup, window, key, monkeypatch):
+    """Four of the task that no step trained on, and four states of the window's valid ticks."""
+    trained_on, judged_on = [], []
+
+    def training(state, env, x0, *, optimiser):
+        trained_on.append(x0)
+        return bptt(state, env, x0, optimiser=optimiser)
+
+    def judging(candidate, incumbent, env, x0):
+        judged_on.append(x0)
+        return judge(candidate, incumbent, env, x0)
+
+    judge = module.judge
+    monkeypatch.setattr(module, "bptt", training)
+    monkeypatch.setattr(module, "judge", judging)
+    learner = setup.learner
+    state = learner.init(setup.new_policy(key), key)
+    half = eqx.tree_at(lambda w: w.valid, window, jnp.arange(40) >= 30)
+    with jax.disable_jit():
+        learner.update_policy(state.policy, state.residual, half, random.key(1))
+    (starts,), (gate,) = trained_on, judged_on
+    assert starts.x.p.shape == (3, 4, 3)
+    assert gate.x.p.shape == (8, 3)
+    seen = starts.x.p.reshape(-1, 3)
+    for p in gate.x.p[:4]:
+        assert float(jnp.min(jnp.linalg.norm(seen - p[None], axis=1))) > 1e-6
+    for t, p in zip(gate.t[4:], gate.x.p[4:], strict=True):
+        row = round(float(t) / 0.02)
+        assert row >= 30
+        np.testing.assert_array_equal(p, window.x.p[row])
+
+
+def test_low_rank_updates_leave_the_base(setup, window, key):
+    learner = setup.learner
+    policy = setup.low_rank(setup.new_policy(key), key)
+    state = learner.init(policy, key)
+    after, _ = learner.update_policy(state.policy, state.residual, window, random.key(1))
+    jax.tree.map(np.testing.assert_array_equal, after.policy.base, policy.base)
+    assert float(optax.tree.norm(jax.tree.map(jnp.subtract, after.policy.delta, policy.delta))) > 0
+    sizes = sum(leaf.size for leaf in jax.tree.leaves(after.optimiser))
+    assert sizes < 3 * sum(leaf.size for leaf in jax.tree.leaves(policy.delta)) + 10
