@@ -176,7 +176,7 @@ def test_air_takes_energy(bem, key):
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_rate_step_response(bem, axis):
-    """Reaches 63 % within 60 ms (yaw 200 ms), overshoots by less than 35 % (no feed-forward, slow motors), holds the others."""
+    """Reaches 63 % in 60 ms (yaw 200 ms), overshoots by less than 35 % (no feed-forward), holds the other rates."""
     rates = path(bem, start(bem, state()), command(G, np.eye(3)[axis]), effects()).body.omega
     assert rates[200 if axis == 2 else 60, axis] > 0.63
     assert rates[:, axis].max() < 1.35

@@ -59,7 +59,7 @@ class BemQuadrotor(AbstractSubstepDynamics[BemState]):
         """Rotors at the speed of u_hover, their inflow settled in the air that ``x`` meets, no rotation."""
         vehicle, zero = self.vehicle, jnp.zeros_like(x.p)
         speed = jnp.sqrt(vehicle.mass * STANDARD_GRAVITY / (4.0 * self.loop.thrust_map))
-        body = RotorState(x, zero, jnp.ones(4, dtype=x.p.dtype) * speed, zero, zero)
+        body = RotorState(x, zero, jnp.ones(4, dtype=x.p.dtype) * speed, zero, zero, zero)
         above = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (4,)), Inflow.above(x.p.dtype))
         _, inflow = self.rotors(body, body.motors, above, zero, steps=16)
         return BemState(body, inflow)
@@ -71,7 +71,7 @@ class BemQuadrotor(AbstractSubstepDynamics[BemState]):
     def with_state(self, s: BemState, x: State) -> BemState:
         """Replace (p, R, v)."""
         b = s.body
-        return BemState(RotorState(x, b.omega, b.motors, b.integral, b.omega_dot), s.inflow)
+        return BemState(RotorState(x, b.omega, b.motors, b.integral, b.omega_dot, b.wanted_slow), s.inflow)
 
     @property
     def command_limits(self) -> tuple[Command, Command]:
@@ -85,12 +85,12 @@ class BemQuadrotor(AbstractSubstepDynamics[BemState]):
     def substep(self, s: BemState, u: Command, effects: ExternalEffects) -> BemState:
         """One millisecond; loads are held over it."""
         vehicle, b = self.vehicle, s.body
-        commanded, integral = self.loop(vehicle, b, u)
+        commanded, integral, wanted_slow = self.loop(vehicle, b, u)
         motors = commanded + (b.motors - commanded) * jnp.exp(-SUBSTEP / vehicle.motor_tau)
         blades, inflow = self.rotors(b, motors, s.inflow, effects.wind)
         loads = self.loads(b, motors, blades, effects)
         mass, inertia = vehicle.mass + effects.mass, vehicle.inertia + effects.inertia
-        moved = rigid_body(b, motors, integral, loads.force, loads.torque, mass, inertia, effects.push)
+        moved = rigid_body(b, motors, integral, loads.force, loads.torque, mass, inertia, effects.push, wanted_slow)
         return BemState(moved, inflow)
 
     def rotors(

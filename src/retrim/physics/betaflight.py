@@ -1,4 +1,4 @@
-"""A rate controller as flight firmware runs it: PID in throttle units, mixer, speed controllers, at 1 kHz."""
+"""Rate controller of flight firmware: PID in throttle units, mixer, speed controllers, at 1 kHz."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -9,7 +9,8 @@ from .substep import SUBSTEP, RotorState, signs
 from .vehicle import Vehicle
 
 # Throttle per unit of gain, and per rad/s, rad and rad/s^2: the firmware's scaling of its P, I and D settings.
-P_SCALE, I_SCALE, D_SCALE = 1.818e-3, 16.67e-6, 31.25e-6
+P_SCALE, I_SCALE, D_SCALE = 1.818e-3, 14.0e-3, 31.25e-6
+RELAX_RATE, RELAX_CUTOFF = 0.698, 15.0  # [rad/s], [Hz]: where the integral pauses (40 deg/s)
 
 
 class Betaflight(eqx.Module):
@@ -25,22 +26,32 @@ class Betaflight(eqx.Module):
 
     @classmethod
     def of(cls, thrust_map: Float[Array, ""]) -> "Betaflight":
-        """P 40, 40, 30, I 80, 80, 60, D 20, 20, 0: the settings of the Agilicious platform."""
+        """Return the settings of the Agilicious platform: P 40, 40, 30, I 80, 80, 60, D 20, 20, 0.
+
+        The clamp of the integral is the firmware's, 40 % of the throttle.
+        """
         return cls(
             kp=jnp.array([40.0, 40.0, 30.0]),
             ki=jnp.array([80.0, 80.0, 60.0]),
             kd=jnp.array([20.0, 20.0, 0.0]),
-            integral_max=jnp.array(0.1),
+            integral_max=jnp.array(0.36),
             thrust_map=thrust_map,
         )
 
-    def __call__(self, vehicle: Vehicle, s: RotorState, u: Command) -> tuple[Float[Array, "4"], Float[Array, "3"]]:
-        """Rotor speeds [rad/s] to command, and the integral of the rate error [rad]."""
+    def __call__(
+        self, vehicle: Vehicle, s: RotorState, u: Command
+    ) -> tuple[Float[Array, "4"], Float[Array, "3"], Float[Array, "3"]]:
+        """Return the commanded rotor speeds [rad/s], the integral of the rate error [rad], and the slow command."""
         low, high = vehicle.command_min, vehicle.command_max
-        error = jnp.clip(u.omega, low.omega, high.omega) - s.omega
-        integral = jnp.clip(s.integral + SUBSTEP * error, -self.integral_max, self.integral_max)
+        wanted = jnp.clip(u.omega, low.omega, high.omega)
+        error = wanted - s.omega
+        # The integral pauses while the command moves fast, so that it does not wind up in a turn.
+        relaxed = jnp.maximum(0.0, 1.0 - jnp.abs(wanted - s.wanted_slow) / RELAX_RATE)
+        grown = s.integral + SUBSTEP * error * relaxed
+        integral = jnp.clip(grown, -self.integral_max, self.integral_max)
+        wanted_slow = wanted + (s.wanted_slow - wanted) * jnp.exp(-2.0 * jnp.pi * RELAX_CUTOFF * SUBSTEP)
         turn = P_SCALE * self.kp * error + I_SCALE * self.ki * integral - D_SCALE * self.kd * s.omega_dot
         thrust = vehicle.mass * jnp.clip(u.c, low.c, high.c)
         throttle = vehicle.esc.throttle(jnp.sqrt(thrust / (4.0 * self.thrust_map)))
         mixed = jnp.clip(throttle + signs(turn.dtype).T @ turn, vehicle.esc.idle, 1.0)
-        return jnp.clip(vehicle.esc.speed(mixed), vehicle.motor_min, vehicle.motor_max), integral
+        return jnp.clip(vehicle.esc.speed(mixed), vehicle.motor_min, vehicle.motor_max), integral, wanted_slow

@@ -62,7 +62,7 @@ class LinearDragQuadrotor(AbstractSubstepDynamics[RotorState]):
     def init(self, x: State) -> RotorState:
         """Hovering rotors, no rotation."""
         motors = jnp.ones(4, dtype=x.p.dtype) * self.vehicle.hover_speed
-        return RotorState(x, jnp.zeros_like(x.p), motors, jnp.zeros_like(x.p), jnp.zeros_like(x.p))
+        return RotorState(x, jnp.zeros_like(x.p), motors, jnp.zeros_like(x.p), jnp.zeros_like(x.p), jnp.zeros_like(x.p))
 
     def state(self, s: RotorState) -> State:
         """(p, R, v)."""
@@ -70,7 +70,7 @@ class LinearDragQuadrotor(AbstractSubstepDynamics[RotorState]):
 
     def with_state(self, s: RotorState, x: State) -> RotorState:
         """Replace (p, R, v)."""
-        return RotorState(x, s.omega, s.motors, s.integral, s.omega_dot)
+        return RotorState(x, s.omega, s.motors, s.integral, s.omega_dot, s.wanted_slow)
 
     @property
     def command_limits(self) -> tuple[Command, Command]:

@@ -66,6 +66,8 @@ class RotorState(eqx.Module):
     """Integral of the rate error [rad]."""
     omega_dot: Float[Array, "3"]
     """Body angular acceleration over the last millisecond [rad/s^2], for the D term."""
+    wanted_slow: Float[Array, "3"] = eqx.field(default_factory=lambda: jnp.zeros(3))
+    """Commanded body rates, low-passed [rad/s], for controllers that look at how fast commands move."""
 
 
 def rigid_body(
@@ -77,6 +79,7 @@ def rigid_body(
     mass: Float[Array, ""],
     inertia: Float[Array, "3"],
     push: Float[Array, "3"],
+    wanted_slow: Float[Array, "3"] | None = None,
 ) -> RotorState:
     """One semi-implicit millisecond under ``force`` [N] and ``torque`` [Nm] in the body frame; attitude on SO(3)."""
     h = SUBSTEP
@@ -85,4 +88,4 @@ def rigid_body(
     gravity = jnp.array([0.0, 0.0, -STANDARD_GRAVITY], dtype=s.x.p.dtype)
     a = s.x.R @ force / mass + gravity + push
     x = State(s.x.p + h * s.x.v + 0.5 * h**2 * a, s.x.R @ so3.exp(h * omega), s.x.v + h * a)
-    return RotorState(x, omega, motors, integral, omega_dot)
+    return RotorState(x, omega, motors, integral, omega_dot, s.wanted_slow if wanted_slow is None else wanted_slow)
