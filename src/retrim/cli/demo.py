@@ -7,21 +7,19 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from ..config.loading import load
-from ..config.presets import PRESETS
+from ..config.loading import load_for
 from ..config.scenario import Scenario
 from ..config.setup import Setup
-from ..errors import ConfigError
 from ..experiments.figures import picture
+from ..experiments.interrupts import interrupts_only_set
+from ..experiments.limits import check_flights, check_seeds
 from ..experiments.metrics import rows
-from ..experiments.outputs import write_events
+from ..experiments.outputs import write_events, write_trained
 from ..experiments.run import INTERRUPTED, Run
 from ..experiments.tables.hover import PAPER
 from ..experiments.tables.study import LEVELS, Study, fly_all, level_table
 from ..experiments.training import nominal_error, train
-from ..io.trained import save_policy
 from .console import RichReporter, console, show_paths, show_table
-from .pretrain import checked_seed
 
 WHY = {
     "hover/fast": "trains in seconds, and its model has a command delay, as plants have",
@@ -48,17 +46,15 @@ def demo(
         seed: Seed of everything.
         out: Folder for the policy, results.json and the pictures; a new one under runs/ by default.
     """
-    return lambda stop: _demo(preset, plant, seconds, starts, checked_seed(seed), out, stop)
+    return lambda stop: _demo(preset, plant, seconds, starts, seed, out, stop)
 
 
 def _demo(
     name: str, plant: str, seconds: float, starts: int, seed: int, out: Path | None, stop: threading.Event
 ) -> int:
-    if not 3.0 <= seconds <= 36_000.0 or not 1 <= starts <= 100_000:
-        raise ConfigError(f"--seconds {seconds:g} --starts {starts}: 3 to 36000 s and 1 to 100000 starts can be flown")
-    preset = load(f"hover/{name}" if f"hover/{name}" in PRESETS else name)
-    if preset.task != "hover":
-        raise ConfigError(f"preset {name!r} is for {preset.task}; the demo hovers")
+    check_seeds([seed])
+    check_flights(starts, seconds)
+    preset = load_for("hover", name)
     scenario, setup, reporter = Scenario("large", plant=plant), Setup.of(preset), RichReporter()
     run = Run("demo", out, stop=stop)
     console.print(f"[bold]{len(LEVELS) * 2 * starts} flights of {seconds:g} s[/]; two to three minutes on two cores")
@@ -68,17 +64,18 @@ def _demo(
     )
     policy, losses = train(setup, seed, reporter=reporter, stop=stop)
     if losses:
-        save_policy(run.folder / "policy.safetensors", policy, preset)
+        write_trained(run, setup, policy, losses, seed=seed)
     if run.interrupted:
-        console.print(f"interrupted while pretraining, after {len(losses)} steps; what there is lies in {run.folder}")
+        console.print(f"interrupted while pretraining, after {len(losses)} steps")
         return INTERRUPTED
     study = Study(preset, {seed: policy}, (nominal_error(setup, policy),))
     console.print(f"hover error in its own model: {1000 * study.errors[0]:.1f} mm")
     scenarios = [replace(scenario, disturbance=level) for level in LEVELS]
     flights = fly_all(study, scenarios, run, reporter, starts=starts, seconds=seconds).flown
     found = rows(flights)
-    run.write_results(found, seeds=[seed], preset=preset.name, losses=losses)
-    write_events(flights, run.folder)
+    with interrupts_only_set(stop):
+        run.write_results(found, seeds=[seed], preset=preset.name, losses=losses)
+        write_events(flights, run.folder)
     title = f"steady-state hover error [m]: mean ± std over {starts} starts, last 2 s of {seconds:g} s"
     show_table(level_table(found, ("base", "full"), PAPER, title))
     console.print(run.watch.sentence())

@@ -2,7 +2,6 @@
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 from ..adapt.learner import LearnerState
@@ -14,6 +13,7 @@ from ..control.policy import Policy
 from ..errors import ConfigError
 from ..experiments.figures import picture
 from ..experiments.fleet import Fleet
+from ..experiments.interrupts import interrupts_only_set
 from ..experiments.metrics import cell, rows
 from ..experiments.outputs import write_events, write_learnt, write_logs
 from ..experiments.run import INTERRUPTED, Run
@@ -21,23 +21,6 @@ from ..experiments.tables.document import TableSection
 from ..io.checkpoint import load_delta
 from ..io.trained import load_learnt, load_policy
 from .console import RichReporter, console, show_paths, show_table
-from .pretrain import checked_seed
-
-
-@dataclass(frozen=True)
-class Order:
-    """What was asked for, checked."""
-
-    preset: Preset
-    policy: Policy
-    scenario: Scenario
-    methods: tuple[str, ...]
-    seconds: float
-    starts: int
-    seed: int
-    latency: Latency
-    state: LearnerState | None
-    out: Path | None
 
 
 def fly(
@@ -73,9 +56,9 @@ def fly(
             simulators, each an extra to install; or module:name.
         adapt: full: re-train all weights in flight; lora: a low-rank delta (ranks 4, 10, 1); base-i: integral action;
             base-do: a disturbance observer; none: fly as it is; or module:name. The policy flies as it is, too.
-        reference: What a tracking policy follows: circle, figure8, star, a CSV file of t, x, y, z[, yaw] or module:name;
-            what it was trained on by default. my.csv:laps repeats a file, my.csv:once does not; by default a closed one
-            repeats. Another reference than that of training needs a policy that sees it.
+        reference: What a tracking policy follows: circle, figure8, star, module:name or a CSV file of t, x, y, z[,
+            yaw]; what it was trained on by default. A closed file repeats as laps, another is flown once; my.csv:laps
+            and my.csv:once insist. Another reference than that of training needs a policy that sees it.
         vehicle: Vehicle that the plant simulates: small, large, kingfisher, a vehicle file or module:name; that which
             the policy was trained for by default. rotorpy and crazyflow fly their own.
         sensors: What the policy is shown of the state: ideal, mocap (0.3 mm, 3 mm/s, 1 mrad), rough (1 mm, 10 mm/s,
@@ -103,50 +86,38 @@ def fly(
         follows = _flown_reference(preset, reference)
         scenario = Scenario(disturbance, plant, vehicle, sensors, thrust_error, follows)
         methods: tuple[str, ...] = ("base",) if adapt == "none" else ("base", adapt)
-        setup = Setup.of(preset, follows)
-        length = setup.flown.flight_seconds if seconds is None else seconds
-        if not 3.0 <= length <= 36_000.0 or not 1 <= starts <= 100_000:
-            raise ConfigError(
-                f"--seconds {length:g} --starts {starts}: 3 to 36000 s and 1 to 100000 starts can be flown"
-            )
+        fleet = Fleet(
+            preset, {seed: weights}, [scenario], methods=methods, starts=starts, seconds=seconds, latency=latency,
+            state=state,
+        )  # fmt: skip
+        run, setup = Run("fly", out, stop=stop), Setup.of(preset, follows)
         _warn(setup, scenario)
-        order = Order(preset, weights, scenario, methods, length, starts, checked_seed(seed), latency, state, out)
-        return _fly(order, setup, stop)
+        return _fly(fleet, setup, scenario, run)
 
     return ordered
 
 
-def _fly(order: Order, setup: Setup, stop: threading.Event) -> int:
-    policies = {order.seed: order.policy}
-    fleet = Fleet(
-        order.preset,
-        policies,
-        [order.scenario],
-        methods=order.methods,
-        starts=order.starts,
-        seconds=order.seconds,
-        latency=order.latency,
-        state=order.state,
-    )
-    run = Run("fly", order.out, stop=stop)
-    with RichReporter().progress("flying") as advance:
+def _fly(fleet: Fleet, setup: Setup, scenario: Scenario, run: Run) -> int:
+    with run.interruptible(), RichReporter().progress("flying") as advance:
         advance(0.0, "compiling the programs of a flight (kept in a cache for the next time)")
         fleet.warm_up()
-        flights = fleet.run(stop=stop, progress=lambda done, n: advance(done / n, f"{done} of {n} flights")).flown
+    with RichReporter().progress("flying") as advance:
+        flights = fleet.run(stop=run.stop, progress=lambda done, n: advance(done / n, f"{done} of {n} flights")).flown
     if not flights:
         console.print("interrupted before the first flight was over; nothing was saved")
         return INTERRUPTED
-    found = rows(flights)
-    run.write_results(found, seeds=[order.seed], preset=order.preset.name)
-    write_events(flights, run.folder)
-    write_logs(flights, run.folder)
-    write_learnt(flights, order.preset, run.folder)
-    many = f"{order.starts} start{'s' * (order.starts > 1)}"
-    kind = order.preset.task.rpartition(":")[2]
-    title = f"{kind} error [m], last {flights[0].steady_seconds:g} s of {order.seconds:g} s, {many}"
+    found, preset = rows(flights), setup.preset
+    with interrupts_only_set(run.stop):
+        run.write_results(found, seeds=list(fleet.policies), preset=preset.name)
+        write_events(flights, run.folder)
+        write_logs(flights, run.folder)
+        write_learnt(flights, preset, run.folder)
+    n, steady = found[0]["n"], min(flights[0].steady_seconds, fleet.seconds)
+    kind = preset.task.rpartition(":")[2]
+    title = f"{kind} error [m], last {steady:g} s of {fleet.seconds:g} s, {n} start{'s' * (n > 1)}"
     lines = tuple((row["disturbance"], row["method"], cell(row)) for row in found)
     show_table(TableSection(("disturbance", "method", "error"), lines, title))
-    show_paths([*picture(flights, setup, order.scenario, run.folder), run.folder / "results.json"])
+    show_paths([*picture(flights, setup, scenario, run.folder), run.folder / "results.json"])
     return run.exit_code
 
 

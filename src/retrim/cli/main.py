@@ -3,11 +3,12 @@
 Modules of commands are imported when they are needed, so that help is quick.
 """
 
+import contextlib
 import os
 import signal
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from types import FrameType
 
 PACKAGE = __name__.rpartition(".")[0]
@@ -44,8 +45,9 @@ def main(words: Sequence[str] | None = None) -> None:
     Args:
         words: Command and options; ``sys.argv`` by default.
     """
-    arguments = list(sys.argv[1:] if words is None else words)
-    sys.exit(_run(arguments))
+    if words is not None:
+        sys.argv = ["retrim", *words]  # what results say they were made by
+    sys.exit(_run(sys.argv[1:]))
 
 
 def _run(words: list[str]) -> int:
@@ -65,9 +67,9 @@ def _run(words: list[str]) -> int:
         print(f"retrim: no command {words[0]!r}; {hint}there are {', '.join(COMMANDS)}", file=sys.stderr)
         return 2
     stop = threading.Event()
-    _stop_on_interrupt(stop)
     try:
-        return _command(words[0], words[1:], stop)
+        with _stop_on_interrupt(stop):
+            return _command(words[0], words[1:], stop)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130
@@ -112,12 +114,19 @@ def _command(name: str, words: list[str], stop: threading.Event) -> int:
     return code
 
 
-def _stop_on_interrupt(stop: threading.Event) -> None:
+@contextlib.contextmanager
+def _stop_on_interrupt(stop: threading.Event) -> Iterator[None]:
     """Let Ctrl-C set the stop token and raise: a KeyboardInterrupt that JAX swallows is not lost."""
 
     def handle(number: int, frame: FrameType | None) -> None:
         stop.set()
         raise KeyboardInterrupt
 
-    if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGINT, handle)
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, handle)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)

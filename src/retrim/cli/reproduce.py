@@ -149,10 +149,5 @@ def model(out: Path | None = None) -> Ordered:
 
 
 COMMANDS: dict[str, Callable[..., Ordered]] = {
-    "hover": hover,
-    "reversing": reversing,
-    "tracking": tracking,
-    "vision": vision,
-    "plants": plants,
-    "model": model,
+    each.__name__: each for each in (hover, reversing, tracking, vision, plants, model)
 }

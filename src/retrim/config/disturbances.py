@@ -45,7 +45,7 @@ def disturbance(names: str, seed: int = 0) -> Disturbance:
         try:
             parts.append(factory(key, size))
         except (TypeError, ValueError) as error:
-            raise error if isinstance(error, ConfigError) else ConfigError(f"disturbance {part!r}: {error}") from error
+            raise ConfigError(f"disturbance {part!r}: {error}") from error
     return parts[0] if len(parts) == 1 else Together(tuple(parts))
 
 

@@ -9,7 +9,7 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 
 from ..errors import ConfigError
-from .presets import PRESETS, Preset
+from .presets import BUILT_IN_TASKS, PRESETS, Preset
 from .vehicle_file import read_vehicle
 
 MAX_TOML_BYTES = 1_000_000
@@ -24,6 +24,20 @@ def load(name: str, overlay: Path | None = None) -> Preset:
     if name not in PRESETS:
         raise ConfigError(f"no preset {name!r}; {suggestion(name, PRESETS)}")
     return PRESETS[name] if overlay is None else overlaid(PRESETS[name], overlay)
+
+
+def load_for(task: str, name: str) -> Preset:
+    """Return a preset for a task: ``fast`` is short for ``hover/fast``. A task of one's own takes those for hover.
+
+    Raises:
+        ConfigError: There is no such preset, or it is for another task.
+    """
+    preset = load(f"{task}/{name}" if f"{task}/{name}" in PRESETS else name)
+    if preset.task == task:
+        return preset
+    if task in BUILT_IN_TASKS or preset.task != "hover":
+        raise ConfigError(f"preset {preset.name!r} is for {preset.task}, not for {task}")
+    return changed(preset, task=task, name=f"{task} on {preset.name}")
 
 
 def overlaid(preset: Preset, overlay: Path) -> Preset:
@@ -46,7 +60,7 @@ def read_toml(path: Path) -> dict[str, Any]:
     """
     try:
         if not path.is_file():
-            raise ConfigError(f"{path}: no such file")
+            raise ConfigError(f"{path}: {'not a regular file' if path.exists() else 'no such file'}")
         if path.stat().st_size > MAX_TOML_BYTES:
             raise ConfigError(f"{path}: larger than the {MAX_TOML_BYTES} bytes that are accepted")
         return tomllib.loads(path.read_text(encoding="utf-8"))

@@ -15,6 +15,7 @@ from ..tasks.hover import TILT
 from .vehicle_file import VehicleSpec
 
 STRICT = ConfigDict(extra="forbid")
+BUILT_IN_TASKS = ("hover", "track", "vision")
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=1, le=1_000_000), Strict()]
 LearningRate = Annotated[float, Field(gt=0, le=10.0)]
@@ -141,7 +142,7 @@ class Preset:
         for name in ("track", "vision"):
             if getattr(self, name) is not None and self.task != name:
                 raise ValueError(f"a table [{name}] needs task = {name!r}, not {self.task!r}")
-        if self.options and self.task in ("hover", "track", "vision"):
+        if self.options and self.task in BUILT_IN_TASKS:
             raise ValueError(f"a table [options] is for a task of one's own, not for {self.task!r}")
         if abs(1000 * self.dt - round(1000 * self.dt)) > 1e-6:
             raise ValueError(f"dt = {self.dt} s must be a whole number of milliseconds")

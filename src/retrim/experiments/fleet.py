@@ -1,9 +1,7 @@
 """Many flights of one preset: scenarios x methods x seeds x starts, on any executor."""
 
-import contextlib
-import signal
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from typing import Any
@@ -24,6 +22,8 @@ from ..errors import ConfigError
 from ..physics.state import State
 from ..runtime.flight import FlightStopped, fly
 from .flights import Flight, FlightSpec, fly_one
+from .interrupts import interrupts_only_set
+from .limits import check_flights, check_seeds
 from .metrics import Rows, rows
 from .provenance import cores
 
@@ -75,19 +75,19 @@ class Fleet:
         Raises:
             ConfigError: Something does not exist, or does not fit together.
         """
-        if starts < 1 or starts > 100_000 or not scenarios or not methods:
-            raise ConfigError(
-                f"{starts} starts of {len(scenarios)} scenarios by {len(methods)} methods cannot be flown"
-            )
-        for method in methods:
-            find_method(method)
+        if not scenarios or not methods:
+            raise ConfigError(f"{len(scenarios)} scenarios by {len(methods)} methods: there is nothing to fly")
+        check_flights(starts, seconds)
         self.preset = preset
         self.policies = dict(policies) if isinstance(policies, Mapping) else {0: policies}
+        check_seeds(tuple(self.policies))
         self._setups = {name: setup_for(dump(preset), name) for name in {s.reference for s in scenarios}}
+        for method in methods:
+            if not find_method(method).learns:  # some do not fit every task
+                for setup in self._setups.values():
+                    setup.pilot(next(iter(self.policies.values())), method)
         first = next(iter(self._setups.values()))
         self.seconds = first.flown.flight_seconds if seconds is None else seconds
-        if not 1.0 <= self.seconds <= 36_000.0:
-            raise ConfigError(f"flights of {self.seconds:g} s: must be between 1 s and 36000 s")
         self._latency, self._state = latency, state
         self._starts = {
             (name, seed): setup.flight_starts(starts, seed)
@@ -173,7 +173,7 @@ class Fleet:
             stop.set()
             raise
         finally:
-            with _deaf_to_interrupts():  # a further Ctrl-C must not lose what is done
+            with interrupts_only_set(stop):  # a further Ctrl-C must not lose what is done
                 for future in futures.values():
                     future.cancel()
                 if stop.is_set():
@@ -206,16 +206,3 @@ def _job(job: Job, stop: threading.Event | None) -> Flight:
     """Fly a job, in whatever process."""
     setup: Setup = setup_for(job.preset, job.spec.scenario.reference)
     return fly_one(setup, job.policy, job.spec, job.x0, job.seconds, latency=job.latency, state=job.state, stop=stop)
-
-
-@contextlib.contextmanager
-def _deaf_to_interrupts() -> Iterator[None]:
-    """Ignore Ctrl-C for a moment; only the main thread may, and only it receives one."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)

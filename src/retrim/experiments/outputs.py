@@ -1,17 +1,51 @@
-"""Files that a run of flights leaves: events, logs and what was learnt."""
+"""Files that a run leaves: a trained policy; events and logs of flights, and what they learnt."""
 
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ..config.presets import Preset
+from ..config.setup import Setup
 from ..control.lora import LoraPolicy
+from ..control.policy import Policy
 from ..io.checkpoint import save_delta
 from ..io.files import write_whole
 from ..io.trained import save_learnt, save_policy
 from .flights import Flight
+from .interrupts import interrupts_only_set
+from .run import Run
+
+
+def write_trained(
+    run: Run, setup: Setup, policy: Policy, losses: Sequence[float], *, seed: int, error_m: float | None = None
+) -> Path:
+    """Write ``policy.safetensors`` with its ``results.json``; a Ctrl-C comes after both.
+
+    Args:
+        run: Where to.
+        setup: Preset of the policy.
+        policy: What was trained.
+        losses: Loss of each optimiser step.
+        seed: Seed of the training.
+        error_m: Error in the policy's own model [m], once it is known.
+
+    Returns:
+        Path of the policy.
+
+    Raises:
+        OSError: The folder cannot be written any more.
+    """
+    preset, path = setup.preset, run.folder / "policy.safetensors"
+    row: dict[str, Any] = {"task": preset.task, "preset": preset.name, "updates": len(losses)}
+    row |= {"envs": preset.pretrain.num_envs, "loss": losses[-1]}
+    row |= {} if error_m is None else {"nominal_error_m": error_m}
+    with interrupts_only_set(run.stop):
+        save_policy(path, policy, preset)
+        run.write_results([row], seeds=[seed], losses=list(losses))
+    return path
 
 
 def write_events(flights: Sequence[Flight], folder: Path) -> None:
@@ -34,7 +68,7 @@ def write_events(flights: Sequence[Flight], folder: Path) -> None:
 
 def write_logs(flights: Sequence[Flight], folder: Path) -> None:
     """Write one NPZ for each flight under ``logs/``: times, true and measured states, commands, errors."""
-    (folder / "logs").mkdir(exist_ok=True)
+    (folder / "logs").mkdir(parents=True, exist_ok=True)
     for flight in flights:
         spec, log = flight.spec, flight.log
         name = f"{spec.method}_seed{spec.seed}_start{spec.start}"

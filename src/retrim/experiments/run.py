@@ -1,9 +1,10 @@
 """The folder of a run: created once, results written whole, an interruption remembered."""
 
+import contextlib
 import json
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -48,6 +49,14 @@ class Run:
     def exit_code(self) -> int:
         """0, or 130 for a run that was interrupted."""
         return INTERRUPTED if self.interrupted else 0
+
+    @contextlib.contextmanager
+    def interruptible(self) -> Iterator[None]:
+        """Let a Ctrl-C end the block early, and be remembered, instead of raising further."""
+        try:
+            yield
+        except KeyboardInterrupt:
+            self.stop.set()
 
     def write_text(self, name: str, text: str) -> Path:
         """Write a file of the folder, whole; return its path."""

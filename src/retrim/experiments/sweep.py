@@ -3,16 +3,16 @@
 import dataclasses
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jax import random
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
-from ..config.loading import changed as changed_preset
-from ..config.loading import dump, load, read_toml, suggestion
+from ..config.loading import changed, dump, load, read_toml, suggestion
 from ..config.presets import Preset
 from ..config.scenario import Scenario
 from ..config.setup import Setup
@@ -24,6 +24,7 @@ from ..viz.panels import bars
 from ..viz.plots import save
 from .fleet import Fleet
 from .flights import Flight, FlightSpec
+from .interrupts import interrupts_only_set
 from .metrics import Rows
 from .reporter import Reporter
 from .run import Run
@@ -97,48 +98,57 @@ def run_sweep(sweep: Sweep, run: Run, reporter: Reporter) -> Rows:
     Raises:
         ConfigError: Something does not exist or does not fit together; found before anything is trained.
     """
-    planned = [(preset, Fleet(preset, Setup.of(preset).new_policy(_zero()), sweep.scenarios(), starts=1))
-               for preset in _presets(sweep)]  # fmt: skip
+    presets = [changed(load(name), **sweep.overlay) for name in sweep.presets]
+    fleets = [_fleet(preset, _untrained(preset, sweep), sweep) for preset in presets]
+    for fleet in fleets:
+        for scenario in sweep.scenarios():
+            scenario.make(fleet.preset.vehicle, dt=fleet.preset.dt)  # a package may be missing
     kept = _Kept(run.folder / "flights.jsonl")
-    for preset, _ in planned:
-        policies = _policies(preset, sweep, run, reporter)
+    for preset in presets:
+        with run.interruptible():
+            _fly(_fleet(preset, _trained(preset, sweep, run, reporter), sweep), kept, run, reporter)
         if run.interrupted:
             break
-        fleet = Fleet(
-            preset, policies, sweep.scenarios(), methods=sweep.methods, starts=sweep.starts, seconds=sweep.seconds
-        )
-        missing = [spec for spec in fleet.specs if _key(preset, spec, fleet.seconds) not in kept.rows]
-        if missing:
-            with reporter.progress(f"flying {preset.name}") as advance:
-                advance(0.0, "compiling the programs of a flight")
-                fleet.warm_up()
-                for i in range(0, len(missing), BATCH):
-                    batch = fleet.run(stop=run.stop, only=missing[i : i + BATCH])
-                    for flight in batch.flown:
-                        kept.add(_key(preset, flight.spec, fleet.seconds), _row(preset, flight))
-                    advance(min(1.0, (i + BATCH) / len(missing)), f"{min(i + BATCH, len(missing))} flights")
-                    if batch.interrupted:
-                        break
-        if run.interrupted:
-            break
-    return _report(sweep, kept, run, reporter)
+    keys = [_key(fleet.preset, spec, fleet.seconds) for fleet in fleets for spec in fleet.specs]
+    return _report(sweep, [kept.rows[key] for key in keys if key in kept.rows], run, reporter)
 
 
 BATCH = 8  # flights between two writes of the results
 
 
-def _zero() -> Any:
-    from jax import random
-
-    return random.key(0)
+def _fleet(preset: Preset, policies: Mapping[int, Policy], sweep: Sweep) -> Fleet:
+    return Fleet(preset, policies, sweep.scenarios(), methods=sweep.methods, starts=sweep.starts, seconds=sweep.seconds)
 
 
-def _presets(sweep: Sweep) -> list[Preset]:
-    return [changed_preset(load(name), **sweep.overlay) for name in sweep.presets]
+def _untrained(preset: Preset, sweep: Sweep) -> dict[int, Policy]:
+    """Stand-ins, to plan flights before anything is trained."""
+    return dict.fromkeys(sweep.seeds, Setup.of(preset).new_policy(random.key(0)))
 
 
-def _policies(preset: Preset, sweep: Sweep, run: Run, reporter: Reporter) -> dict[int, Policy]:
-    """Trained policies by seed, from the run's folder where they are there."""
+def _fly(fleet: Fleet, kept: "_Kept", run: Run, reporter: Reporter) -> None:
+    """Fly what is missing, and keep each batch."""
+    keys = {spec: _key(fleet.preset, spec, fleet.seconds) for spec in fleet.specs}
+    missing = [spec for spec, key in keys.items() if key not in kept.rows]
+    if not missing or run.interrupted:
+        return
+    with reporter.progress(f"flying {fleet.preset.name}") as advance:
+        advance(0.0, "compiling the programs of a flight")
+        fleet.warm_up()
+        for i in range(0, len(missing), BATCH):
+            flown = fleet.run(stop=run.stop, only=missing[i : i + BATCH]).flown
+            with interrupts_only_set(run.stop):
+                kept.add({keys[flight.spec]: _row(fleet.preset, flight) for flight in flown})
+            advance(min(1.0, (i + BATCH) / len(missing)), f"{min(i + BATCH, len(missing))} flights")
+            if run.interrupted:
+                break
+
+
+def _trained(preset: Preset, sweep: Sweep, run: Run, reporter: Reporter) -> dict[int, Policy]:
+    """Return trained policies by seed, from the run's folder where they are there.
+
+    Raises:
+        KeyboardInterrupt: The run was interrupted before all were trained.
+    """
     found = dict[int, Policy]()
     for seed in sweep.seeds:
         digest = hashlib.sha256(dump(preset).encode()).hexdigest()[:8]
@@ -149,7 +159,7 @@ def _policies(preset: Preset, sweep: Sweep, run: Run, reporter: Reporter) -> dic
         reporter.say(f"preset {preset.name}, seed {seed}")
         policy, _ = train(Setup.of(preset), seed, reporter=reporter, stop=run.stop)
         if run.interrupted:
-            break
+            raise KeyboardInterrupt
         save_policy(path, policy, preset)
         found[seed] = policy
     return found
@@ -167,9 +177,9 @@ class _Kept:
             except (json.JSONDecodeError, KeyError, TypeError):
                 continue
 
-    def add(self, key: str, row: Mapping[str, Any]) -> None:
-        """Keep a row; the whole file is written."""
-        self.rows[key] = {"key": key, **row}
+    def add(self, rows: Mapping[str, Mapping[str, Any]]) -> None:
+        """Keep rows by their keys; the whole file is written."""
+        self.rows |= {key: {"key": key, **row} for key, row in rows.items()}
         write_whole(self._path, "".join(json.dumps(each) + "\n" for each in self.rows.values()))
 
 
@@ -200,9 +210,10 @@ def _row(preset: Preset, flight: Flight) -> dict[str, Any]:
 GROUP = ("preset", "plant", "vehicle", "sensors", "reference", "disturbance", "method")
 
 
-def _report(sweep: Sweep, kept: _Kept, run: Run, reporter: Reporter) -> Rows:
+def _report(sweep: Sweep, kept: Sequence[dict[str, Any]], run: Run, reporter: Reporter) -> Rows:
+    """Write the documents of the flights that are over, in the order of the sweep."""
     groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
-    for row in kept.rows.values():
+    for row in kept:
         groups.setdefault(tuple(row[name] for name in GROUP), []).append(row)
     found, cells = Rows(), list[tuple[str, ...]]()
     varied = [name for i, name in enumerate(GROUP) if len({group[i] for group in groups}) > 1 or name == "method"]

@@ -43,12 +43,12 @@ def read_bounded(path: Path, advice: str) -> bytes:
 
 
 def check_writable(folder: Path) -> None:
-    """Make a folder and check that files can be written there, before anything long begins.
+    """Check that files can be written to a folder, before anything long begins; leave no new folder behind.
 
     Raises:
         ConfigError: They cannot.
     """
-    probe = folder / ".retrim-probe"
+    probe, new = folder / ".retrim-probe", [each for each in (folder, *folder.parents) if not each.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
         probe.write_bytes(b"x" * 4096)
@@ -59,3 +59,5 @@ def check_writable(folder: Path) -> None:
     finally:
         with contextlib.suppress(OSError):
             probe.unlink(missing_ok=True)
+            for each in new:
+                each.rmdir()

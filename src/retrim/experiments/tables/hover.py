@@ -2,12 +2,11 @@
 
 from collections.abc import Sequence
 
-from ...config.loading import load
 from ...config.scenario import Scenario
 from ..reporter import Reporter
 from ..run import Run
 from .document import Document
-from .study import PaperRows, level_section, train_all
+from .study import PaperRows, level_section, table_presets, train_all
 
 PAPER: PaperRows = (  # Table I [m]
     ("base", ("0.128 ± 0.004", "0.328 ± 0.001", "1.228 ± 0.073")),
@@ -28,7 +27,7 @@ def hover(
     methods: Sequence[str] = ("base", "base-i", "base-do", "full", "lora"),
 ) -> None:
     """Make ``hover.md``: three disturbances, for each preset, over several training seeds."""
-    loaded = [load(name) for name in presets]
+    loaded = table_presets(presets, "hover", seeds=seeds, starts=starts, seconds=seconds)
     scenario = Scenario(plant=plant, sensors=sensors)
     intro = (
         f"Made by `retrim reproduce hover`. Steady-state error [m], the mean over the last 2 s of {seconds:g} s:\n"

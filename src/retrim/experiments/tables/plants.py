@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
-from ...config.loading import load
 from ...config.plants import PLANTS
 from ...config.scenario import Scenario
 from ...errors import PlantError
@@ -11,7 +10,7 @@ from ..metrics import cell, rows
 from ..reporter import Reporter
 from ..run import Run
 from .document import Document, TableSection
-from .study import fly_all, train_all
+from .study import fly_all, table_presets, train_all
 
 GROUPS: tuple[tuple[str, Scenario, tuple[str, ...]], ...] = (
     ("bem", Scenario(), ("none", "small", "large")),
@@ -56,7 +55,9 @@ def plants(
 
     A plant whose package is not installed is left out, with a line that says so.
     """
-    loaded = load(preset)
+    (loaded,) = table_presets([preset], "hover", seeds=seeds, starts=starts, seconds=seconds)
+    for name in only:
+        PLANTS.find(name)
     own = ", ".join(f"`{name}` flies its {p.own_vehicle}" for name, p in PLANTS.items() if p.own_vehicle)
     intro = (
         "Made by `retrim reproduce plants`. A policy trained in the nominal model for the small quadrotor, flown\n"

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from ...config.loading import load
 from ...config.presets import Adapt
 from ...config.scenario import Scenario
 from ...config.setup import Setup
@@ -17,7 +16,7 @@ from ..metrics import rows
 from ..reporter import Reporter
 from ..run import Run
 from .document import Document, TableSection
-from .study import fly_all, train_all
+from .study import fly_all, table_presets, train_all
 
 PERIOD = 15.0  # [s]
 METHODS: dict[str, str] = {
@@ -44,14 +43,14 @@ def reversing(
     starts: int = 8,
 ) -> None:
     """Make ``reversing.md``: the error before and after each update, its peak, and the picture."""
-    loaded = load(preset)
-    if loaded.task != "hover" or seconds < 2 * PERIOD:
-        raise ConfigError(f"{preset}, {seconds:g} s: needs a preset for hover and at least {2 * PERIOD:g} s")
+    (loaded,) = table_presets([preset], "hover", seeds=seeds, starts=starts, seconds=seconds)
+    scenario = Scenario("reversing", plant=plant)
+    if seconds < 2 * PERIOD:
+        raise ConfigError(f"flights of {seconds:g} s: a push that reverses needs at least {2 * PERIOD:g} s")
     document = Document(
         run, "reversing", "Hover under a push that reverses (Sec. IV-B.3 of the paper)", INTRO, seeds, reporter
     )
     study = train_all(loaded, seeds, run, reporter)
-    scenario = Scenario("reversing", plant=plant)
     flown = fly_all(study, [scenario], run, reporter, methods=tuple(METHODS), starts=starts, seconds=seconds).flown
     if not flown:
         document.write()

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from ...config.loading import load_for
 from ...config.methods import find_method
 from ...config.presets import Preset
 from ...config.scenario import Scenario
@@ -11,6 +12,7 @@ from ...config.setup import Setup
 from ...control.policy import Policy
 from ..figures import picture
 from ..fleet import Fleet, Flights
+from ..limits import check_flights, check_seeds
 from ..metrics import cell, rows
 from ..reporter import Reporter
 from ..run import Run
@@ -38,6 +40,19 @@ class Study:
         return f"Preset `{self.preset.name}`; error in its own model, by seed: {own} mm."
 
 
+def table_presets(
+    names: Sequence[str], task: str, *, seeds: Sequence[int], starts: int, seconds: float | None
+) -> list[Preset]:
+    """Load the presets of a table, and check its sizes before anything is trained.
+
+    Raises:
+        ConfigError: A preset does not exist or is for another task, or the sizes cannot be flown.
+    """
+    check_seeds(seeds)
+    check_flights(starts, seconds)
+    return [load_for(task, name) for name in names]
+
+
 def train_all(preset: Preset, seeds: Sequence[int], run: Run, reporter: Reporter) -> Study:
     """Train a policy for each seed; an interruption leaves those that are complete."""
     setup, policies, errors = Setup.of(preset), dict[int, Policy](), list[float]()
@@ -47,8 +62,9 @@ def train_all(preset: Preset, seeds: Sequence[int], run: Run, reporter: Reporter
         reporter.say(f"preset {preset.name}, seed {seed}")
         policy, _ = train(setup, seed, reporter=reporter, stop=run.stop)
         if not run.interrupted:
-            policies[seed] = policy
-            errors.append(nominal_error(setup, policy))
+            with run.interruptible():
+                errors.append(nominal_error(setup, policy))
+                policies[seed] = policy
     return Study(preset, policies, tuple(errors))
 
 
@@ -70,10 +86,11 @@ def fly_all(
     if not study.policies or run.interrupted:
         return Flights([], interrupted=True)
     fleet = Fleet(study.preset, study.policies, scenarios, methods=methods, starts=starts, seconds=seconds)
-    with reporter.progress("flying") as advance:
+    with run.interruptible(), reporter.progress("flying") as advance:
         advance(0.0, "compiling the programs of a flight (kept in a cache for the next time)")
         fleet.warm_up()
         return fleet.run(stop=run.stop, progress=lambda done, n: advance(done / n, f"{done} of {n} flights"))
+    return Flights([], interrupted=True)
 
 
 def level_section(

@@ -1,15 +1,15 @@
 """Table II of the paper: circle, figure-8 and star."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
-from ...config.loading import changed, load
+from ...config.loading import changed
 from ...config.presets import Preset
 from ...config.scenario import Scenario
-from ...errors import ConfigError
 from ..reporter import Reporter
 from ..run import Run
 from .document import Document
-from .study import PaperRows, Study, level_section, train_all
+from .study import PaperRows, Study, level_section, table_presets, train_all
 
 PAPER: dict[str, PaperRows] = {  # Table II [m]
     "circle": (
@@ -51,7 +51,9 @@ def tracking(
     starts: int = 8,
 ) -> None:
     """Make ``tracking.md``: three references under three disturbances, and a figure-8 that training never saw."""
-    sections = [section for name in presets for section in _sections(load(name))]
+    loaded = table_presets(presets, "track", seeds=seeds, starts=starts, seconds=seconds)
+    sections = [section for preset in loaded for section in _sections(preset)]
+    base = Scenario(plant=plant)
     document = Document(run, "tracking", "Tracking (Table II of the paper)", INTRO, seeds, reporter)
     studies = dict[str, Study]()
     for title, preset, reference, methods, paper in sections:
@@ -61,7 +63,7 @@ def tracking(
             studies[key] = train_all(preset, seeds, run, reporter)
         stem = "_".join(["tracking", preset.name.rpartition("/")[2], reference, trained_on.replace("+", "-")])
         made = level_section(
-            studies[key], title, Scenario(plant=plant, reference=reference), run, reporter,
+            studies[key], title, replace(base, reference=reference), run, reporter,
             methods=methods, starts=starts, seconds=seconds, paper=paper, stem=stem,
         )  # fmt: skip
         if made is not None:
@@ -73,9 +75,7 @@ def tracking(
 
 def _sections(preset: Preset) -> list[tuple[str, Preset, str, tuple[str, ...], PaperRows]]:
     """Title, preset, reference, methods and the paper's rows of each section of a preset."""
-    if preset.track is None:
-        raise ConfigError(f"preset {preset.name!r} is for {preset.task}, not for track")
-    if preset.track.observation == "preview":
+    if preset.track is not None and preset.track.observation == "preview":
         unseen = changed(preset, track={"reference": "circle+star"})
         return [
             *((f"{name}, seen ahead", preset, name, ALL, paper) for name, paper in PAPER.items()),

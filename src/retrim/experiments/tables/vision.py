@@ -2,12 +2,11 @@
 
 from collections.abc import Sequence
 
-from ...config.loading import load
 from ...config.scenario import Scenario
 from ..reporter import Reporter
 from ..run import Run
 from .document import Document
-from .study import PaperRows, level_section, train_all
+from .study import PaperRows, level_section, table_presets, train_all
 
 PAPER: PaperRows = (  # Table III [m]
     ("base", ("0.133 ± 0.009", "0.404 ± 0.039", "1.383 ± 0.176")),
@@ -37,7 +36,8 @@ def vision(
     starts: int = 8,
 ) -> None:
     """Make ``vision.md``: hover from seven points on the ground under three disturbances."""
-    loaded = [load(name) for name in presets]
+    loaded = table_presets(presets, "vision", seeds=seeds, starts=starts, seconds=seconds)
+    scenario = Scenario(plant=plant)
     document = Document(run, "vision", "Hover from keypoints (Table III of the paper)", INTRO, seeds, reporter)
     for preset in loaded:
         study = train_all(preset, seeds, run, reporter)
@@ -45,7 +45,7 @@ def vision(
         methods: tuple[str, ...] = ("base", "full") if preset.name == "vision/paper" else ("base", "full", "lora")
         stem = f"vision_{preset.name.rpartition('/')[2]}"
         made = level_section(
-            study, TITLES.get(preset.name, preset.name), Scenario(plant=plant), run, reporter,
+            study, TITLES.get(preset.name, preset.name), scenario, run, reporter,
             methods=methods, starts=starts, seconds=seconds, paper=PAPER, stem=stem,
         )  # fmt: skip
         if made is not None:

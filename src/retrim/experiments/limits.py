@@ -1,0 +1,36 @@
+"""What can be flown at all: seeds, numbers of starts, lengths of flights. Checked before anything is trained."""
+
+from collections.abc import Sequence
+
+from ..errors import ConfigError
+
+MAX_SEED, MAX_STARTS, MAX_SECONDS = 2**32 - 1, 100_000, 36_000.0
+
+
+def check_seeds(seeds: Sequence[int]) -> None:
+    """Check the seeds of a run.
+
+    Raises:
+        ConfigError: There is none, one is there twice, or one is negative or does not fit 32 bits.
+    """
+    for seed in seeds:
+        if not 0 <= seed <= MAX_SEED:
+            raise ConfigError(f"seed {seed}: must be 0 to {MAX_SEED}")
+    if not seeds or len(set(seeds)) < len(seeds):
+        raise ConfigError(f"seeds {', '.join(map(str, seeds)) or 'none'}: at least one is needed, and each only once")
+
+
+def check_flights(starts: int, seconds: float | None) -> None:
+    """Check number and length of flights.
+
+    Args:
+        starts: Flights per scenario, method and seed.
+        seconds: Length of a flight; None for the task's own.
+
+    Raises:
+        ConfigError: They cannot be flown.
+    """
+    if not 1 <= starts <= MAX_STARTS:
+        raise ConfigError(f"{starts} starts: must be 1 to {MAX_STARTS}")
+    if seconds is not None and not 1.0 <= seconds <= MAX_SECONDS:
+        raise ConfigError(f"flights of {seconds:g} s: must be 1 s to {MAX_SECONDS:g} s long")
