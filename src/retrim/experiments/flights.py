@@ -21,6 +21,8 @@ from ..runtime.events import Event, Observer
 from ..runtime.flight import Log, fly
 from ..tasks.task import AbstractTask
 
+FLOOR = -0.5  # [m]: a vehicle below this is terminated; starts may lie at z = 0, and a transient dips below them
+SETTLED = 0.05  # [m]
 LEARNER_TAG = 2**30 + 2  # folded into a seed: learners share no key with training, starts and disturbances
 
 
@@ -74,6 +76,14 @@ class Flight:
         """Largest error after the first 5 s [m]; infinite for a flight that was terminated."""
         late = self.error[self.log.t >= min(5.0, self.log.t[-1] / 2)]
         return float("inf") if self.log.terminated else float(late.max())
+
+    @property
+    def settle_s(self) -> float:
+        """Time after which the error stays below 5 cm [s]; infinite if it does not."""
+        outside = np.flatnonzero(self.error >= SETTLED)
+        if self.log.terminated or (len(outside) and outside[-1] == len(self.error) - 1):
+            return float("inf")
+        return float(self.log.t[outside[-1] + 1]) if len(outside) else 0.0
 
     @property
     def cross_track(self) -> float | None:
@@ -147,7 +157,7 @@ def fly_one(
 
 @eqx.filter_jit
 def _terminated(task: AbstractTask, t: Any, x: State) -> Array:
-    return task.terminated(jnp.asarray(t, dtype=x.p.dtype), x)
+    return task.terminated(jnp.asarray(t, dtype=x.p.dtype), x) | (x.p[2] < FLOOR)
 
 
 @eqx.filter_jit

@@ -55,6 +55,7 @@ def _row(group: Sequence[Flight], by_seed: bool) -> dict[str, Any]:
         "std": float(steady.std(ddof=1)) if len(steady) > 1 else None,
         "median": _finite(float(np.median(everything))),
         "peak_after_5s": _finite(float(np.median(peaks))),
+        "settle_s": _finite(float(np.median([f.settle_s for f in group]))),
         **({"cross_track_m": float(np.mean(cross))} if cross else {}),
         "n": len(group),
         "crashes": sum(f.log.terminated for f in group),

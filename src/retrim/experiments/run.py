@@ -36,6 +36,7 @@ class Run:
         """
         self.folder = out or Path("runs") / f"{command}-{datetime.now():%Y%m%d-%H%M%S}"
         self.watch = Stopwatch()
+        self.replaces = out is not None and any(self.folder.glob("*.json"))
         self.stop = stop or threading.Event()
         commit()  # remembered from before the run writes anything into the checkout
         check_writable(self.folder)

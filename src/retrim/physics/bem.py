@@ -1,6 +1,6 @@
 """The realistic plant: blade-element rotors, body drag, firmware's rate controller and motors, at 1 kHz."""
 
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -26,6 +26,20 @@ class BemState(eqx.Module):
     """Of the four rotors: every leaf has 4 numbers."""
 
 
+@runtime_checkable
+class RateController(Protocol):
+    """Turns commands into rotor speeds, once per millisecond; an ``eqx.Module``."""
+
+    thrust_map: Float[Array, ""]
+    """c in Omega = sqrt(F / 4 c): what the controller assumes of its propellers [N s^2]."""
+
+    def __call__(
+        self, vehicle: Vehicle, s: RotorState, u: Command, /
+    ) -> tuple[Float[Array, "4"], Float[Array, "3"], Float[Array, "3"]]:
+        """Return commanded rotor speeds [rad/s], the integral of the rate error [rad], and the slow command [rad/s]."""
+        ...
+
+
 class Loads(NamedTuple):
     """What acts on the body, in its frame."""
 
@@ -39,7 +53,7 @@ class BemQuadrotor(AbstractSubstepDynamics[BemState]):
     """Quadrotor with blade-element rotors under a CTBR command."""
 
     vehicle: Vehicle
-    loop: Betaflight
+    loop: RateController
     dt: float = eqx.field(static=True)
 
     def __check_init__(self) -> None:

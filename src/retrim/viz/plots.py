@@ -95,8 +95,9 @@ def _errors(axes: Axes, base: list[Track], adapted: list[Track], spans: list[Spa
     for i, t in enumerate(swaps):
         axes.axvline(t, color=UPDATE, linestyle="--", linewidth=1.2, label=None if i else "new policy takes over")
     for tracks, color, name in ((base, BASE, "base policy"), (adapted, ADAPTED, "adapted in flight")):
-        for track in tracks:
-            axes.plot(track.t, track.error, color=color, alpha=0.35, linewidth=0.8)
+        for i, track in enumerate(tracks):
+            label = f"{name}: single flights" if len(tracks) > 1 and i == 0 else None
+            axes.plot(track.t, track.error, color=color, alpha=0.35, linewidth=0.8, label=label)
             if track.crashed:
                 axes.plot(track.t[-1], track.error[-1], "x", color=color, markersize=10)
         whole = [track.error for track in tracks if not track.crashed]

@@ -25,7 +25,13 @@ class Targets(eqx.Module):
     valid: Bool[Array, " n"]
 
 
-def residual_targets(window: Window, nominal: AbstractDynamics[Any], *, delay_ticks: int = 0) -> Targets:
+def residual_targets(
+    window: Window,
+    nominal: AbstractDynamics[Any],
+    *,
+    delay_ticks: int = 0,
+    a_gt: Float[Array, "n 3"] | None = None,
+) -> Targets:
     """Compute a_res = a_gt - a_hat of each tick.
 
     a_gt is the forward difference of velocity over the tick, a_hat that of the nominal model from the same state, both
@@ -38,6 +44,8 @@ def residual_targets(window: Window, nominal: AbstractDynamics[Any], *, delay_ti
         window: n ticks of flight.
         nominal: The analytical model.
         delay_ticks: Declared command delay of the plant [ticks].
+        a_gt: Measured accelerations, the mean over the tick that begins in each row, world [m/s^2]; by default the
+            differences of velocity.
 
     Returns:
         n - 1 - ``delay_ticks`` rows.
@@ -59,6 +67,8 @@ def residual_targets(window: Window, nominal: AbstractDynamics[Any], *, delay_ti
         return after, (v_next - nominal.state(after).v) / nominal.dt
 
     first = nominal.init(jax.tree.map(lambda leaf: leaf[0], x))
+    if a_gt is not None:
+        v_next = x.v + nominal.dt * a_gt[delay_ticks : delay_ticks + rows]
     _, a_res = lax.scan(tick, first, (x, u, v_next))
     settled = _settled(window, nominal.settling_ticks)[:rows]
     return Targets(x, u, a_res, window.valid[:rows] & _regular(window, nominal.dt, delay_ticks) & settled)
