@@ -11,7 +11,9 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 
 from retrim.experiments.compile_cache import enable_compile_cache  # noqa: E402  (after the configuration)
 
-enable_compile_cache()  # shared by the workers
+enable_compile_cache()  # shared by the workers and by the commands that tests start
+# Only what takes long to compile is worth a file: thousands of small programs are not written from test workers.
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 settings.register_profile("repeatable", derandomize=True)  # the same examples on every machine
 settings.load_profile("repeatable")
 
@@ -21,6 +23,13 @@ def optax_promotion():
     """For tests that run an optimiser: optax multiplies Python floats by integer counters."""
     with jax.numpy_dtype_promotion("standard"):
         yield
+
+
+@pytest.fixture(scope="module", autouse=True)
+def forget_programs():
+    """Free a module's compiled programs: each holds memory maps, and a worker lives for the whole run."""
+    yield
+    jax.clear_caches()
 
 
 @pytest.fixture
