@@ -7,10 +7,10 @@ import pytest
 from jax import random
 
 from helpers import hover_task
-from retrim.adapt import ControllerPilot, SensorModel, SimPlant, fly
 from retrim.control import Policy, PolicyController
 from retrim.physics import Constant, LinearDragQuadrotor, State, small
-from retrim.runtime.batch import batch_flight
+from retrim.plants import SensorModel, SimPlant
+from retrim.runtime import ControllerPilot, batch_flight, fly
 
 
 @pytest.fixture(scope="module")
@@ -22,11 +22,11 @@ def parts():
     return model, push, PolicyController(task.observation, policy), State.at(jnp.array([0.2, 0.1, 1.3]))
 
 
-@pytest.mark.parametrize("delay", [0.0, 0.02, 0.025])
-def test_same_as_flying_the_plant(parts, delay):
+@pytest.mark.parametrize("delay_s", [0.0, 0.02, 0.025])
+def test_same_as_flying_the_plant(parts, delay_s):
     model, push, controller, x0 = parts
-    log = fly(SimPlant(model, push, delay=delay), ControllerPilot(controller), x0, ticks=15)
-    states, commands = jax.jit(lambda x0: batch_flight(model, push, controller, x0, ticks=15, delay=delay))(x0)
+    log = fly(SimPlant(model, push, delay_s=delay_s), ControllerPilot(controller), x0, ticks=15)
+    states, commands = jax.jit(lambda x0: batch_flight(model, push, controller, x0, ticks=15, delay_s=delay_s))(x0)
     np.testing.assert_allclose(states.p, log.p[1:], atol=1e-12)
     np.testing.assert_allclose(states.R, log.R[1:], atol=1e-12)
     np.testing.assert_allclose(jax.vmap(lambda u: u.vector())(commands), log.u[1:], atol=1e-10)
@@ -43,5 +43,5 @@ def test_maps_over_starts_and_sees_through_sensors(parts):
     commands = jax.jit(jax.vmap(fly_from))(starts, random.split(random.key(1)))
     assert commands.c.shape == (2, 5)
     assert not np.array_equal(commands.c[0], commands.c[1])  # other noise
-    with pytest.raises(ValueError, match="needs a key"):
+    with pytest.raises(ValueError, match="need a key"):
         batch_flight(model, push, controller, x0, ticks=5, sensors=sensors)

@@ -1,0 +1,290 @@
+"""The flight loop: clocks that start anywhere, ticks that are missed, commands that are limited, and who is told."""
+
+import json
+import threading
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from helpers import hover_task
+from retrim import PlantError
+from retrim.adapt import RollingBuffer, Skip
+from retrim.config import Scenario
+from retrim.control import AbstractController, Policy, PolicyController
+from retrim.physics import Command, State, small
+from retrim.plants import Plant
+from retrim.runtime import ControllerPilot, Event, FlightStopped, FunctionPilot, JsonlObserver, Pilot, fly
+
+START = State.at(jnp.array([0.3, -0.2, 1.5]))
+HOVER = FunctionPilot(lambda measurement: Command.hover())
+
+
+class Odd(Plant):
+    """The simple plant with another clock, with commands limited, or with measurements missed."""
+
+    def __init__(self, *, clock=0.0, limit=None, stalls=(), sensors="ideal", disturbance="none"):
+        self._inner = Scenario(disturbance, "simple", sensors=sensors).make()
+        self._clock, self._limit, self._stalls = clock, limit, stalls
+        self.dt = self._inner.dt
+        self.issued, self.stops, self._steps = [], 0, 0
+
+    def reset(self, x0):
+        self._steps = 0
+        return self._shown(self._inner.reset(x0))
+
+    def step(self, u):
+        self.issued.append(u)
+        if self._limit is not None:
+            u = self._limit(u)
+        for _ in range(3 if self._steps in self._stalls else 1):
+            measurement, _ = self._inner.step(u)
+        self._steps += 1
+        return self._shown(measurement), u
+
+    def stop(self):
+        self.stops += 1
+        self._inner.stop()
+
+    def _shown(self, measurement):
+        return measurement._replace(t=self._clock + measurement.t)
+
+
+class Witness:
+    """An observer that keeps what it is told, in order."""
+
+    def __init__(self):
+        self.told = []
+
+    def measurement(self, measurement, u):
+        self.told.append((measurement, u))
+
+    def event(self, event):
+        self.told.append(event)
+
+
+class Climb(AbstractController[None]):
+    """Thrust that depends on the time since the start of the flight."""
+
+    def init(self, x):
+        return None
+
+    def __call__(self, memory, t, x):
+        return Command(9.81 + t, jnp.zeros(3)), None
+
+
+class Eventful(Pilot):
+    """Hovers, and has something to tell at its third tick."""
+
+    def __init__(self):
+        self._t, self._start = 0.0, 0.0
+
+    def reset(self, measurement):
+        self._start = measurement.t
+
+    def act(self, measurement):
+        self._t = measurement.t - self._start
+        return Command.hover()
+
+    def take_events(self):
+        return [Event.of(self._t, Skip(self._t, "policy"))] if round(self._t / 0.02) == 2 else []
+
+
+def policy_controller(key, history=2):
+    task = hover_task(history=history)
+    policy = Policy.of(task.observation.size, small(), key=key, hidden=(8,))
+    return PolicyController(task.observation, jax.tree.map(lambda leaf: leaf + 0.05, policy))
+
+
+# ---- time
+
+
+def test_a_clock_may_start_anywhere():
+    """Pilots are told the time since the start of the flight, whatever the plant's clock says."""
+    asked = []
+
+    def late(t, x):
+        asked.append(t)
+        return t > 0.29
+
+    flown = [
+        fly(Odd(clock=clock), ControllerPilot(Climb()), START, ticks=50, terminated=late) for clock in (0.0, 1.7e9)
+    ]
+    for log in flown:
+        assert len(log.t) == 16
+        assert log.t[0] == 0.0
+        assert log.terminated
+        np.testing.assert_allclose(log.t, 0.02 * np.arange(16), atol=1e-6)
+        np.testing.assert_allclose(log.u[1:, 0], 9.81 + 0.02 * np.arange(15), atol=1e-6)
+    np.testing.assert_allclose(asked, 2 * list(0.02 * np.arange(1, 16)), atol=1e-6)
+    np.testing.assert_allclose(flown[1].p, flown[0].p, atol=1e-6)
+
+
+def test_missed_ticks_count_and_shorten_the_flight():
+    """The clock jumps by three ticks at the fifth and eighth step: 20 ticks take 16 steps."""
+    plant = Odd(stalls=(4, 7))
+    log = fly(plant, HOVER, START, ticks=20)
+    assert log.missed_ticks == 4
+    assert len(log.t) == 17
+    assert log.t[-1] == pytest.approx(0.4)
+    steps = np.full(16, 0.02)
+    steps[[4, 7]] = 0.06
+    np.testing.assert_allclose(np.diff(log.t), steps)
+    assert fly(Odd(), HOVER, START, ticks=20).missed_ticks == 0
+
+
+# ---- commands that a plant limits
+
+
+def limited(u):
+    return Command(jnp.clip(u.c, 9.5, 10.0), jnp.clip(u.omega, -0.05, 0.05))
+
+
+def test_log_and_observation_hold_the_accepted_command(key):
+    """The policy's next observation has the accepted command: replayed with it, each issued command is the same."""
+    controller, plant = policy_controller(key), Odd(limit=limited)
+    log = fly(plant, ControllerPilot(controller), START, ticks=12)
+    issued = np.stack([u.vector() for u in plant.issued])
+    accepted = np.stack([limited(u).vector() for u in plant.issued])
+    assert not np.allclose(issued, accepted)
+    np.testing.assert_array_equal(log.u[1:], accepted)
+    np.testing.assert_array_equal(log.u[0], Command.hover().vector())
+
+    def replayed(told):
+        memory, found = controller.init(START), []
+        for k in range(12):
+            x = State(*(jnp.asarray(leaf[k]) for leaf in log.measured))
+            u, memory = controller(memory, jnp.array(0.02 * k), x)
+            found.append(u.vector())
+            if told:
+                memory = controller.accepted(memory, limited(u))
+        return np.stack(found)
+
+    np.testing.assert_allclose(replayed(told=True), issued, atol=1e-12)
+    assert not np.allclose(replayed(told=False), issued, atol=1e-6)
+
+
+# ---- the record
+
+
+def test_a_log_gives_the_window_that_was_seen_in_flight(key):
+    """Of a log and of a buffer, each measured, noisy state stands with the command that followed it."""
+    buffer, inner = RollingBuffer(10), ControllerPilot(policy_controller(key))
+
+    class Keeping(Pilot):
+        def reset(self, measurement):
+            inner.reset(measurement)
+
+        def act(self, measurement):
+            u = inner.act(measurement)
+            buffer.push(measurement.t, measurement.x, u)
+            return u
+
+        def accepted(self, u):
+            inner.accepted(u)
+            buffer.accepted(u)
+
+    log = fly(Odd(sensors="rough", limit=limited), Keeping(), START, ticks=15)
+    seen, kept = buffer.window(), log.window(10)
+    for a, b in zip(jax.tree.leaves(seen), jax.tree.leaves(kept), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-12)
+    assert not np.allclose(kept.x.p, log.p[5:15], atol=1e-6)  # measured, not true
+    earlier = log.window(4, end=9)
+    np.testing.assert_array_equal(earlier.x.p, log.measured.p[5:9])
+    np.testing.assert_array_equal(earlier.u.c, log.u[6:10, 0])
+    with pytest.raises(ValueError, match="16 ticks up to row 15 of a flight of 15 ticks"):
+        log.window(16)
+    with pytest.raises(ValueError, match="4 ticks up to row 16"):
+        log.window(4, end=16)
+
+
+def test_flights_of_noisy_plants_keep_truth_and_measurement():
+    log = fly(Odd(sensors="mocap"), HOVER, START, ticks=8)
+    np.testing.assert_array_equal(log.p, fly(Odd(), HOVER, START, ticks=8).p)
+    assert np.all(np.any(log.measured.p != log.true.p, axis=1))
+
+
+# ---- who is told
+
+
+def test_observers_see_the_first_measurement_every_tick_and_every_event():
+    witness, second, plant = Witness(), Witness(), Odd(clock=100.0)
+    log = fly(plant, Eventful(), START, ticks=5, observers=[witness, second])
+    measurements = [told for told in witness.told if not isinstance(told, Event)]
+    assert len(measurements) == 6
+    first, u = measurements[0]
+    np.testing.assert_array_equal(first.x.vector(), START.vector())
+    np.testing.assert_array_equal(u.vector(), Command.hover().vector())
+    np.testing.assert_array_equal(log.p, np.stack([m.x.p for m, _ in measurements]))
+    (event,) = [told for told in witness.told if isinstance(told, Event)]
+    assert event == Event(event.t, "skipped", "policy learner still busy")
+    assert event.t == pytest.approx(0.04)
+    assert log.events == (event,)
+    assert [type(told) for told in witness.told] == [type(told) for told in second.told]
+    assert witness.told.index(event) == 3  # with the tick that it happened in, before its measurement
+
+
+def test_events_as_lines_of_json(tmp_path):
+    observer = JsonlObserver(tmp_path / "events.jsonl", method="full")
+    fly(Odd(), Eventful(), START, ticks=5, observers=[observer])
+    observer.close()
+    (line,) = (tmp_path / "events.jsonl").read_text().splitlines()
+    assert json.loads(line) == {
+        "event": "skipped",
+        "method": "full",
+        "t": 0.04,
+        "note": "policy learner still busy",
+    }
+
+
+def test_a_stop_token_gives_the_flight_up_and_stops_the_plant():
+    stop, witness, plant = threading.Event(), Witness(), Odd()
+
+    def until_the_third(measurement):
+        if measurement.t > 0.03:
+            stop.set()
+        return Command.hover()
+
+    with pytest.raises(FlightStopped, match="given up"):
+        fly(plant, FunctionPilot(until_the_third), START, ticks=50, observers=[witness], stop=stop)
+    assert plant.stops == 1
+    assert len(plant.issued) == 3
+    assert len(witness.told) == 4
+    with pytest.raises(PlantError, match="call reset first"):
+        plant.step(Command.hover())
+
+
+def test_a_pilot_that_fails_stops_the_plant():
+    plant = Odd()
+
+    def failing(measurement):
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fly(plant, FunctionPilot(failing), START, ticks=5)
+    assert plant.stops == 1
+
+
+def test_termination_ends_the_flight_and_is_logged():
+    log = fly(Odd(), HOVER, START, ticks=50, terminated=lambda t, x: t >= 0.1 - 1e-9)
+    assert log.terminated
+    assert log.t[-1] == pytest.approx(0.1)
+    assert not fly(Odd(), HOVER, START, ticks=5).terminated
+
+
+def test_termination_is_judged_by_the_true_state():
+    seen = []
+    fly(Odd(sensors="rough"), HOVER, START, ticks=5, terminated=lambda t, x: seen.append(x.p) or False)
+    np.testing.assert_array_equal(np.stack(seen), fly(Odd(), HOVER, START, ticks=5).p[1:])
+
+
+def test_pilot_starts_its_memory_anew_at_time_zero(key):
+    pilot, plant = ControllerPilot(policy_controller(key)), Odd()
+    with plant:
+        start = plant.reset(START)
+        pilot.reset(start)
+        first = pilot.act(start).vector()
+        pilot.act(plant.step(Command.hover())[0])
+    pilot.reset(start._replace(t=50.0))
+    np.testing.assert_array_equal(pilot.act(start._replace(t=50.0)).vector(), first)

@@ -1,0 +1,89 @@
+"""The virtual clock: a result appears after its latency, in whole ticks; one window is under way at a time."""
+
+import types
+
+import jax.numpy as jnp
+import pytest
+
+from retrim.adapt import Rejection, RollingBuffer, Skip
+from retrim.physics import Command, State
+from retrim.runtime import LockstepLearner, lockstep
+
+
+class Worker:
+    """Refuses each window at once."""
+
+    layer = "policy"
+
+    def __init__(self):
+        self.received, self.learnt = [], 0
+
+    def learn(self, window):
+        self.learnt += 1
+        return Rejection(float(window.t[-1]), self.layer, f"window {self.learnt}")
+
+    def receive(self, update):
+        self.received.append(update)
+
+
+def window(t):
+    buffer = RollingBuffer(2)
+    buffer.push(t, State.at(jnp.zeros(3)), Command.hover())
+    return buffer.window()
+
+
+def appears(learner, tick):
+    """Tick at which the update of a window that was submitted at ``tick`` appears."""
+    learner.submit(window(0.02 * tick), tick)
+    for later in range(tick, tick + 100):
+        if learner.poll(later):
+            return later
+    return None
+
+
+@pytest.mark.parametrize(("latency_s", "ticks"), [(0.001, 1), (0.02, 1), (0.021, 2), (0.1, 5), (0.3, 15), (1.0, 50)])
+def test_latencies_are_rounded_up_to_whole_ticks(latency_s, ticks):
+    assert appears(LockstepLearner(Worker(), latency_s, 0.02), 7) == 7 + ticks
+
+
+def test_the_same_latency_is_twice_the_ticks_at_twice_the_rate():
+    assert appears(LockstepLearner(Worker(), 0.2, 0.01), 0) == 20
+
+
+def test_measured_latency_is_what_the_clock_shows(monkeypatch):
+    """The worker takes 0.37 s by the clock."""
+    readings = iter([100.0, 100.37, 200.0, 200.05])
+    monkeypatch.setattr(lockstep, "time", types.SimpleNamespace(perf_counter=lambda: next(readings)))
+    learner = LockstepLearner(Worker(), None, 0.02)
+    assert appears(learner, 0) == 19
+    assert appears(learner, 50) == 53
+
+
+def test_a_window_is_skipped_while_another_is_under_way():
+    worker = Worker()
+    learner = LockstepLearner(worker, 0.1, 0.02)
+    learner.submit(window(1.0), 50)
+    learner.submit(window(1.04), 52)
+    assert worker.learnt == 1
+    assert learner.poll(52) == [Skip(1.04, "policy")]
+    assert learner.poll(54) == []
+    assert learner.poll(55) == [Rejection(1.0, "policy", "window 1")]
+    assert learner.poll(56) == []
+
+
+def test_reset_drops_what_is_under_way():
+    worker = Worker()
+    learner = LockstepLearner(worker, 0.1, 0.02)
+    learner.submit(window(1.0), 50)
+    learner.submit(window(1.02), 51)
+    learner.reset()
+    assert learner.poll(1000) == []
+    learner.submit(window(0.0), 0)
+    assert worker.learnt == 2
+
+
+def test_published_updates_reach_the_worker():
+    worker = Worker()
+    update = Skip(1.0, "residual")
+    LockstepLearner(worker, 0.1, 0.02).receive(update)
+    assert worker.received == [update]
