@@ -7,7 +7,7 @@ STAMP := $(VENV)/.installed
 
 DEV := $(VENV)/.installed-dev
 
-.PHONY: setup dev demo test check docs bench tables pins clean
+.PHONY: setup dev demo test check docs wheel mutants bench tables pins clean
 
 setup: $(STAMP)
 
@@ -27,7 +27,20 @@ check: dev docs
 
 # The documentation site, into site/; a link or name that does not resolve is an error.
 docs: dev
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
+# The wheel, installed into a clean environment outside the checkout, flies a short demo there.
+wheel: | $(UV)
+	rm -rf build/wheel && mkdir -p build/wheel/elsewhere
+	$(UV) build --quiet --wheel --out-dir build/wheel .
+	$(UV) venv --quiet --clear --python $(PYTHON) build/wheel/venv
+	$(UV) pip install --quiet --python build/wheel/venv --constraints constraints.txt build/wheel/*.whl
+	cd build/wheel/elsewhere && ../venv/bin/retrim --version \
+		&& ../venv/bin/retrim demo --seconds 8 --starts 1 --out demo && test -s demo/hover_large.png
+
+# Faults planted in the wiring, and the share of them that the tests notice.
+mutants: dev
+	$(BIN)/python tools/mutants.py
 
 bench: setup
 	$(BIN)/retrim bench
@@ -63,4 +76,4 @@ pins: | $(UV)
 		--no-header --no-annotate pyproject.toml --output-file constraints.txt
 
 clean:
-	rm -rf $(VENV) .uv runs site .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf $(VENV) .uv build runs site .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
