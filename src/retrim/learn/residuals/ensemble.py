@@ -15,7 +15,7 @@ from .targets import Targets
 
 
 class EnsembleResidual(eqx.Module):
-    """Mean of ``members`` ReLU networks 19-128-128-3 on [x, u] [m/s^2], world frame.
+    """Mean of ``members`` ReLU networks 19-128-128-3 on x and u, in the world frame [m/s^2].
 
     ``offset`` and ``scale`` bring the 19 inputs to order one: positions relative to the task's origin, thrust
     mass-normalised. They are the same in fitting, simulation and flight, and are never trained.

@@ -1,0 +1,47 @@
+"""Run the Python blocks of pages as a reader would, with untrained policies and short flights; results as JSON.
+
+Usage: ``python run_pages.py PAGE...`` in an empty folder. A block with a title is written to the file of that name.
+"""
+
+import json
+import re
+import sys
+import traceback
+from pathlib import Path
+
+import retrim
+
+BLOCK = re.compile(r'^```(?P<language>python|toml)(?: title="(?P<title>[^"]+)")?\n(?P<code>.*?)^```', re.M | re.S)
+SHORTER = {"ticks=1500": "ticks=4", "seconds=30": "seconds=1"}
+
+
+def untrained(setup, seed=0):
+    """In place of minutes of training."""
+    from jax import random
+
+    return setup.new_policy(random.key(seed))
+
+
+def run(page: Path) -> str | None:
+    """Run a page; return a traceback if a block fails, and say so if there is no block at all."""
+    blocks = list(BLOCK.finditer(page.read_text()))
+    for block in blocks:
+        if block["title"]:
+            Path(block["title"]).write_text(block["code"])
+    wanted = [block["code"] for block in blocks if block["language"] == "python" and not block["title"]]
+    try:
+        for code in wanted:
+            for long, short in SHORTER.items():
+                code = code.replace(long, short)
+            exec(compile(code, str(page), "exec"), {"__name__": "page"})
+    except BaseException:
+        return traceback.format_exc()
+    return None if wanted else "there is no Python block"
+
+
+if __name__ == "__main__":
+    sys.path.insert(0, str(Path.cwd()))
+    retrim.Setup.pretrained = untrained
+    retrim.enable_compile_cache()
+    found = {name: run(Path(name)) for name in sys.argv[1:]}
+    Path("pages.json").write_text(json.dumps(found))

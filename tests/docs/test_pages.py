@@ -1,0 +1,71 @@
+"""What the documentation shows runs, and what it lists is complete."""
+
+import dataclasses
+import json
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from retrim.cli.main import COMMANDS
+from retrim.config.loading import overlaid
+from retrim.config.presets import PRESETS
+from retrim.config.vehicle_file import VehicleSpec, read_vehicle
+from retrim.experiments.sweep import Sweep, read_sweep
+
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+PAGES = [DOCS / "getting-started.md", DOCS / "presets.md"]
+PAGES += [page for page in sorted((DOCS / "how-to").glob("*.md")) if "```python" in page.read_text()]
+TOML = re.compile(r'^```toml title="(?P<title>[^"]+)"\n(?P<code>.*?)^```', re.M | re.S)
+
+
+@pytest.fixture(scope="module")
+def ran(tmp_path_factory):
+    """Traceback, or None, of each page; one process for all, since most of the time is compiling."""
+    folder = tmp_path_factory.mktemp("reader")
+    words = [sys.executable, str(Path(__file__).with_name("run_pages.py")), *map(str, PAGES)]
+    process = subprocess.run(words, cwd=folder, capture_output=True, text=True, timeout=900)
+    assert process.returncode == 0, process.stderr
+    return json.loads((folder / "pages.json").read_text())
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_blocks_of_a_page_run(ran, page):
+    assert ran[str(page)] is None, ran[str(page)]
+
+
+@pytest.mark.parametrize(("page", "kind"), [("vehicle", VehicleSpec), ("sweep", Sweep)])
+def test_a_page_lists_every_key_and_no_other(page, kind):
+    listed = re.findall(r"^\| `(\w+)` \|", (DOCS / "how-to" / f"{page}.md").read_text(), re.M)
+    assert sorted(listed) == sorted(field.name for field in dataclasses.fields(kind))
+
+
+def test_toml_files_of_pages_are_accepted(tmp_path):
+    readers = {
+        "my_quad": read_vehicle,
+        "study": read_sweep,
+        "track100": lambda path: overlaid(PRESETS["track/preview"], path),
+        "east": lambda path: tomllib.loads(path.read_text()),
+    }
+    found = {block["title"]: block["code"] for page in PAGES for block in TOML.finditer(page.read_text())}
+    assert set(readers) == {Path(title).stem for title in found}
+    for title, code in found.items():
+        (tmp_path / title).write_text(code)
+        readers[Path(title).stem](tmp_path / title)
+
+
+def test_commands_of_documents_exist():
+    shown = set[str]()
+    for page in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *DOCS.glob("*.md"), *(DOCS / "how-to").glob("*.md")):
+        shown |= set(re.findall(r"^(?:\.venv/bin/)?retrim ([a-z]+)", page.read_text(), re.M))
+    assert shown <= set(COMMANDS)
+    assert {"pretrain", "fly", "sweep"} <= shown
+
+
+def test_every_preset_is_described():
+    listed = re.findall(r"^\| `(\w+/\w+)` \|", (DOCS / "presets.md").read_text(), re.M)
+    assert sorted(listed) == sorted(PRESETS)
