@@ -1,4 +1,4 @@
-"""References as tables: shapes as published, derivatives, flatness, laps, families, files, what cannot be flown."""
+"""References as tables: shapes as published, derivatives, flatness, laps, families, what cannot be flown."""
 
 import math
 
@@ -11,8 +11,9 @@ from jax import random
 
 from helpers import replaced
 from retrim.physics import Command, PointMass, State, small, with_payload
-from retrim.tasks import REFERENCES, Reference, from_csv, joined
-from retrim.tasks.reference import POINTS, circle, figure8, smooth_start, star
+from retrim.tasks import REFERENCES, Reference, joined, smooth_start
+from retrim.tasks.reference import POINTS
+from retrim.tasks.shapes import circle, figure8, star
 
 PERIODS = {"circle": 3.0, "figure8": 5.0, "star": 6.0}
 RAMP = 3.0
@@ -233,13 +234,13 @@ def test_at_a_jump_it_hovers(tables):
 
 
 def test_the_papers_smooth_shapes_can_be_flown(tables):
-    assert tables["circle"].worst_violation(small()) is None
-    assert tables["figure8"].worst_violation(small()) is None
+    assert tables["circle"].infeasibility(small()) is None
+    assert tables["figure8"].infeasibility(small()) is None
 
 
 def test_names_the_jump(tables):
     """Edges meet at 36 degrees: the velocity turns by 144, 2 x 1.585 m/s x sin 72 = 3.02 m/s."""
-    text = tables["star"].worst_violation(small())
+    text = tables["star"].infeasibility(small())
     assert "velocity jumps by 3.0" in text
     when = float(text.split(" at ")[1].split(" s")[0])
     corner = at_one(tables["star"], when).p
@@ -249,24 +250,90 @@ def test_names_the_jump(tables):
 def test_names_the_thrust():
     """Loaded with more than its weight, the small one has 28.6 m/s^2; a circle at 27.4 m/s^2 needs 29.1."""
     heavy = with_payload(small(), 0.3)
-    text = circle(radius=1.0, period=1.2).worst_violation(heavy)
+    text = circle(radius=1.0, period=1.2).infeasibility(heavy)
     assert "needs 29.1 m/s² of thrust" in text
     assert "the vehicle has 28.6" in text
-    assert "thrust" not in circle(radius=1.0, period=1.3).worst_violation(heavy)
+    assert "thrust" not in circle(radius=1.0, period=1.3).infeasibility(heavy)
 
 
 def test_names_the_thrust_of_a_far_too_fast_circle():
-    assert "of thrust" in circle(radius=3.0, period=1.0).worst_violation(small())
+    assert "of thrust" in circle(radius=3.0, period=1.0).infeasibility(small())
 
 
 def test_names_the_axis_of_the_rate():
     """A nose that turns at 6 rad/s on the spot; a circle that needs more roll than a lazy vehicle has."""
     spin = Reference.of(lambda t: [0.0, 0.0, 1.0, 6.0 * t], seconds=2.0)
-    text = spin.worst_violation(small())
+    text = spin.infeasibility(small())
     assert "it needs 6.0 rad/s about z" in text
     assert "the limit is 4.0" in text
     lazy = replaced(small(), omega_max=jnp.array([0.5, 6.0, 4.0]))
-    assert "rad/s about x" in circle().worst_violation(lazy)
+    assert "rad/s about x" in circle().infeasibility(lazy)
+
+
+def test_names_a_start_and_an_end_at_speed():
+    text = Reference.of(lambda t: [2.0 * t, 0.0, 1.0], seconds=2.0).infeasibility(small())
+    assert "it starts at speed, 2.00 m/s" in text
+    assert "it ends at speed, 2.00 m/s" in text
+    lap = Reference.of(lambda t: [math.sin(t), math.cos(t), 1.0], seconds=2.0 * math.pi, lap=0.0)
+    assert "it starts at speed, 1.00 m/s" in lap.infeasibility(small())
+    assert "it ends" not in lap.infeasibility(small())
+
+
+def dive(depth, seconds=1.0):
+    """Down by ``depth`` [m] from rest to rest; the largest acceleration is 2 pi depth / seconds^2."""
+    w = 2.0 * math.pi / seconds
+    return lambda t: [0.0, 0.0, 9.0 - depth * (w * t - math.sin(w * t)) / (2.0 * math.pi)]
+
+
+def test_names_what_is_steeper_than_free_fall():
+    """1.5 m in 1 s need 9.42 m/s^2 downwards, 1.7 m need 10.68."""
+    assert Reference.of(dive(1.5), seconds=1.0).infeasibility(small()) is None
+    text = Reference.of(dive(1.7), seconds=1.0).infeasibility(small())
+    assert "steeper than free fall at 0.2" in text
+    assert "(10.7 m/s² downwards)" in text
+
+
+def test_in_free_fall_it_hovers():
+    """Without thrust there is no attitude: the command is finite, and the reason named."""
+    height = 9.0 - 0.5 * 9.81 * np.linspace(0.0, 1.0, 5) ** 2
+    reference = Reference.of(lambda t: [0.0, 0.0, 9.0 - 0.5 * 9.81 * t**2], seconds=1.0)
+    assert np.isfinite(np.asarray(reference.rows)).all()
+    np.testing.assert_allclose(at(reference, np.linspace(0.0, 0.999, 5)).p[:, 2], height, atol=0.02)
+    assert "ends at speed" in reference.infeasibility(small())
+
+
+def test_names_the_ground():
+    text = Reference.of(lambda t: [0.0, 0.0, 0.5 - 0.9 * smooth_start(t, 2.0)], seconds=2.0).infeasibility(small())
+    assert "0.40 m below the ground, z = 0, at 2.00 s" in text
+
+
+def test_names_a_lap_that_does_not_close():
+    def path(t):
+        return [0.1 * smooth_start(t), 0.0, 1.0]
+
+    assert "its lap does not close: its end is 0.20 m" in Reference.of(path, seconds=5.0, lap=3.0).infeasibility(
+        small()
+    )
+
+
+def test_names_a_jump_from_lap_to_lap():
+    """There and back at 1 m/s: the velocity turns at the seam, within a millimetre of the start."""
+
+    def path(t):
+        s = smooth_start(t) % 2.0
+        return [min(s, 2.0 - s), 0.0, 1.0]
+
+    reference = Reference.of(path, seconds=5.0, lap=3.0)
+    assert "velocity jumps by" in reference.infeasibility(small())
+    bow = Reference.of(lambda t: [math.sin(0.5 * math.pi * smooth_start(t) % math.pi), 0.0, 1.0], seconds=5.0, lap=3.0)
+    assert "velocity jumps by" in bow.infeasibility(small())
+
+
+def test_all_reasons_are_named():
+    text = Reference.of(lambda t: [2.0 * t, 0.0, -1.0, 9.0 * t], seconds=2.0).infeasibility(small())
+    assert text.count(";") == 3
+    for reason in ("starts at speed", "ends at speed", "rad/s about z", "below the ground"):
+        assert reason in text
 
 
 # ---- what is refused
@@ -307,72 +374,6 @@ def test_the_end_is_held():
             np.testing.assert_array_equal(a, b)
     np.testing.assert_allclose(end.p, [1.0, 0.0, 1.0], atol=1e-6)
     np.testing.assert_allclose(end.v, 0.0, atol=0.01)
-
-
-# ---- files
-
-
-def written(tmp_path, text):
-    file = tmp_path / "path.csv"
-    file.write_text(text, encoding="utf-8")
-    return file
-
-
-def helix_csv(tmp_path, header):
-    times = np.linspace(2.0, 8.0, 61)
-    rows = [[t, math.cos(t), math.sin(t), 0.2 * t, 0.5 * t] for t in times]
-    text = "\n".join(", ".join(f"{value:.9f}" for value in row) for row in rows)
-    return written(tmp_path, header + text + "\n\n")
-
-
-@pytest.mark.parametrize("header", ["t,x,y,z,yaw\n", "\ufeffTimestamp [s], x [m], y, z, yaw\n", ""])
-def test_helix_from_csv(header, tmp_path):
-    """Through its points, at their times; away from the ends, where it must come to rest, its derivative too."""
-    reference = from_csv(helix_csv(tmp_path, header))
-    for t in (0.0, 1.0, 3.0, 4.4, 6.0):
-        here, s = at_one(reference, t), t + 2.0
-        np.testing.assert_allclose(here.p, [math.cos(s), math.sin(s), 0.2 * s], atol=1e-4)
-        assert float(here.heading) == pytest.approx(0.5 * s, abs=1e-4)
-        if 0.5 < t < 5.5:
-            np.testing.assert_allclose(here.v, [-math.sin(s), math.cos(s), 0.2], atol=5e-3)
-    for t in (0.0, 6.0, 100.0):
-        here = at_one(reference, t)
-        assert float(jnp.linalg.norm(here.v)) < 0.15
-    np.testing.assert_allclose(at_one(reference, 50.0).p, at_one(reference, 6.0).p, atol=0.0)
-
-
-def test_without_yaw_it_heads_along_x(tmp_path):
-    reference = from_csv(written(tmp_path, "t,x,y,z\n0,0,0,1\n2,1,0,1\n4,1,1,2\n"))
-    np.testing.assert_array_equal(reference.rows[:, 10], 0.0)
-    np.testing.assert_allclose(at_one(reference, 2.0).p, [1.0, 0.0, 1.0], atol=1e-4)
-
-
-def test_at_a_held_end_it_asks_for_hover(tmp_path):
-    reference = from_csv(written(tmp_path, "0,0,0,1\n1,1,1,1\n2,2,0,1\n"))
-    np.testing.assert_allclose(at_one(reference, 10.0).u, [9.81, 0.0, 0.0, 0.0], atol=0.05)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("t,x,y,z\n0,0,0,1\n1,one,0,1\n", r"line 3: '1,one,0,1' is not t, x, y, z\[, yaw\] in numbers"),
-        ("0,0,0,1\nt,x,y,z\n", "line 2: 't,x,y,z' is not"),
-        ("0,0,0\n1,0,0\n", "line 1: '0,0,0' is not"),
-        ("0,0,0,1,0,0\n", "line 1: '0,0,0,1,0,0' is not"),
-        ("0,0,0,1\n1,0,0,1,0\n", "line 2: '1,0,0,1,0' is not"),
-        ("0,0,0,1\n\n1,0,0,1\n1,0,0,2\n", r"line 4: time 1\.0 s does not come after 1\.0 s"),
-        ("0,0,0,1\n2,0,0,1\n1,0,0,2\n", r"line 3: time 1\.0 s does not come after 2\.0 s"),
-        ("t,x,y,z\n0,0,0,1\n", "1 points; a trajectory needs at least two"),
-        ("", "0 points"),
-        ("0,0,0,1\n1,nan,0,1\n", r"line 2: '1,nan,0,1' is not .* finite"),
-        ("0,0,0,1\ninf,0,0,1\n", "line 2: .*finite"),
-        ("0,0,0,1\n1,0,,1\n", "line 2: '1,0,,1' is not"),
-    ],
-)
-def test_faults_of_a_file_are_named_with_their_line(text, message, tmp_path):
-    with pytest.raises(ValueError, match=message) as error:
-        from_csv(written(tmp_path, text))
-    assert "path.csv" in str(error.value)
 
 
 # ---- families

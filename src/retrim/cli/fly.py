@@ -57,8 +57,8 @@ def fly(
         adapt: full: re-train all weights in flight; lora: a low-rank delta (ranks 4, 10, 1); base-i: integral action;
             base-do: a disturbance observer; none: fly as it is; or module:name. The policy flies as it is, too.
         reference: What a tracking policy follows: circle, figure8, star, module:name or a CSV file of t, x, y, z[,
-            yaw]; what it was trained on by default. A closed file repeats as laps, another is flown once; my.csv:laps
-            and my.csv:once insist. Another reference than that of training needs a policy that sees it.
+            yaw]; what it was trained on by default. A closed file repeats as laps, another is flown once;
+            my.csv:laps and my.csv:once insist. Another reference than that of training needs a policy that sees it.
         vehicle: Vehicle that the plant simulates: small, large, kingfisher, a vehicle file or module:name; that which
             the policy was trained for by default. rotorpy and crazyflow fly their own.
         sensors: What the policy is shown of the state: ideal, mocap (0.3 mm, 3 mm/s, 1 mrad), rough (1 mm, 10 mm/s,

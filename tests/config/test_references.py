@@ -1,0 +1,95 @@
+"""References by name: files with how they are flown, families, and what is refused."""
+
+import math
+
+import numpy as np
+import pytest
+
+from retrim.config.loading import load
+from retrim.config.scenario import Scenario
+from retrim.config.setup import Setup
+from retrim.config.tasks import REFERENCES, make_reference
+from retrim.errors import ConfigError
+from retrim.physics import large, small
+from retrim.tasks import Reference
+from retrim.tasks.shapes import circle
+
+
+@pytest.fixture
+def lap(tmp_path):
+    """A closed file of one round."""
+    file = tmp_path / "lap.csv"
+    angles = np.linspace(0.0, 2.0 * math.pi, 101)
+    file.write_text("\n".join(f"{a / 2.0},{math.sin(a)},{math.cos(a)},1" for a in angles))
+    return file
+
+
+def repeats(reference):
+    return float(reference.lap[0]) < float(reference.lap[1])
+
+
+def test_a_file_is_flown_as_its_name_says(lap):
+    assert repeats(make_reference(str(lap)))
+    assert repeats(make_reference(f"{lap}:laps"))
+    assert not repeats(make_reference(f"{lap}:once"))
+
+
+def test_an_open_file_is_no_lap(tmp_path):
+    file = tmp_path / "Open.CSV"
+    file.write_text("0,0,0,1\n2,1,0,1\n4,2,0,1\n6,3,0,1\n")
+    assert not repeats(make_reference(str(file)))
+    with pytest.raises(ConfigError, match=r"Open\.CSV: its last point is 3\.000 m from its first"):
+        make_reference(f"{file}:laps")
+
+
+def test_a_file_in_a_family(lap):
+    family = make_reference(f"circle+{lap}:once")
+    assert family.joins.shape == (2, 2)
+    assert not repeats(family)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("{}:twice", "'twice' is not 'laps' or 'once'"),
+        ("{}x.csv", r"x\.csv: No such file"),
+        ("{}x.csv:once", r"x\.csv: No such file"),
+        ("circel", "no reference 'circel'; .*circle.* or a CSV file"),
+        ("math:cos", "reference math:cos: "),
+        ("math:pi", "reference math:pi: .*not callable"),
+        ("builtins:dict", "is a dict, not a function that gives a Reference"),
+    ],
+)
+def test_what_is_refused(name, message, lap):
+    with pytest.raises(ConfigError, match=message):
+        make_reference(name.format(lap))
+
+
+def test_every_registered_name_makes_a_reference():
+    for name in REFERENCES:
+        assert isinstance(make_reference(name), Reference)
+
+
+# ---- what a flight of them needs
+
+
+def test_a_flight_lasts_as_long_as_a_reference_that_ends(lap):
+    """Its last seconds are what is scored: a flight of 60 s would be scored while it hovers."""
+    preset = load("track/preview")
+    assert Setup.of(preset, str(lap)).flown.flight_seconds == 60.0
+    assert Setup.of(preset, f"{lap}:once").flown.flight_seconds == pytest.approx(math.pi, abs=1e-3)
+    assert Setup.of(preset, "circle").flown.flight_seconds == 60.0
+    assert Setup.of(preset).flown.flight_seconds == 60.0
+
+
+def test_limits_are_those_of_the_vehicle_that_flies():
+    """A circle whose rates the large vehicle has (10 rad/s), and the small one, of training, has not (6 rad/s)."""
+    preset = load("track/preview")
+    hasty = circle(radius=3.0, period=1.4)
+    assert hasty.infeasibility(small()) != hasty.infeasibility(large())
+    setup = Setup.of(preset, hasty)
+    for vehicle in (None, "small", "large"):
+        flies = Scenario(vehicle=vehicle).make_vehicle(preset.vehicle)
+        assert setup.limits_exceeded(flies) == hasty.infeasibility({"large": large()}.get(vehicle, small()))
+    assert setup.limits_exceeded() == hasty.infeasibility(small())
+    assert Setup.of(load("hover/fast")).limits_exceeded() is None
