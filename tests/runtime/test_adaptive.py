@@ -1,0 +1,384 @@
+"""The adaptive loop: any learner's updates in order, and the virtual clock that charges compute to flight."""
+
+import dataclasses
+import types
+from collections import deque
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import random
+
+from helpers import tiny_preset
+from retrim.adapt import OnlineLearner, PolicyUpdate, Rejection, ResidualUpdate, ResidualWorker, Skip, judge
+from retrim.config import Scenario, Setup, changed
+from retrim.learn import PolicyState
+from retrim.physics import Command
+from retrim.plants import Plant
+from retrim.runtime import AdaptivePilot, Learner, LockstepLearner, Scheduled, fly, lockstep
+
+pytestmark = pytest.mark.usefixtures("optax_promotion")
+
+BRISK = {"fit_every": 0.6, "update_every": 1.0, "fit_latency": 0.1, "update_latency": 0.3}
+
+
+@pytest.fixture(scope="module")
+def trained():
+    """A set-up, a policy that hovers, and a fresh one."""
+    with jax.numpy_dtype_promotion("standard"):
+        setup = Setup.of(tiny_preset(adapt=BRISK))
+        return setup, setup.pretrained(1), setup.new_policy(random.key(0))
+
+
+def rescheduled(setup, **adapt):
+    return dataclasses.replace(setup, preset=changed(setup.preset, adapt=adapt))
+
+
+class Odd(Plant):
+    """The simple plant with another clock, with commands limited, or with three ticks for one at ``stalls``."""
+
+    def __init__(self, disturbance="large", *, clock=0.0, limit=None, stalls=(), sensors="ideal"):
+        self._inner = Scenario(disturbance, "simple", sensors=sensors).make()
+        self._clock, self._limit, self._stalls, self._steps = clock, limit, stalls, 0
+        self.dt = self._inner.dt
+
+    def reset(self, x0):
+        self._steps = 0
+        return self._shown(self._inner.reset(x0))
+
+    def step(self, u):
+        u = u if self._limit is None else self._limit(u)
+        for _ in range(3 if self._steps in self._stalls else 1):
+            measurement, _ = self._inner.step(u)
+        self._steps += 1
+        return self._shown(measurement), u
+
+    def stop(self):
+        self._inner.stop()
+
+    def _shown(self, measurement):
+        return measurement._replace(t=self._clock + measurement.t)
+
+
+def flight(setup, policy, seconds, plant=None, **options):
+    pilot = setup.adaptive_pilot(policy, random.key(3), **options)
+    log = fly(plant or Odd(), pilot, setup.flight_starts(1)[0], ticks=round(seconds / setup.preset.dt))
+    return log, pilot
+
+
+def plain_flight(setup, policy, seconds):
+    return fly(Odd(), setup.pilot(policy), setup.flight_starts(1)[0], ticks=round(seconds / setup.preset.dt))
+
+
+def times(log, *kinds):
+    return [event.t for event in log.events if event.kind in kinds]
+
+
+# ---- any learner
+
+
+class QueueLearner(Learner):
+    """Answers from a queue, as one in another process would: the test says what becomes visible when."""
+
+    def __init__(self, answers=()):
+        self._answers = deque(answers)  # (tick, update)
+        self.submitted, self.received, self.resets = [], [], 0
+
+    def submit(self, window, tick):
+        self.submitted.append((tick, window))
+
+    def poll(self, tick):
+        found = []
+        while self._answers and self._answers[0][0] <= tick:
+            found.append(self._answers.popleft()[1])
+        return found
+
+    def receive(self, update):
+        self.received.append(update)
+
+    def reset(self):
+        self.resets += 1
+
+
+def queued(setup, policy, *learners, every_s=0.1, window=12):
+    state = setup.learner.init(policy, random.key(2))
+    scheduled = tuple(Scheduled(learner, every_s) for learner in learners)
+    return AdaptivePilot(setup.flown.observation_in_flight, state, scheduled, dt=setup.preset.dt, window=window)
+
+
+def biased(state, by):
+    """The same policy with another output."""
+    return eqx.tree_at(lambda s: s.policy.layers[-1].bias, state, state.policy.layers[-1].bias + by)
+
+
+def test_updates_of_any_learner_are_applied_in_order_and_told_to_all(trained):
+    setup, policy, _ = trained
+    state = setup.learner.init(policy, random.key(2))
+    fitted = jax.tree.map(lambda leaf: leaf + 1, state.residual)
+    first, second = biased(state.policy, 0.1), biased(state.policy, 0.2)
+    updates = [
+        ResidualUpdate(0.1, 0.3, fitted),
+        PolicyUpdate(0.1, 0.1, 0.2, first),
+        Rejection(0.1, "residual", "why not"),
+        PolicyUpdate(0.1, 0.1, 0.2, second),
+        Skip(0.3, "policy"),
+    ]
+    one = QueueLearner([(8, updates[0]), (8, updates[1]), (8, updates[2]), (15, updates[4])])
+    other = QueueLearner([(8, updates[3])])
+    pilot = queued(setup, policy, one, other)
+    log = fly(Odd(), pilot, setup.flight_starts(1)[0], ticks=20)
+    assert [id(u) for u in one.received] == [id(u) for u in updates]
+    assert [id(u) for u in other.received] == [id(u) for u in updates]
+    assert [e.kind for e in log.events] == ["residual", "policy", "rejected", "policy", "skipped"]
+    np.testing.assert_allclose([e.t for e in log.events], [0.16, 0.16, 0.16, 0.16, 0.3])
+    assert pilot.state.policy is second
+    assert pilot.state.residual is fitted
+    # What is published at a tick flies from that tick on.
+    plain = plain_flight(setup, policy, 0.4)
+    np.testing.assert_array_equal(log.u[:9], plain.u[:9])
+    assert not np.array_equal(log.u[9], plain.u[9])
+    controller = setup.pilot(second.policy)
+    with Odd() as plant:
+        measurement = plant.reset(setup.flight_starts(1)[0])
+        controller.reset(measurement)
+        for k in range(9):
+            u = controller.act(measurement)
+            if k < 8:
+                controller.accepted(Command.of(jnp.asarray(log.u[k + 1])))
+                measurement, _ = plant.step(Command.of(jnp.asarray(log.u[k + 1])))
+    np.testing.assert_allclose(u.vector(), log.u[9], rtol=1e-12)
+
+
+def test_learners_are_offered_windows_on_schedule_and_reset_at_each_flight(trained):
+    setup, policy, _ = trained
+    one, other = QueueLearner(), QueueLearner()
+    pilot = queued(setup, policy, one, other)
+    for flights in (1, 2):
+        log = fly(Odd(clock=37.0 * flights), pilot, setup.flight_starts(1)[0], ticks=18)
+        assert (one.resets, other.resets) == (flights, flights)
+        assert [tick for tick, _ in one.submitted] == [5, 10, 15] * flights
+        tick, window = one.submitted[-2]
+        assert int(window.valid.sum()) == tick + 1  # nothing of an earlier flight
+        np.testing.assert_allclose(window.t[np.asarray(window.valid)], 0.02 * np.arange(11), atol=1e-9)
+        tick, window = other.submitted[-1]
+        kept = log.window(12, end=16)
+        for a, b in zip(jax.tree.leaves(window), jax.tree.leaves(kept), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)
+
+
+def test_an_answer_at_once_is_published_in_the_same_tick(trained):
+    """As a skip is."""
+    setup, policy, _ = trained
+
+    class Busy(QueueLearner):
+        def submit(self, window, tick):
+            super().submit(window, tick)
+            self._answers.append((tick, Skip(float(window.t[-1]), "policy")))
+
+    log = fly(Odd(), queued(setup, policy, Busy()), setup.flight_starts(1)[0], ticks=12)
+    np.testing.assert_allclose(times(log, "skipped"), [0.1, 0.2])
+
+
+def test_without_learners_it_flies_the_policy(trained):
+    setup, policy, _ = trained
+    log = fly(Odd(), queued(setup, policy), setup.flight_starts(1)[0], ticks=20)
+    np.testing.assert_array_equal(log.u, plain_flight(setup, policy, 0.4).u)
+    assert log.events == ()
+
+
+def test_windows_are_of_measured_states_and_accepted_commands(trained):
+    """What a learner saw is what the log's window says, with noisy sensors and a plant that limits commands."""
+    setup, policy, _ = trained
+    learner = QueueLearner()
+    limit = lambda u: Command(jnp.clip(u.c, 9.6, 9.9), jnp.clip(u.omega, -0.05, 0.05))  # noqa: E731
+    plant = Odd(limit=limit, sensors="rough")
+    log = fly(plant, queued(setup, policy, learner), setup.flight_starts(1)[0], ticks=16)
+    tick, window = learner.submitted[-1]
+    kept = log.window(12, end=tick + 1)
+    np.testing.assert_array_equal(window.x.p, kept.x.p)
+    np.testing.assert_array_equal(window.x.v, log.measured.v[4:16])
+    assert not np.allclose(window.x.p, log.p[4:16], atol=1e-6)
+    # The last command was issued, but not accepted yet; no fit uses it.
+    np.testing.assert_array_equal(window.u.c[:-1], kept.u.c[:-1])
+    np.testing.assert_array_equal(window.u.omega[:-1], log.u[5:16, 1:])
+    assert float(window.u.c.max()) <= 9.9 or float(window.u.c[-1]) > 9.9
+
+
+# ---- on the virtual clock
+
+
+def test_lockstep_repeats_bit_for_bit(trained):
+    setup, policy, _ = trained
+    first, one = flight(setup, policy, 3.2)
+    second, two = flight(setup, policy, 3.2)
+    for name in ("t", "u"):
+        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
+    jax.tree.map(np.testing.assert_array_equal, (first.true, first.measured), (second.true, second.measured))
+    assert first.events == second.events == tuple(one.events)
+    assert {"residual"} < {e.kind for e in first.events}
+    jax.tree.map(np.testing.assert_array_equal, one.state, two.state)
+
+
+def test_results_appear_only_after_their_latency(trained):
+    """Residuals are due every 0.6 s and take 0.1 s; policies every 1 s and take 0.3 s."""
+    setup, policy, _ = trained
+    log, _ = flight(setup, policy, 3.0)
+    np.testing.assert_allclose(times(log, "residual"), [0.7, 1.3, 1.9, 2.5], atol=1e-9)
+    np.testing.assert_allclose(times(log, "policy", "rejected"), [1.3, 2.3], atol=1e-9)
+
+
+def test_commands_are_the_old_policys_until_the_swap(trained):
+    """The flight equals an unadapted one up to the tick at which the first policy appears, and differs after it."""
+    setup, policy, _ = trained
+    log, _ = flight(setup, policy, 2.4)
+    plain = plain_flight(setup, policy, 2.4)
+    swap = round(times(log, "policy")[0] / 0.02)
+    np.testing.assert_array_equal(log.u[: swap + 1], plain.u[: swap + 1])
+    assert not np.array_equal(log.u[swap + 1], plain.u[swap + 1])
+
+
+def test_a_clock_that_starts_anywhere_gives_the_same_flight(trained):
+    setup, policy, _ = trained
+    here, _ = flight(setup, policy, 2.4)
+    there, _ = flight(setup, policy, 2.4, Odd(clock=1.7e9))
+    assert there.t[0] == 0.0
+    np.testing.assert_allclose(there.t, here.t, atol=1e-6)
+    np.testing.assert_array_equal(there.u, here.u)
+    assert [(e.kind, e.note) for e in there.events] == [(e.kind, e.note) for e in here.events]
+    np.testing.assert_allclose([e.t for e in there.events], [e.t for e in here.events], atol=1e-6)
+    assert len(here.events) >= 4
+
+
+def test_a_busy_learner_is_skipped_not_queued(trained):
+    setup, policy, _ = trained
+    busy = rescheduled(setup, fit_every=10.0, update_every=0.5, update_latency=0.7)
+    log, _ = flight(busy, policy, 2.5)
+    np.testing.assert_allclose(times(log, "skipped"), [1.0, 2.0])
+
+
+def test_measured_latency_charges_what_the_clock_shows(trained, monkeypatch):
+    """Each reading of the clock is 0.17 s after the last."""
+    setup, policy, _ = trained
+    now = iter(0.17 * np.arange(1000))
+    monkeypatch.setattr(lockstep, "time", types.SimpleNamespace(perf_counter=lambda: float(next(now))))
+    log, _ = flight(setup, policy, 1.5, latency="measured")
+    np.testing.assert_allclose(times(log, "residual"), [0.78, 1.38])
+    np.testing.assert_allclose(times(log, "policy", "rejected"), [1.18])
+
+
+def test_one_trace_over_many_cycles(trained):
+    """New weights, optimiser states, windows and keys never compile again."""
+    setup, policy, _ = trained
+    traces, task = [], setup.env.task
+
+    class Counting(type(task)):
+        def reward(self, t, x, u):
+            traces.append(1)
+            return super().reward(t, x, u)
+
+    counting = Counting(**{f.name: getattr(task, f.name) for f in dataclasses.fields(task)})
+    learner = eqx.tree_at(lambda l: l.env.task, setup.learner, counting)
+    pilot = dataclasses.replace(setup, learner=learner).adaptive_pilot(policy, random.key(3))
+    fly(Odd(), pilot, setup.flight_starts(1)[0], ticks=60)
+    compiled = len(traces)
+    assert compiled > 0
+    log = fly(Odd(), pilot, setup.flight_starts(1)[0], ticks=250)
+    assert len(times(log, "policy", "rejected")) >= 4
+    assert len(traces) == compiled
+
+
+def test_adaptation_cuts_the_error_under_the_large_disturbance():
+    """The whole loop, at reduced size: after three updates at least three times closer than the base policy."""
+    preset = changed(
+        tiny_preset(),
+        pretrain={"hidden_sizes": (64, 64), "num_updates": 120, "num_envs": 16, "horizon": 100},
+        adapt={"update_every": 2.0, "fit_every": 1.0, "learning_rate": 3e-3, "num_updates": 30, "num_envs": 10}
+        | {"fit_steps": 100},
+    )
+    setup = Setup.of(preset)
+    policy = setup.pretrained(0)
+    base = plain_flight(setup, policy, 10.0)
+    adapted, _ = flight(setup, policy, 10.0)
+    before, after = (np.linalg.norm(log.p[-50:] - preset.goal, axis=1).mean() for log in (base, adapted))
+    assert after < before / 3
+
+
+def broken_update(self, state, residual, window, key):
+    """An update that went wrong."""
+    bad = eqx.tree_at(lambda p: p.layers[0].bias, state.policy, jnp.full_like(state.policy.layers[0].bias, jnp.nan))
+    x0 = jax.vmap(self.env.task.reset)(random.split(key, 2))
+    return PolicyState(bad, state.optimiser), judge(bad, state.policy, self.env, x0)
+
+
+def test_a_refused_policy_is_logged_and_never_flies(trained, monkeypatch):
+    setup, policy, _ = trained
+    monkeypatch.setattr(OnlineLearner, "update_policy", broken_update)
+    log, pilot = flight(setup, policy, 3.0)
+    np.testing.assert_array_equal(log.u, plain_flight(setup, policy, 3.0).u)
+    refused = [e for e in log.events if e.kind == "rejected"]
+    np.testing.assert_allclose([e.t for e in refused], [1.3, 2.3])
+    assert {e.note for e in refused} == {"a weight is not finite"}
+    jax.tree.map(np.testing.assert_array_equal, pilot.state.policy.policy, policy)
+
+
+def test_a_second_flight_keeps_what_was_learnt_and_forgets_what_was_seen(trained):
+    setup, policy, _ = trained
+    log, pilot = flight(setup, policy, 1.5)
+    learnt = pilot.state
+    assert times(log, "policy", "residual")
+    again = fly(Odd(), pilot, setup.flight_starts(1)[0], ticks=10)
+    assert again.events == ()
+    jax.tree.map(np.testing.assert_array_equal, pilot.state, learnt)
+    # It flies what it has learnt from the first tick on.
+    fresh = fly(Odd(), setup.pilot(learnt.policy.policy), setup.flight_starts(1)[0], ticks=10)
+    np.testing.assert_array_equal(again.u, fresh.u)
+
+
+def test_a_flight_goes_on_from_what_another_learnt(trained):
+    setup, policy, _ = trained
+    _, pilot = flight(setup, policy, 1.5)
+    resumed = setup.adaptive_pilot(policy, random.key(3), state=pilot.state)
+    jax.tree.map(np.testing.assert_array_equal, resumed.state, pilot.state)
+    log = fly(Odd(), resumed, setup.flight_starts(1)[0], ticks=10)
+    fresh = fly(Odd(), setup.pilot(pilot.state.policy.policy), setup.flight_starts(1)[0], ticks=10)
+    np.testing.assert_array_equal(log.u, fresh.u)
+
+
+class Recorded(ResidualWorker):
+    """A residual worker that keeps its updates."""
+
+    def __init__(self, *args):
+        super().__init__(*args)
+        self.updates = []
+
+    def learn(self, window):
+        self.updates.append(super().learn(window))
+        return self.updates[-1]
+
+
+def test_missed_ticks_keep_the_schedule_and_do_not_poison_the_fit(trained):
+    """The clock jumps by three ticks at every ninth step; the plant is pushed by 2 m/s^2 per axis all the same."""
+    setup, policy, _ = trained
+
+    def fits(stalls):
+        state = setup.learner.init(policy, random.key(2))
+        worker = Recorded(setup.learner, state)
+        learner = LockstepLearner(worker, 0.1, 0.02)
+        observation = setup.flown.observation_in_flight
+        pilot = AdaptivePilot(observation, state, [Scheduled(learner, 0.6)], dt=0.02, window=100)
+        log = fly(Odd(stalls=stalls), pilot, setup.flight_starts(1)[0], ticks=160)
+        assert log.missed_ticks == 2 * sum(s < len(log.t) - 1 for s in stalls)
+        return log, [update.rms_error for update in worker.updates]
+
+    smooth, undisturbed = fits(())
+    rough, errors = fits(tuple(range(4, 160, 9)))
+    assert smooth.missed_ticks == 0
+    assert rough.missed_ticks > 20
+    assert rough.t[-1] == pytest.approx(3.2, abs=0.05)
+    due = 0.6 * np.arange(1, 6)
+    assert len(times(rough, "residual")) == len(times(smooth, "residual")) == 5
+    late = np.array(times(rough, "residual")) - due
+    assert np.all((late > 0.099) & (late < 0.1 + 0.1))  # the first tick that was there, after the latency
+    assert max(errors[1:]) < 2.0 * max(undisturbed[1:])
