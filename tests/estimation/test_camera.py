@@ -1,0 +1,90 @@
+"""The camera: the double-sphere model by hand, its inverse, its borders; where it looks."""
+
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import random
+
+from helpers import replaced
+from retrim.estimation import Camera
+from retrim.estimation.camera import in_camera
+from retrim.physics import State, so3
+
+
+@pytest.fixture(scope="module")
+def camera():
+    return Camera.published()
+
+
+project = eqx.filter_jit(lambda camera, P: jax.vmap(camera.project)(P))
+
+
+def test_centre_and_neighbourhood_by_hand(camera):
+    """On the axis: the principal point. Close to it a pinhole with focal length f / (1 + xi), for d1 = d2 = z."""
+    found = project(camera, jnp.array([[0.0, 0.0, 2.0], [0.002, 0.0, 2.0], [0.0, -0.002, 2.0]]))
+    centre = 2.0 * np.array([632.1317557 / 1280.0, 388.2472267 / 720.0]) - 1.0
+    np.testing.assert_allclose(found.pixel[0], centre, atol=1e-9)
+    xi, f = -0.0074411489, (599.87676297, 449.29110372)
+    slope = 1.0 / (0.6138265280850498 * (1.0 + xi) + (1.0 - 0.6138265280850498) * (1.0 + xi))
+    np.testing.assert_allclose(found.pixel[1] - centre, [2.0 * f[0] * 1e-3 * slope / 1280.0, 0.0], atol=1e-8)
+    np.testing.assert_allclose(found.pixel[2] - centre, [0.0, -2.0 * f[1] * 1e-3 * slope / 720.0], atol=1e-8)
+
+
+def test_looks_down_with_x_to_the_right():
+    """Camera x is body -y, camera y is body -x: what is ahead is up in the image, what is left is left."""
+    x = State.at(jnp.array([0.0, 0.0, 3.0]))
+    points = in_camera(x, jnp.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 0.0]]))
+    np.testing.assert_allclose(points, [[0.0, -1.0, 3.0], [-1.0, 0.0, 3.0], [0.0, 0.0, 3.0]], atol=1e-12)
+    turned = in_camera(replaced(x, R=so3.rotz(jnp.array(0.5 * math.pi))), jnp.array([[0.0, 1.0, 0.0]]))
+    np.testing.assert_allclose(turned, [[0.0, -1.0, 3.0]], atol=1e-12)
+
+
+def test_bearing_is_the_inverse_of_project(camera):
+    pixels = random.uniform(random.key(1), (200, 2), minval=-1.0, maxval=1.0)
+    rays = eqx.filter_jit(lambda c, m: jax.vmap(c.bearing)(m))(camera, pixels)
+    np.testing.assert_allclose(jnp.linalg.norm(rays, axis=1), 1.0, atol=1e-9)
+    far = 0.3 + 5.0 * random.uniform(random.key(2), (200, 1))
+    found = project(camera, rays * far)
+    np.testing.assert_allclose(found.pixel, pixels, atol=1e-8)
+    assert found.visible.all()
+
+
+def test_about_120_degrees_across(camera):
+    ends = jax.vmap(camera.bearing)(jnp.array([[-1.0, 0.0], [1.0, 0.0]]))
+    assert math.degrees(math.acos(float(jnp.sum(ends[0] * ends[1])))) == pytest.approx(120.0, abs=5.0)
+
+
+ODD = [
+    [0.0, 0.0, -1.0], [1e-3, 0.0, -2.0], [3.0, 0.0, 0.0], [0.0, -4.0, 1e-9], [5.0, 5.0, 0.01], [1.0, 1.0, -1.0],
+    [0.0, 0.0, 0.0], [0.0, 0.0, 1e-12], [1e6, 0.0, 1.0],
+]  # fmt: skip
+
+
+def test_finite_and_unseen_far_off_axis_and_behind(camera):
+    points = jnp.array(ODD)
+    found = project(camera, points)
+    slopes = eqx.filter_jit(lambda c, P: jax.vmap(jax.jacobian(lambda q: c.project(q).pixel))(P))(camera, points)
+    assert np.isfinite(found.pixel).all()
+    assert np.isfinite(slopes).all()
+    assert not found.visible[:6].any()
+    assert not found.visible[8]
+
+
+def test_the_border_decides(camera):
+    """Just inside is seen, just outside is not; values and gradients are finite on the border itself."""
+    for axis in (0, 1):
+        for side in (-1.0, 1.0):
+            rays = jnp.stack([camera.bearing(jnp.zeros(2).at[axis].set(side * s)) for s in (0.999, 1.0, 1.001)])
+            found = project(camera, rays)
+            assert bool(found.visible[0])
+            assert not bool(found.visible[2])
+            assert np.isfinite(jax.jacobian(lambda q: camera.project(q).pixel)(rays[1])).all()
+
+
+def test_the_projection_does_not_depend_on_distance(camera, key):
+    rays = random.normal(key, (20, 3)).at[:, 2].set(1.0)
+    np.testing.assert_allclose(project(camera, 7.0 * rays).pixel, project(camera, rays).pixel, atol=1e-9)

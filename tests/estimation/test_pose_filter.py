@@ -1,0 +1,122 @@
+"""The pose filter: it converges, predicts while nothing is seen, and is never thrown by one stray point."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax, random
+
+from helpers import GOAL, random_command, stacked
+from retrim.estimation import Camera, PoseFilter
+from retrim.estimation.camera import in_camera
+from retrim.physics import Command, PointMass, State, so3
+from retrim.tasks.keypoints import PATTERN
+
+DT = 0.02
+CAMERA = Camera.published()
+GROUND = jnp.concatenate([jnp.array(PATTERN), jnp.zeros((7, 1))], axis=1)
+
+
+@jax.jit
+def pixels_at(x):
+    return jax.vmap(CAMERA.project)(in_camera(x, GROUND)).pixel
+
+
+@eqx.filter_jit
+def tracked(estimate, x, us, visible):
+    """The filter beside a point mass; ``visible`` (ticks x 7) says what it is shown."""
+    noise = 2.0 * 0.5 / CAMERA.size
+
+    def tick(carry, step):
+        estimate, x = carry
+        u, seen = step
+        x = PointMass(DT).step(x, u, jnp.zeros(3))
+        estimate = estimate.predicted(u, DT).corrected(CAMERA, GROUND, pixels_at(x), seen, noise)
+        gap = estimate.x.p - x.p, so3.log(x.R.T @ estimate.x.R), estimate.x.v - x.v
+        return (estimate, x), (jnp.stack([jnp.sqrt(jnp.sum(g**2)) for g in gap]), estimate.P)
+
+    (estimate, x), (gaps, covariances) = lax.scan(tick, (estimate, x), (us, visible))
+    return estimate, x, gaps, covariances
+
+
+@eqx.filter_jit
+def corrected(estimate, pixels, visible):
+    return estimate.corrected(CAMERA, GROUND, pixels, visible, 1.0 / CAMERA.size)
+
+
+def hovering(n):
+    return [Command.hover()] * n
+
+
+def gentle(key, n):
+    return [Command(9.81 + 0.5 * random.normal(k, ()), 0.3 * random.normal(k, (3,))) for k in random.split(key, n)]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_converges_from_its_hand_over(seed):
+    x = State.at(jnp.array(GOAL))
+    start = PoseFilter.near(x, random.key(seed))
+    assert float(jnp.linalg.norm(start.x.p - x.p)) > 0.01
+    _, _, gaps, _ = tracked(start, x, stacked(hovering(40)), jnp.ones((40, 7), dtype=bool))
+    assert float(gaps[15:, 0].max()) < 2e-3  # m
+    assert float(gaps[15:, 1].max()) < 2e-3  # rad
+    assert float(gaps[25:, 2].max()) < 0.02  # m/s
+
+
+def test_hand_over_is_as_uncertain_as_it_says():
+    x = State.at(jnp.array(GOAL))
+    starts = jax.jit(jax.vmap(lambda k: PoseFilter.near(x, k)))(random.split(random.key(8), 2000))
+    np.testing.assert_allclose((starts.x.p - x.p[None]).std(axis=0), 0.1, rtol=0.08)
+    np.testing.assert_allclose(jax.vmap(so3.log)(starts.x.R).std(axis=0), 0.05, rtol=0.08)
+    np.testing.assert_allclose(starts.x.v.std(axis=0), 0.2, rtol=0.08)
+    np.testing.assert_allclose(np.diag(starts.P[0]), np.repeat([0.01, 0.0025, 0.04], 3))
+
+
+def test_predicts_through_the_dark(key):
+    """15 ticks without any point, under commands that it knows: the error stays, the doubt grows."""
+    us = stacked(hovering(25) + [random_command(k) for k in random.split(key, 15)])
+    dark = jnp.arange(40)[:, None] < jnp.full((1, 7), 25)
+    x0 = State.at(jnp.array(GOAL))
+    _, x, gaps, P = tracked(PoseFilter.near(x0, key), x0, us, dark)
+    assert float(jnp.linalg.norm(x.v)) > 0.1  # it has moved
+    assert float(gaps[-1, 0]) < 5e-3
+    assert float(gaps[-1, 1]) < 5e-3
+    doubt = jnp.trace(P[:, :3, :3], axis1=1, axis2=2)
+    assert (np.diff(doubt[24:]) > 0.0).all()
+    assert float(doubt[-1]) > 10.0 * float(doubt[24])
+
+
+def test_one_point_corrects(key):
+    """Of whichever point: less doubt than without it; a hidden one changes nothing."""
+    x = State.at(jnp.array(GOAL))
+    estimate = PoseFilter.near(x, key)
+    pixels = pixels_at(x)
+    for i in range(7):
+        after = corrected(estimate, pixels, jnp.arange(7) == i)
+        shrunk = np.linalg.eigvalsh(estimate.P - after.P)
+        assert shrunk.min() > -1e-12
+        assert (shrunk > 1e-4).sum() == 2  # two numbers, two directions
+        assert float(jnp.trace(after.P)) < float(jnp.trace(estimate.P))
+    none = corrected(estimate, pixels, jnp.zeros(7, dtype=bool))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-12), none, estimate)
+
+
+def test_covariance_stays_one(key):
+    """Symmetric and positive, whatever comes into estimate and goes."""
+    kv, ku, ks = random.split(key, 3)
+    us = stacked(gentle(ku, 40))
+    seen = random.uniform(kv, (40, 7)) < 0.3
+    x0 = State.at(jnp.array(GOAL))
+    _, _, gaps, P = tracked(PoseFilter.near(x0, ks), x0, us, seen)
+    np.testing.assert_allclose(P, np.swapaxes(P, 1, 2), atol=1e-15)
+    assert np.linalg.eigvalsh(P).min() > 0.0
+    assert float(gaps[20:, 0].max()) < 0.02
+
+
+def test_a_stray_point_does_not_throw_it(key):
+    x = State.at(jnp.array(GOAL))
+    estimate, *_ = tracked(PoseFilter.near(x, key), x, stacked(hovering(40)), jnp.ones((40, 7), dtype=bool))
+    pixels = pixels_at(x).at[2].set(jnp.array([-0.9, -0.9]))
+    after = corrected(estimate, pixels, jnp.ones(7, dtype=bool))
+    assert float(jnp.linalg.norm(after.x.p - x.p)) < 0.02

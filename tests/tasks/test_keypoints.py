@@ -1,0 +1,334 @@
+"""Keypoints: as published, whitened, out of sight, under the command that acted; learning to see."""
+
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import random
+
+from helpers import GOAL, replaced
+from retrim.control import Policy, PolicyController
+from retrim.learn import Env, rollout
+from retrim.learn.encoder import pretrain_encoder
+from retrim.physics import Command, PointMass, State, small, so3
+from retrim.plants import Measurement
+from retrim.runtime import ControllerPilot
+from retrim.tasks import Hover, Keypoints, Start
+from retrim.tasks.keypoints import FEATURE_LIMIT, random_motion
+
+PUBLISHED = [
+    (-0.427, -0.474), (0.402, -0.474), (0.402, 0.631), (-0.427, 0.631), (-0.012, 0.665), (-0.452, 0.078),
+    (-0.012, -0.508),
+]  # fmt: skip
+
+
+def keypoints(**options):
+    return Keypoints.of(jnp.array(GOAL), small().omega_max, **({"whitened": False} | options))
+
+
+def near():
+    """Sees everything for a while."""
+    return State(jnp.array([0.05, -0.1, 1.1]), jnp.eye(3), jnp.array([0.1, 0.2, -0.05]))
+
+
+@pytest.fixture(scope="module")
+def plain():
+    return keypoints()
+
+
+@pytest.fixture(scope="module")
+def white():
+    return keypoints(whitened=True)
+
+
+def test_published_projections_at_the_goal(plain):
+    pixels, visible = plain.pixels(State.at(jnp.array(GOAL)))
+    np.testing.assert_allclose(pixels, PUBLISHED, atol=6e-4)
+    assert visible.all()
+
+
+# ---- keypoints
+
+
+begin = eqx.filter_jit(lambda o, x: o.init(x))
+step = eqx.filter_jit(lambda x, u: PointMass(0.02).step(x, u, jnp.zeros(3)))
+see = eqx.filter_jit(lambda o, memory, x, last: o(memory, jnp.array(0.0), x, last))
+
+
+def watched(observation, x, us):
+    """Observations of a point mass under the commands ``us``, as a policy would get them; and the last state."""
+    memory, last, shown = begin(observation, x), Command.hover(), []
+    for u in us:
+        o, memory = see(observation, memory, x, last)
+        x, last = step(x, u), u
+        shown.append(np.asarray(o))
+    return np.array(shown), memory, x
+
+
+def gentle(key, n):
+    return [Command(9.81 + 0.5 * random.normal(k, ()), 0.3 * random.normal(k, (3,))) for k in random.split(key, n)]
+
+
+def test_no_silent_broadcast(plain):
+    plain(plain.init(near()), jnp.array(0.0), near(), Command.hover())
+
+
+def test_layout(plain, key):
+    us = gentle(key, 6)
+    shown, _, _ = watched(plain, near(), us)
+    assert shown.shape == (6, plain.size) == (6, 89)
+    assert plain.size == 89
+    pixels, _ = plain.pixels(near())
+    np.testing.assert_allclose(np.clip(shown[0, :14], -5, 5), np.reshape(pixels, 14), atol=1e-9)  # newest first
+    np.testing.assert_allclose(shown[3, 14:28], shown[0, :14], atol=1e-12)  # 60 ms later it is one frame back
+    np.testing.assert_array_equal(shown[:, 70:77], 1.0)
+    issued = [[float(u.c) / 9.81 - 1.0, *(np.asarray(u.omega) / [6.0, 6.0, 4.0])] for u in us[2:5]]
+    np.testing.assert_allclose(shown[5, 77:], np.reshape(issued, 12), atol=1e-12)
+
+
+def test_the_same_start_sees_the_same(key):
+    noisy, us = keypoints(noise=2.0, dropout=0.2), gentle(key, 4)
+    first, again = watched(noisy, near(), us)[0], watched(noisy, near(), us)[0]
+    np.testing.assert_array_equal(first, again)
+    elsewhere = replaced(near(), v=near().v + 0.01)
+    quiet = watched(keypoints(noise=0.0), elsewhere, us)[0] - watched(keypoints(noise=0.0), near(), us)[0]
+    assert not np.allclose(watched(noisy, elsewhere, us)[0] - first, quiet, atol=1e-4)  # other noise
+
+
+def test_without_noise_it_shows_the_projection_and_with_noise_its_deviation(plain):
+    """In pixels: of 1280 and 720 across an image that is 2 wide and high."""
+    exact = np.asarray(plain.pixels(near())[0])
+    noisy = keypoints(noise=3.0, occlusion=False)
+    starts = jax.vmap(lambda k: State(near().p, near().R, 0.1 * random.normal(k, (3,))))(
+        random.split(random.key(4), 600)
+    )
+
+    @eqx.filter_jit
+    def first(o, xs):
+        return jax.vmap(lambda x: o(o.init(x), jnp.array(0.0), x, Command.hover())[0][:14])(xs)
+
+    np.testing.assert_allclose(first(keypoints(occlusion=False), starts)[0].reshape(7, 2), exact, atol=1e-12)
+    off = (np.asarray(first(noisy, starts)).reshape(-1, 7, 2) - exact) * np.array([640.0, 360.0])
+    np.testing.assert_allclose(off.reshape(-1, 2).std(axis=0), 3.0, rtol=0.05)
+    np.testing.assert_allclose(off.reshape(-1, 2).mean(axis=0), 0.0, atol=0.15)
+
+
+@pytest.mark.parametrize("noise", [0.0, 1.0])
+def test_occlusion_costs_nothing_while_everything_is_seen(noise, key):
+    us = gentle(key, 8)
+    every, occluded = (watched(keypoints(noise=noise, occlusion=o), near(), us)[0] for o in (False, True))
+    np.testing.assert_array_equal(occluded[:, 70:77], 1.0)
+    np.testing.assert_allclose(occluded, every, atol=1e-12)
+
+
+def test_what_is_out_of_sight_is_not_observed(plain):
+    """Its flag is down, and what is shown is the filter's, not the truth; without occlusion it is the truth."""
+    aside = State(jnp.array([0.9, 0.0, 1.0]), jnp.eye(3), jnp.zeros(3))
+    pixels, visible = (np.asarray(a) for a in plain.pixels(aside))
+    assert 0 < visible.sum() < 7
+    (o,), _, _ = watched(plain, aside, [Command.hover()])
+    np.testing.assert_array_equal(o[70:77], visible)
+    wrong = np.abs(o[:14].reshape(7, 2) - pixels).max(axis=1)
+    np.testing.assert_allclose(wrong[visible], 0.0, atol=1e-12)
+    assert (wrong[~visible] > 1e-6).all()
+    (o,), _, _ = watched(keypoints(occlusion=False), aside, [Command.hover()])
+    np.testing.assert_allclose(o[:14].reshape(7, 2), pixels, atol=1e-12)
+
+
+@pytest.mark.parametrize("place", [(0.05, -0.1, 1.1), (0.9, 0.0, 1.0), (4.0, 0.0, 0.3)])
+@pytest.mark.parametrize("occlusion", [True, False])
+def test_gradient_of_the_observation_is_finite(place, occlusion, white):
+    observation = replaced(white, occlusion=occlusion)
+    x = State(jnp.array(place), so3.exp(jnp.array([0.1, 0.5, 0.0])), jnp.array([0.3, 0.0, 0.0]))
+
+    @eqx.filter_jit
+    def slope(o, x):
+        memory = o.init(x)
+        return jax.jacobian(lambda x: o(memory, jnp.array(0.0), x, Command.hover())[0])(x)
+
+    leaves = jax.tree.leaves(slope(observation, x))
+    assert all(np.isfinite(leaf).all() for leaf in leaves)
+    if place[0] < 1.0:
+        assert float(jnp.abs(leaves[0]).max()) > 0.01
+
+
+def test_history_is_a_steady_motion(plain):
+    """Position by velocity, attitude by body rates, step by step, oldest first."""
+    omega, x = jnp.array([0.5, -0.3, 0.8]), near()
+    frames = []
+    for _ in range(13):
+        frames.append(np.asarray(plain.pixels(x)[0]).reshape(14))
+        last = x
+        x = State(x.p + 0.02 * x.v, x.R @ so3.exp(0.02 * omega), x.v)
+    np.testing.assert_allclose(plain.history(last, omega), frames, atol=1e-10)
+    np.testing.assert_array_equal(plain.stacked(jnp.array(frames)).reshape(5, 14), np.array(frames)[[12, 9, 6, 3, 0]])
+
+
+@pytest.fixture(scope="module")
+def motions(white):
+    """Whitened, before the cut: the motions of the whitening itself, and others."""
+
+    @jax.jit
+    def whitened(key):
+        stack = jax.vmap(lambda k: white.stacked(white.history(*random_motion(k, white.goal))))
+        return (stack(random.split(key, 20000)) - white.mean[None]) @ white.whiten.T
+
+    return np.asarray(whitened(random.key(0))), np.asarray(whitened(random.key(5)))
+
+
+def test_whitening(white, motions):
+    """Symmetric; unit covariance of the motions it was made from, less where a pixel's noise is all there is."""
+    own, other = motions
+    np.testing.assert_allclose(white.whiten, white.whiten.T, atol=1e-10)
+    np.testing.assert_allclose(own.mean(axis=0), 0.0, atol=1e-9)
+    C = own.T @ own / len(own)
+    spectrum = np.linalg.eigvalsh(C)
+    assert spectrum.max() <= 1.0 + 1e-6
+    assert np.median(spectrum) > 0.95
+    assert spectrum.min() > 0.3
+    variance = other.var(axis=0)  # rare frames, with points far outside, weigh much
+    assert 0.8 < np.median(variance) < 1.5
+    np.testing.assert_allclose(other.mean(axis=0), 0.0, atol=0.1)
+
+
+def test_features_of_other_motions_are_white(white, motions):
+    """What a policy is shown of motions that the whitening was not made from: the cut takes what rare frames leave."""
+    own, other = (np.clip(whitened, -FEATURE_LIMIT, FEATURE_LIMIT) for whitened in motions)
+    spectrum = np.linalg.eigvalsh(np.cov(other.T))
+    assert spectrum.max() < 1.5
+    np.testing.assert_allclose(np.sort(spectrum), np.linalg.eigvalsh(np.cov(own.T)), rtol=0.15, atol=0.02)
+    assert np.mean(np.abs(motions[1]) > FEATURE_LIMIT) < 0.01
+
+
+def test_features_are_cut_off(white):
+    wild = 2.5 * random.normal(random.key(3), (13, 14))
+    features = white.features(wild)
+    raw = white.whiten @ (white.stacked(wild) - white.mean)
+    assert float(jnp.abs(raw).max()) > 10.0
+    np.testing.assert_array_equal(features, jnp.clip(raw, -5.0, 5.0))
+
+
+# ---- delay, occlusion, rate
+
+
+def blind(observation, us, delay):
+    """Fly a point mass that hears commands ``delay`` ticks late, for the last half without any visible point.
+
+    Returns the error of the filter's velocity after each tick [m/s].
+    """
+    x, last, errors = State.at(jnp.array(GOAL)), Command.hover(), []
+    memory, acting = begin(observation, x), [Command.hover()] * delay
+    # The filter starts from the truth, so that nothing but its prediction can make an error.
+    memory = memory._replace(pose=replaced(memory.pose, x=x, P=1e-12 * jnp.eye(9)))
+    for u in us:
+        _, memory = see(observation, memory, x, last)
+        errors.append(float(jnp.linalg.norm(memory.pose.x.v - x.v)))
+        acting.append(u)
+        x, last = step(x, acting.pop(0)), u
+    return np.array(errors)
+
+
+@pytest.mark.parametrize("delay", [0, 1, 2, 3])
+def test_the_filter_predicts_under_the_command_that_acted(delay):
+    """No point is ever visible: the declared delay follows the true velocity exactly, any other does not.
+
+    After a step of thrust and roll the wrong command is in force for as many ticks as the delay is off by.
+    """
+    us = [Command.hover()] * 6 + [Command(jnp.array(13.0), jnp.array([1.5, 0.0, 0.0]))] * 6
+    never = keypoints(dropout=1.0)
+    found = {d: blind(replaced(never, delay_ticks=d), us, delay) for d in {max(delay - 1, 0), delay, min(delay + 1, 3)}}
+    assert found[delay].max() < 1e-9
+    for declared, errors in found.items():
+        assert errors[:6].max() < 1e-9  # in hover every delay is the same
+        if declared != delay:
+            assert errors[-1] > 0.05
+
+
+def test_a_wrong_delay_shows_even_while_points_are_seen():
+    """With points in sight the filter is corrected, and still follows a step of commands less well."""
+    us = [Command.hover()] * 6 + [Command(jnp.array(14.0), jnp.zeros(3)), Command(jnp.array(6.0), jnp.zeros(3))] * 5
+    right, wrong = (blind(keypoints(delay_ticks=d), us, delay=1).max() for d in (1, 0))
+    assert right < 1e-3
+    assert wrong > 20.0 * right
+
+
+def test_occluded_hides_what_is_outside_the_image(plain):
+    """The observation of flight, made from that of training: only its flags, its dropout and hidden points differ."""
+    training = keypoints(occlusion=False)
+    flown = training.occluded(0.0)
+    assert (training.occlusion, flown.occlusion) == (False, True)
+    aside = State(jnp.array([0.9, 0.0, 1.0]), jnp.eye(3), jnp.zeros(3))
+    true, visible = (np.asarray(a) for a in plain.pixels(aside))
+    outside = (np.abs(true) > 1.0).any(axis=1)
+    assert outside.any()
+    np.testing.assert_array_equal(visible, ~outside)
+    all_shown, shown = (watched(o, aside, [Command.hover()])[0][0, :14].reshape(7, 2) for o in (training, flown))
+    np.testing.assert_allclose(all_shown, true, atol=1e-12)
+    np.testing.assert_allclose(shown[~outside], true[~outside], atol=1e-12)
+    assert (np.abs(shown - true).max(axis=1)[outside] > 1e-6).all()
+    half = training.occluded(0.5)
+    flags = np.concatenate([watched(half, State(near().p, near().R, 0.01 * k * jnp.ones(3)), gentle(random.key(k), 10))
+                            [0][:, 70:77] for k in range(4)])  # fmt: skip
+    assert 0.3 < flags.mean() < 0.7
+
+
+@pytest.mark.parametrize(("dt", "depth", "stride"), [(0.02, 13, 3), (0.01, 25, 6), (0.06, 5, 1)])
+def test_frames_are_60_ms_apart_at_every_rate(dt, depth, stride):
+    """Of a steady motion the frames show where it was 0, 60, ..., 240 ms ago."""
+    observation = keypoints(dt=dt)
+    assert (observation.depth, observation.stride) == (depth, stride)
+    assert stride * dt == pytest.approx(0.06)
+    frames = observation.history(near(), jnp.zeros(3))
+    assert frames.shape == (depth, 14)
+    for i, shown in enumerate(np.asarray(observation.stacked(frames)).reshape(5, 14)):
+        then = replaced(near(), p=near().p - 0.06 * i * near().v)
+        np.testing.assert_allclose(shown, np.reshape(observation.pixels(then)[0], 14), atol=1e-12)
+
+
+def test_impossible_rates_and_delays():
+    with pytest.raises(ValueError, match=r"dt = 0\.05 s must divide the frame time"):
+        keypoints(dt=0.05)
+    for delay in (-1, 4):
+        with pytest.raises(ValueError, match=rf"delay_ticks = {delay} must be 0 to 3"):
+            keypoints(delay_ticks=delay)
+
+
+# ---- learning, and flying
+
+
+@pytest.mark.usefixtures("optax_promotion")
+def test_learns_to_see(white, key):
+    """A hundred small steps: the error falls; the output layer and the limits are as they were."""
+    policy = Policy.of(white.size, small(), key=key, hidden=(16,))
+    learnt, errors = pretrain_encoder(policy, white, key, steps=100, batch=32)
+    assert errors.shape == (100,)
+    assert float(errors[-10:].mean()) < 0.75 * float(errors[:5].mean())
+    jax.tree.map(np.testing.assert_array_equal, learnt.layers[-1], policy.layers[-1])
+    jax.tree.map(
+        np.testing.assert_array_equal,
+        (learnt.u_hover, learnt.u_min, learnt.u_max),
+        (policy.u_hover, policy.u_min, policy.u_max),
+    )
+    assert [l.weight.shape for l in learnt.layers] == [l.weight.shape for l in policy.layers]
+    for before, after in zip(policy.layers[:-1], learnt.layers[:-1], strict=True):
+        assert float(jnp.abs(after.weight - before.weight).max()) > 0.01
+
+
+@pytest.mark.parametrize("occlusion", [True, False])
+def test_simulation_and_flight_see_the_same(occlusion, white, key):
+    """Noise and lost points included: the pilot, given the states of a roll-out, issues its very commands."""
+    seen = replaced(white, occlusion=occlusion, noise=jnp.array(1.0), dropout=jnp.array(0.1))
+    task = Hover(jnp.array(GOAL), seen, jnp.array(5.0), jnp.array(0.3), 0.02, 12)
+    policy = Policy.of(seen.size, small(), key=key, hidden=(8,))
+    policy = jax.tree.map(lambda leaf: leaf + 0.02, policy)
+    x0 = Start(jnp.array(0.0), State(jnp.array([0.6, 0.2, 1.2]), jnp.eye(3), jnp.array([0.5, 0.0, 0.0])))
+    simulated = eqx.filter_jit(rollout)(Env(PointMass(0.02), task), policy, x0)
+    pilot = ControllerPilot(PolicyController(seen, policy))
+    pilot.reset(Measurement(0.0, x0.x))
+    for k in range(task.horizon):
+        x = jax.tree.map(lambda leaf, k=k: leaf[k], simulated.x)
+        u = pilot.act(Measurement(k * 0.02, x))
+        np.testing.assert_allclose(u.vector(), Command(simulated.u.c[k], simulated.u.omega[k]).vector(), rtol=1e-7)
+    assert np.ptp(np.asarray(simulated.u.c)) > 1e-3
