@@ -16,10 +16,11 @@ from .vehicle_file import VehicleSpec
 
 STRICT = ConfigDict(extra="forbid")
 BUILT_IN_TASKS = ("hover", "track", "vision")
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-Count = Annotated[int, Field(ge=1, le=1_000_000), Strict()]
-LearningRate = Annotated[float, Field(gt=0, le=10.0)]
-Seconds = Annotated[float, Field(ge=1e-3, le=3600.0)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
+Count = Annotated[int, Field(ge=1, le=1_000_000, strict=True)]
+LearningRate = Annotated[float, Field(gt=0, le=10.0, strict=True)]
+Seconds = Annotated[float, Field(ge=1e-3, le=3600.0, strict=True)]
+Coordinate = Annotated[FiniteFloat, Strict()]
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -34,13 +35,13 @@ class Pretrain:
     """Ticks of a roll-out."""
     learning_rate: LearningRate = 5e-3
     """Adam's rate at the start; it falls to zero along a cosine. The paper gives none; the authors' code has 5e-3."""
-    adam_b2: float = Field(default=0.999, ge=0, lt=1)
+    adam_b2: float = Field(default=0.999, ge=0, lt=1, strict=True)
     """Adam's second decay."""
     max_grad_norm: Positive | None = None
     """Largest norm of a gradient; none is clipped by default."""
     hidden_sizes: tuple[Count, ...] = Field(default=(512, 512), min_length=1, max_length=8)
     """Hidden layers of the policy."""
-    max_start_yaw: float = Field(default=math.pi, ge=0, le=math.pi)
+    max_start_yaw: float = Field(default=math.pi, ge=0, le=math.pi, strict=True)
     """Starts have a yaw within +- this angle [rad]."""
 
 
@@ -48,7 +49,7 @@ class Pretrain:
 class Adapt:
     """Adaptation in flight (paper, Sec. IV-A.3)."""
 
-    window: int = Field(default=100, ge=12, le=100_000)
+    window: int = Field(default=100, ge=12, le=100_000, strict=True)
     """Ticks of flight that are remembered."""
     residual: str = "ensemble"
     """Residual model: ensemble (the paper's), or module:name."""
@@ -58,7 +59,7 @@ class Adapt:
     """Optimiser steps of one fit."""
     fit_learning_rate: LearningRate = 1e-2
     """Adam's rate of the fit."""
-    spectral_weight: float = Field(default=1e-3, ge=0, allow_inf_nan=False)
+    spectral_weight: float = Field(default=1e-3, ge=0, allow_inf_nan=False, strict=True)
     """Weight of the spectral penalty; the paper gives none."""
     update_every: Seconds = 5.0
     """Time between policy updates [s]."""
@@ -92,15 +93,15 @@ class Track:
 class Vision:
     """What only hover from keypoints has."""
 
-    occlusion: bool = False
+    occlusion: bool = Field(default=False, strict=True)
     """In flight, points outside the image are not observed; else every point is, as in the paper."""
-    pixel_noise: float = Field(default=0.0, ge=0, le=1000.0)
+    pixel_noise: float = Field(default=0.0, ge=0, le=1000.0, strict=True)
     """Standard deviation of a pixel coordinate, in training and flight [px]."""
-    dropout: float = Field(default=0.0, ge=0, lt=1)
+    dropout: float = Field(default=0.0, ge=0, lt=1, strict=True)
     """With occlusion: probability that a visible point is missed in a frame."""
-    whiten_pixels: bool = False
+    whiten_pixels: bool = Field(default=False, strict=True)
     """Pixels are whitened over random short motions; else fed as they are."""
-    encoder_steps: int = Field(default=0, ge=0, le=1_000_000)
+    encoder_steps: int = Field(default=0, ge=0, le=1_000_000, strict=True)
     """Optimiser steps of encoder pretraining, before the policy is trained."""
 
 
@@ -115,17 +116,17 @@ class Preset:
     """paper: as printed; l2: ours, with a tip at the goal."""
     vehicle: str | VehicleSpec = "small"
     """Vehicle of training: small, large, kingfisher, module:name, or a vehicle file."""
-    dt: float = Field(default=0.02, ge=0.002, le=0.1)
+    dt: float = Field(default=0.02, ge=0.002, le=0.1, strict=True)
     """Control period [s]: 50 Hz in the paper (Sec. III-E). A whole number of milliseconds."""
-    goal: tuple[FiniteFloat, FiniteFloat, FiniteFloat] = (0.0, 0.0, 1.0)
+    goal: tuple[Coordinate, Coordinate, Coordinate] = (0.0, 0.0, 1.0)
     """Where to hover, world [m]."""
     termination_box: Positive = 5.0
     """A vehicle farther than this from the goal or reference along an axis is terminated [m]."""
-    command_history: int = Field(default=0, ge=0, le=50)
+    command_history: int = Field(default=0, ge=0, le=50, strict=True)
     """Past commands in the observation."""
-    delay_ticks: int = Field(default=0, ge=0, le=20)
+    delay_ticks: int = Field(default=0, ge=0, le=20, strict=True)
     """Command delay of the model [ticks]."""
-    plant_delay_ticks: int = Field(default=1, ge=0, le=20)
+    plant_delay_ticks: int = Field(default=1, ge=0, le=20, strict=True)
     """Declared command delay of the plant [ticks], to pair accelerations with commands."""
     actuator_tau: Positive | None = None
     """Time constant of the model's actuators [s]; none by default."""

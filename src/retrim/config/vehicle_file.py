@@ -13,7 +13,7 @@ from ..errors import ConfigError
 from ..physics.state import STANDARD_GRAVITY
 from ..physics.vehicle import Vehicle, kingfisher, small
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
 Three = tuple[Positive, Positive, Positive]
 
 
@@ -22,7 +22,7 @@ class VehicleSpec:
     """A quadrotor in X configuration."""
 
     name: str
-    mass: Annotated[float, Field(gt=0.005, le=50.0)]
+    mass: Annotated[float, Field(gt=0.005, le=50.0, strict=True)]
     """All-up mass [kg]."""
     inertia: Three
     """Diagonal of the inertia, body frame [kg m^2]."""
@@ -32,7 +32,7 @@ class VehicleSpec:
     """Static thrust of all four rotors together [N]."""
     rates_max: Three
     """Largest body rates that the rate controller accepts [rad/s]."""
-    motor_tau: Annotated[float, Field(gt=0, le=0.5)]
+    motor_tau: Annotated[float, Field(gt=0, le=0.5, strict=True)]
     """Time constant of the motors [s]."""
     propeller: Literal["3 inch", "5 inch"] | None = None
     """Blade geometry that is scaled to the vehicle; the nearer one by default."""
