@@ -22,6 +22,7 @@ from ..errors import ConfigError
 from ..learn.encoder import pretrain_encoder
 from ..learn.env import Env
 from ..learn.pretrain import pretrain
+from ..learn.residuals.model import ResidualModel
 from ..physics.actuators import Lagged
 from ..physics.dynamics import AbstractDynamics, PointMass
 from ..physics.state import State
@@ -63,12 +64,19 @@ class Setup:
     """Of pretraining: Adam under a cosine, behind a clip."""
 
     @classmethod
-    def of(cls, preset: Preset, reference: str | Reference | None = None) -> "Setup":
+    def of(
+        cls,
+        preset: Preset,
+        reference: str | Reference | None = None,
+        *,
+        residual_model: ResidualModel | None = None,
+    ) -> "Setup":
         """Build a set-up.
 
         Args:
             preset: The numbers.
             reference: What a tracking flight follows, by name or as an object; None for what training follows.
+            residual_model: Residual model of the learner; by default the one that the preset names.
 
         Raises:
             ConfigError: A name does not exist, the task tracks no reference, or values do not fit together.
@@ -90,7 +98,8 @@ class Setup:
             if preset.actuator_tau is not None:
                 nominal = Lagged(nominal, jnp.array(preset.actuator_tau))
             env = Env(nominal, task, preset.delay_ticks)
-            learner = _learner(preset, vehicle, Env(nominal, flown, preset.delay_ticks))
+            model = residual_model or make_residual(ResidualRequest(preset, vehicle))
+            learner = _learner(preset, model, Env(nominal, flown, preset.delay_ticks))
         except (TypeError, ValueError) as error:
             raise (
                 error if isinstance(error, ConfigError) else ConfigError(f"preset {preset.name!r}: {error}")
@@ -222,11 +231,11 @@ def _low_rank(policy: Policy, key: Key[Array, ""]) -> LoraPolicy:
     return LoraPolicy.of(policy, key=key)
 
 
-def _learner(preset: Preset, vehicle: Vehicle, env: Env) -> OnlineLearner:
+def _learner(preset: Preset, model: ResidualModel, env: Env) -> OnlineLearner:
     a = preset.adapt
     return OnlineLearner(
         env,
-        make_residual(ResidualRequest(preset, vehicle)),
+        model,
         policy_rate=jnp.array(a.learning_rate),
         max_grad_norm=jnp.array(a.max_grad_norm or math.inf),
         plant_delay_ticks=preset.plant_delay_ticks,

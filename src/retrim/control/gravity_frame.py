@@ -39,7 +39,7 @@ class GravityFrame(AbstractController[GravityFrameState]):
         return GravityFrameState(self.observer.init(x), self.inner.init(x))
 
     def __call__(self, memory: GravityFrameState, t: Float[Array, ""], x: State) -> tuple[Command, GravityFrameState]:
-        """Estimate, turn the state, let the controller act, correct its thrust."""
+        """Return the inner controller's command in the estimated gravity, with corrected thrust."""
         observed = self.observer(memory.observer, x)
         Q, extra = tilted(observed.d_hat)
         turned = State(self.pivot + so3.act(Q, x.p - self.pivot), so3.mul(Q, x.R), so3.act(Q, x.v))

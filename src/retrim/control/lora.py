@@ -1,4 +1,4 @@
-"""Low-rank adaptation (Hu et al. 2022; paper, Sec. III-F): the base is frozen, two thin matrices a layer are trained.
+"""Low-rank adaptation (Hu et al. 2022; paper, Sec. III-F): the base is frozen, two thin factors per layer are trained.
 
 y = (W + scale * B A) x + b. B starts at zero, so that a fresh delta changes nothing. A network of the paper's size has
 12,864 numbers to train instead of 272,900.
@@ -25,7 +25,7 @@ class LowRankFactors(eqx.Module):
 
 
 class LoraPolicy(eqx.Module):
-    """A frozen policy and a delta. Trains like a :class:`Policy`; flies once it is :meth:`merged`."""
+    """A frozen policy and a delta. It trains like a :class:`Policy`; :meth:`merged` flies."""
 
     base: Policy
     delta: tuple[LowRankFactors, ...]
@@ -44,7 +44,7 @@ class LoraPolicy(eqx.Module):
     def of(
         cls, base: Policy, *, key: Key[Array, ""], ranks: tuple[int, ...] = RANKS, scale: float = SCALE
     ) -> "LoraPolicy":
-        """A fresh delta, one rank per layer: A uniform within 1 / sqrt(fan-in) (Kaiming), B zero.
+        """Return a fresh delta, one rank per layer: A uniform within 1 / sqrt(fan-in) (Kaiming), B zero.
 
         Raises ``ValueError`` unless there is a rank for each layer, from 1 to the smaller side of its matrix.
         """
@@ -62,15 +62,15 @@ class LoraPolicy(eqx.Module):
 
     @property
     def params(self) -> tuple[LowRankFactors, ...]:
-        """What an optimiser may move."""
+        """Return the parameters that an optimiser updates."""
         return self.delta
 
     def with_params(self, delta: tuple[LowRankFactors, ...]) -> "LoraPolicy":
-        """The same base with another delta."""
+        """Return the same base with another delta."""
         return LoraPolicy(self.base, delta, self.scale)
 
     def merged(self) -> Policy:
-        """The delta merged into plain weights; no gradient flows to the base."""
+        """Return a plain policy with the delta merged into its weights; no gradient flows to the base."""
         base, scale = lax.stop_gradient((self.base, self.scale))
         layers: Layers = tuple(
             eqx.tree_at(lambda l: l.weight, layer, layer.weight + scale * thin.up @ thin.down)

@@ -14,7 +14,7 @@ Perturbations = tuple[Float[Array, "... _"], ...]
 Layers = tuple[eqx.nn.Linear, ...]
 """The layers of a policy, or a gradient with respect to them."""
 Inputs = tuple[Float[Array, "... _"], ...]
-"""What each layer was given."""
+"""Inputs of each layer."""
 
 
 class Policy(eqx.Module):
@@ -33,7 +33,7 @@ class Policy(eqx.Module):
     def of(
         cls, observation_size: int, vehicle: Vehicle, *, key: Key[Array, ""], hidden: tuple[int, ...] = (512, 512)
     ) -> "Policy":
-        """A fresh network: kernels N(0, 0.01 / mean of fan-in and fan-out), biases zero; it hovers blindly at first."""
+        """Return a fresh network: kernels N(0, 0.01 / mean of fan-in and fan-out), biases zero; it hovers."""
         sizes = (observation_size, *hidden, 4)
         layers = []
         for fan_in, fan_out, k in zip(sizes[:-1], sizes[1:], random.split(key, len(sizes) - 1), strict=True):
@@ -50,26 +50,26 @@ class Policy(eqx.Module):
 
     @property
     def params(self) -> Layers:
-        """What an optimiser may move."""
+        """Return the parameters that an optimiser updates."""
         return self.layers
 
     def with_params(self, layers: Layers) -> "Policy":
-        """The same policy with other layers."""
+        """Return the same policy with other layers."""
         return Policy(layers, self.u_hover, self.u_min, self.u_max)
 
     def merged(self) -> "Policy":
-        """Itself: what flies. A low-rank policy merges its delta here."""
+        """Return itself; a low-rank policy merges its delta here."""
         return self
 
     def __call__(self, observation: Float[Array, " o"]) -> Command:
-        """The command for one observation."""
+        """Return the command for one observation."""
         h = observation
         for layer in self.layers[:-1]:
             h = jax.nn.relu(layer(h))
         return self.bounded(self.layers[-1](h))
 
     def perturbed(self, observation: Float[Array, " o"], perturbations: Perturbations) -> tuple[Command, Inputs]:
-        """The same command, with ``perturbations[l]`` added to the output of layer l and no gradient to any weight.
+        """Return the command with ``perturbations[l]`` added to the output of layer l, without gradients to weights.
 
         Also returns each layer's input: with the perturbations' cotangents they give every weight gradient.
         """
@@ -81,7 +81,7 @@ class Policy(eqx.Module):
         return self.bounded(h), tuple(inputs)
 
     def bounded(self, y: Float[Array, "4"]) -> Command:
-        """From the network's output to a command within the limits; zero is hover."""
+        """Map the network's output to a command within the limits; zero maps to hover."""
         low, high, hover = (lax.stop_gradient(u.vector()) for u in (self.u_min, self.u_max, self.u_hover))
         y_0 = jnp.log((hover - low) / (high - hover))
         return Command.of(low + (high - low) * jax.nn.sigmoid(y + y_0))

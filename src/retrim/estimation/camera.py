@@ -36,7 +36,7 @@ class Camera(eqx.Module):
 
     @classmethod
     def published(cls) -> "Camera":
-        """The one that the paper's authors describe: 1280 x 720, about 120 degrees across."""
+        """Return the camera that the paper's authors describe: 1280 x 720 px, about 120 degrees across."""
         return cls(
             xi=jnp.array(-0.007441148905788614),
             alpha=jnp.array(0.6138265280850498),
@@ -46,7 +46,7 @@ class Camera(eqx.Module):
         )
 
     def project(self, P: Float[Array, "3"]) -> Projection:
-        """Where a point in camera coordinates [m] appears. Finite, with a finite gradient, wherever it is."""
+        """Project a point in camera coordinates [m]; finite, with a finite gradient, wherever the point is."""
         d1 = jnp.sqrt(jnp.sum(P**2) + 1e-12)
         z1 = self.xi * d1 + P[2]
         d2 = jnp.sqrt(P[0] ** 2 + P[1] ** 2 + z1**2 + 1e-12)
@@ -58,7 +58,7 @@ class Camera(eqx.Module):
         return Projection(pixel, holds & jnp.all(jnp.abs(pixel) <= 1.0))
 
     def bearing(self, pixel: Float[Array, "2"]) -> Float[Array, "3"]:
-        """The direction that appears at ``pixel`` (normalised), of length one in camera coordinates."""
+        """Return the unit direction in camera coordinates that appears at ``pixel`` (normalised)."""
         m = ((pixel + 1.0) * self.size / 2.0 - self.centre) / self.focal
         r2 = jnp.sum(m**2)
         inside = jnp.maximum(1.0 - (2.0 * self.alpha - 1.0) * r2, 1e-6)
@@ -68,6 +68,6 @@ class Camera(eqx.Module):
 
 
 def in_camera(x: State, points: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-    """World points [m] in the coordinates of a camera at the body's origin."""
+    """Map world points [m] to the coordinates of a camera at the body's origin."""
     down = jnp.array(DOWN, dtype=x.p.dtype)
     return (points - x.p[None]) @ x.R @ down.T

@@ -21,12 +21,12 @@ PerturbedLoss = Callable[[Perturbations], tuple[Float[Array, ""], Inputs]]
 
 
 def zero_perturbations(policy: Policy, rows: tuple[int, ...]) -> Perturbations:
-    """A zero for each layer's output, for each of ``rows``."""
+    """Return zeros for each layer's output, for each of ``rows``."""
     return tuple(jnp.zeros((*rows, layer.weight.shape[0]), dtype=layer.weight.dtype) for layer in policy.layers)
 
 
 def value_and_grad(loss: PerturbedLoss, policy: Policy, rows: tuple[int, ...]) -> tuple[Float[Array, ""], Layers]:
-    """The loss and its gradient with respect to ``policy.layers``, equal to ``jax.value_and_grad`` of the same loss."""
+    """Return the loss and its gradient with respect to ``policy.layers``, equal to ``jax.value_and_grad``."""
     (value, inputs), cotangents = jax.value_and_grad(loss, has_aux=True)(zero_perturbations(policy, rows))
     gradients = []
     for layer, seen, cotangent in zip(policy.layers, inputs, cotangents, strict=True):

@@ -1,4 +1,4 @@
-"""First-order actuator lag for any model: without it, a sharp reward learns gains that slow motors cannot follow."""
+"""First-order actuator lag for any model. Without it, a steep reward yields gains that slow motors cannot follow."""
 
 from typing import Generic, TypeVar
 
@@ -21,7 +21,7 @@ class LagState(eqx.Module, Generic[X]):
 
 
 class Lagged(AbstractDynamics[LagState[X]]):
-    """Each command reaches the model through a first-order lag; the model sees where it stands after the tick."""
+    """Each command reaches the model through a first-order lag."""
 
     base: AbstractDynamics[X]
     tau: Float[Array, ""]
@@ -51,7 +51,7 @@ class Lagged(AbstractDynamics[LagState[X]]):
         return LagState(self.base.with_state(s.inner, x), s.acting)
 
     def step(self, s: LagState[X], u: Command, a_ext: Float[Array, "3"]) -> LagState[X]:
-        """One tick under the mean of the lagged command over it."""
+        """Advance one tick under the mean of the lagged command over it."""
         decay = jnp.exp(-self.dt / self.tau)
         left = self.tau / self.dt * (1.0 - decay)  # share of the old command in the mean over the tick
         mean = jax.tree.map(lambda old, new: new + left * (old - new), s.acting, u)

@@ -23,7 +23,7 @@ class BemState(eqx.Module):
 
     body: RotorState
     inflow: Inflow
-    """Of the four rotors: every leaf has 4 numbers."""
+    """Inflow of the four rotors; every leaf has 4 numbers."""
 
 
 @runtime_checkable
@@ -41,7 +41,7 @@ class RateController(Protocol):
 
 
 class Loads(NamedTuple):
-    """What acts on the body, in its frame."""
+    """Force and torque on the body, body frame."""
 
     force: Float[Array, "3"]
     """[N]"""
@@ -62,7 +62,7 @@ class BemQuadrotor(AbstractSubstepDynamics[BemState]):
 
     @classmethod
     def of(cls, vehicle: Vehicle, dt: float, *, thrust_error: float = 0.035) -> "BemQuadrotor":
-        """With a thrust map that is wrong by ``thrust_error``: u_hover in still air gives (1 + thrust_error) m g.
+        """Build the model with a thrust map that is wrong by ``thrust_error``: u_hover gives (1 + thrust_error) m g.
 
         T / Omega^2 of a propeller in still air is constant, so one number calibrates the whole range.
         """
@@ -70,7 +70,7 @@ class BemQuadrotor(AbstractSubstepDynamics[BemState]):
         return cls(vehicle, Betaflight.of(true / (1.0 + thrust_error)), dt)
 
     def init(self, x: State) -> BemState:
-        """Rotors at the speed of u_hover, their inflow settled in the air that ``x`` meets, no rotation."""
+        """Return the state of a vehicle that hovers at ``x``: rotor speeds of u_hover, settled inflow, no rotation."""
         vehicle, zero = self.vehicle, jnp.zeros_like(x.p)
         speed = jnp.sqrt(vehicle.mass * STANDARD_GRAVITY / (4.0 * self.loop.thrust_map))
         body = RotorState(x, zero, jnp.ones(4, dtype=x.p.dtype) * speed, zero, zero, zero)
@@ -79,7 +79,7 @@ class BemQuadrotor(AbstractSubstepDynamics[BemState]):
         return BemState(body, inflow)
 
     def state(self, s: BemState) -> State:
-        """(p, R, v)."""
+        """Return (p, R, v)."""
         return s.body.x
 
     def with_state(self, s: BemState, x: State) -> BemState:
@@ -97,7 +97,7 @@ class BemQuadrotor(AbstractSubstepDynamics[BemState]):
         return s.body
 
     def substep(self, s: BemState, u: Command, effects: ExternalEffects) -> BemState:
-        """One millisecond; loads are held over it."""
+        """Advance one millisecond with loads held."""
         vehicle, b = self.vehicle, s.body
         commanded, integral, wanted_slow = self.loop(vehicle, b, u)
         motors = commanded + (b.motors - commanded) * jnp.exp(-SUBSTEP / vehicle.motor_tau)
@@ -116,7 +116,7 @@ class BemQuadrotor(AbstractSubstepDynamics[BemState]):
         *,
         steps: int = 2,
     ) -> tuple[BladeForces, Inflow]:
-        """Forces of the four rotors, each in the air that meets its own hub."""
+        """Return the forces of the four rotors, each for the air velocity at its own hub."""
         air = self.hub_velocities(b, wind)
         v_hor = jnp.sqrt(air[:, 0] ** 2 + air[:, 1] ** 2 + 1e-12)
 
@@ -128,17 +128,17 @@ class BemQuadrotor(AbstractSubstepDynamics[BemState]):
         return jax.vmap(one)(motors, v_hor, -air[:, 2], inflow)
 
     def hub_velocities(self, b: RotorState, wind: Float[Array, "3"]) -> Float[Array, "4 3"]:
-        """Velocity of each hub through the air, body frame [m/s]."""
+        """Return the velocity of each hub through the air, body frame [m/s]."""
         return (b.x.R.T @ (b.x.v - wind))[None] + jnp.cross(b.omega[None], self.places())
 
     def places(self) -> Float[Array, "4 3"]:
-        """Of the hubs, body frame [m]."""
+        """Return the positions of the hubs, body frame [m]."""
         arm = self.vehicle.arm
         turn = signs(arm.dtype)  # a rotor at (x, y) turns the body about x by its y, about y by -x
         return jnp.stack([-arm[0] * turn[1], arm[1] * turn[0], jnp.zeros(4, dtype=arm.dtype)], axis=1)
 
     def loads(self, b: RotorState, motors: Float[Array, "4"], blades: BladeForces, effects: ExternalEffects) -> Loads:
-        """Rotors, body drag, yaw reaction of the motors and gyroscopic torque."""
+        """Return force and torque of rotors, body drag, yaw reaction of the motors and gyroscopic effects."""
         vehicle = self.vehicle
         air = self.hub_velocities(b, effects.wind)
         along = air[:, :2] / jnp.sqrt(air[:, :1] ** 2 + air[:, 1:2] ** 2 + 1e-12)
@@ -155,6 +155,6 @@ class BemQuadrotor(AbstractSubstepDynamics[BemState]):
         return Loads(obstruction * jnp.sum(forces, axis=0) + self.body_drag(b, effects.wind), torque)
 
     def body_drag(self, b: RotorState, wind: Float[Array, "3"]) -> Float[Array, "3"]:
-        """F_k = -1/2 rho (c A)_k u_k |u_k|, body frame [N]."""
+        """Return F_k = -1/2 rho (c A)_k u_k |u_k|, body frame [N]."""
         through = b.x.R.T @ (b.x.v - wind)
         return -0.5 * AIR_DENSITY * self.vehicle.drag_area * through * jnp.abs(through)

@@ -1,6 +1,6 @@
-"""What disturbs a flight: functions (t, x) -> :class:`ExternalEffects`. Pushes stand here; see also wind and trouble.
+"""Disturbances: functions (t, x) -> :class:`ExternalEffects`. Pushes are here; see also wind and faults.
 
-Disturbances belong to the plant; the nominal model never hears of them. What is random about one is drawn when it is
+Disturbances belong to the plant; the nominal model does not know them. What is random about one is drawn when it is
 made, so that it is a function of time and repeats.
 """
 
@@ -22,7 +22,7 @@ class Disturbance(Protocol):
     """Any function of time [s] and state will do."""
 
     def __call__(self, t: Float[Array, ""], x: State, /) -> ExternalEffects:
-        """What surrounds the vehicle at time ``t`` in the state ``x``."""
+        """Return the external effects at time ``t`` in the state ``x``."""
         ...
 
 
@@ -32,7 +32,7 @@ class Push(eqx.Module):
     a_ext: Callable[[Float[Array, ""], State], Float[Array, "3"]]
 
     def __call__(self, t: Float[Array, ""], x: State) -> ExternalEffects:
-        """Pushed by ``a_ext(t, x)``."""
+        """Return the push ``a_ext(t, x)``."""
         return ExternalEffects.of(x.p.dtype, push=self.a_ext(t, x))
 
 
@@ -42,7 +42,7 @@ class Together(eqx.Module):
     parts: tuple[Disturbance, ...]
 
     def __call__(self, t: Float[Array, ""], x: State) -> ExternalEffects:
-        """The sum of the parts; calm without any."""
+        """Return the sum of the parts."""
         return sum((part(t, x) for part in self.parts), start=ExternalEffects.calm(x.p.dtype))
 
 
@@ -52,7 +52,7 @@ class Constant(eqx.Module):
     a: Float[Array, "3"]
 
     def __call__(self, t: Float[Array, ""], x: State) -> ExternalEffects:
-        """Pushed by ``a`` [m/s^2]."""
+        """Return the push ``a`` [m/s^2]."""
         return ExternalEffects.of(x.p.dtype, push=self.a)
 
 
@@ -68,7 +68,7 @@ class Reversing(eqx.Module):
             raise ValueError(f"Reversing.period = {float(self.period)} s must be positive")
 
     def __call__(self, t: Float[Array, ""], x: State) -> ExternalEffects:
-        """``a`` in the first period, ``-a`` in the second, and so on."""
+        """Return the push ``a`` in the first period, ``-a`` in the second, and so on."""
         first = jnp.floor(t / self.period) % 2.0 == 0.0
         return ExternalEffects.of(x.p.dtype, push=jnp.where(first, self.a, -self.a))
 
@@ -85,7 +85,7 @@ class RandomWalk(eqx.Module):
 
     @classmethod
     def of(cls, rate: float, bound: float, *, key: Key[Array, ""], every: float = 0.1, n: int = 1200) -> "RandomWalk":
-        """From zero, with a standard deviation of ``rate`` [m/s^2] after one second (far from the bounds)."""
+        """Draw a walk from zero with a standard deviation of ``rate`` [m/s^2] after one second, far from the bounds."""
         if not (bound > 0 and rate >= 0 and every > 0 and n >= 2):
             raise ValueError(f"RandomWalk: rate = {rate}, bound = {bound}, every = {every}, n = {n} cannot be")
         path = jnp.cumsum(rate * every**0.5 * random.normal(key, (n, 3)), axis=0)
@@ -93,7 +93,7 @@ class RandomWalk(eqx.Module):
         return cls(bound - jnp.abs((path + bound) % (4.0 * bound) - 2.0 * bound), jnp.array(every))
 
     def __call__(self, t: Float[Array, ""], x: State) -> ExternalEffects:
-        """Pushed by the walk's acceleration at ``t``."""
+        """Return the walk's acceleration at ``t`` as a push."""
         last = self.points.shape[0] - 1
         where = last - jnp.abs((t / self.every) % (2.0 * last) - last)  # there and back again
         i = jnp.clip(jnp.floor(where), 0, last - 1).astype(jnp.int32)

@@ -41,23 +41,23 @@ class AbstractDynamics(eqx.Module, Generic[X]):
 
     @abc.abstractmethod
     def init(self, x: State) -> X:
-        """Lift: the model's state when the vehicle hovers in the state ``x``."""
+        """Lift a vehicle's state to the model's: the vehicle hovers at ``x``."""
 
     @abc.abstractmethod
     def state(self, s: X) -> State:
-        """Project the model's state on the vehicle's."""
+        """Return the vehicle's state."""
 
     @abc.abstractmethod
     def with_state(self, s: X, x: State) -> X:
-        """Write ``x`` back; what is hidden in ``s`` stays."""
+        """Return ``s`` with (p, R, v) replaced; hidden state stays."""
 
     @abc.abstractmethod
     def step(self, s: X, u: Command, a_ext: Float[Array, "3"]) -> X:
-        """One tick under the command ``u`` and the external acceleration ``a_ext`` (world [m/s^2]), both held."""
+        """Advance one tick under the command ``u`` and the acceleration ``a_ext`` (world [m/s^2]), both held."""
 
 
 def f_a(x: State, u: Command, a_ext: Float[Array, "3"]) -> StateDot:
-    """Eq. (1) of the paper: p' = v, R' = R [omega_cmd]x, v' = R c + g, plus an external acceleration [m/s^2]."""
+    """Evaluate Eq. (1) of the paper: p' = v, R' = R [omega_cmd]x, v' = R c + g + ``a_ext`` [m/s^2]."""
     thrust = x.R[:, 2] * u.c  # R @ [0, 0, c]
     gravity = jnp.array([0.0, 0.0, -STANDARD_GRAVITY], dtype=x.p.dtype)
     return StateDot(p=x.v, omega=u.omega, v=thrust + gravity + a_ext)
@@ -72,19 +72,19 @@ class PointMass(AbstractDynamics[State]):
     dt: float = eqx.field(static=True)
 
     def init(self, x: State) -> State:
-        """Identity."""
+        """Return the state itself."""
         return x
 
     def state(self, s: State) -> State:
-        """Identity."""
+        """Return the state itself."""
         return s
 
     def with_state(self, s: State, x: State) -> State:
-        """The new state; nothing is hidden."""
+        """Return the new state; nothing is hidden."""
         return x
 
     def step(self, s: State, u: Command, a_ext: Float[Array, "3"]) -> State:
-        """One Runge-Kutta step of ``dt`` seconds."""
+        """Advance by one Runge-Kutta step of ``dt`` seconds."""
         h = self.dt
         middle = so3.mul(s.R, so3.exp(0.5 * h * u.omega))
         end = so3.mul(s.R, so3.exp(h * u.omega))
@@ -101,7 +101,7 @@ class Residual(Protocol):
     """Predicts the acceleration that a model misses, world frame [m/s^2]. Any function of (x, u) will do."""
 
     def __call__(self, x: State, u: Command, /) -> Float[Array, "3"]:
-        """Missing acceleration in the state ``x`` while ``u`` acts."""
+        """Return the missing acceleration in the state ``x`` while ``u`` acts."""
         ...
 
 
@@ -139,7 +139,7 @@ class Hybrid(AbstractDynamics[X]):
         return self.base.with_state(s, x)
 
     def step(self, s: X, u: Command, a_ext: Float[Array, "3"]) -> X:
-        """The base model's tick with the residual added to ``a_ext``."""
+        """Advance the base model by one tick with the residual added to ``a_ext``."""
         a_res = self.residual(self.base.state(s), u)
         return self.base.step(s, u, a_ext + (a_res if self.backprop else lax.stop_gradient(a_res)))
 
@@ -181,7 +181,7 @@ class StraightThrough(AbstractDynamics[X]):
         return self.forward.with_state(s, x)
 
     def step(self, s: X, u: Command, a_ext: Float[Array, "3"]) -> X:
-        """The forward model's tick, with the backward model's derivative at the same state and command."""
+        """Advance the forward model, with the backward model's derivative at the same state and command."""
         ahead = self.forward.step(lax.stop_gradient(s), lax.stop_gradient(u), lax.stop_gradient(a_ext))
         back = self.backward.step(self.forward.state(s), u, a_ext)
         value = self.forward.state(ahead)

@@ -31,11 +31,11 @@ class Payload(eqx.Module):
 
     @classmethod
     def of(cls, mass: float, *, picked: float = 0.0, dropped: float = float("inf")) -> "Payload":
-        """A small cube under the vehicle; see :func:`payload_inertia`."""
+        """Return the load of a small cube under the vehicle; see :func:`payload_inertia`."""
         return cls(jnp.array(mass), payload_inertia(mass), jnp.array(picked), jnp.array(dropped))
 
     def __call__(self, t: Float[Array, ""], x: State) -> ExternalEffects:
-        """Heavier, while it is carried."""
+        """Return the payload's mass and inertia while it is attached."""
         carried = jnp.where((t >= self.picked) & (t < self.dropped), 1.0, 0.0).astype(self.mass.dtype)
         return ExternalEffects.of(x.p.dtype, mass=carried * self.mass, inertia=carried * self.inertia)
 
@@ -56,7 +56,7 @@ class BatterySag(eqx.Module):
             raise ValueError(f"BatterySag: rate = {self.rate} 1/s, floor = {self.floor}")
 
     def __call__(self, t: Float[Array, ""], x: State) -> ExternalEffects:
-        """All rotors weaker."""
+        """Return the gain of all rotors at time ``t``."""
         share = jnp.maximum(1.0 - self.rate * t, self.floor)
         return ExternalEffects.of(x.p.dtype, gain=share * jnp.ones(4, dtype=share.dtype))
 
@@ -69,11 +69,11 @@ class WeakRotor(eqx.Module):
 
     @classmethod
     def of(cls, rotor: int, share: float) -> "WeakRotor":
-        """``rotor`` 0 ... 3 keeps ``share`` of its thrust."""
+        """Return a fault of ``rotor`` (0 to 3), which keeps ``share`` of its thrust."""
         if rotor not in range(4) or not 0 < share <= 1:
             raise ValueError(f"WeakRotor: rotor = {rotor} must be 0 to 3, share = {share} in (0, 1]")
         return cls(jnp.ones(4).at[rotor].set(share))
 
     def __call__(self, t: Float[Array, ""], x: State) -> ExternalEffects:
-        """One rotor weaker."""
+        """Return the gains of the rotors."""
         return ExternalEffects.of(x.p.dtype, gain=self.gain)

@@ -44,7 +44,7 @@ class Propeller(eqx.Module):
 
     @property
     def area(self) -> Float[Array, ""]:
-        """Of the disk [m^2]."""
+        """Area of the rotor disk [m^2]."""
         return jnp.pi * self.radius**2
 
 
@@ -85,7 +85,7 @@ def three_inch() -> Propeller:
 
 
 class BladeForces(NamedTuple):
-    """Of one rotor."""
+    """Forces of one rotor."""
 
     thrust: Float[Array, ""]
     """T along the axis [N]."""
@@ -96,16 +96,16 @@ class BladeForces(NamedTuple):
 
 
 class Inflow(eqx.Module):
-    """Where the two searches for the induced velocity stand; kept from millisecond to millisecond."""
+    """Induced velocities of one rotor, kept from millisecond to millisecond to start the next search."""
 
     v_i: Float[Array, ""]
-    """Solves the momentum balance [m/s]."""
+    """Induced velocity that solves the momentum balance [m/s]."""
     v_h: Float[Array, ""]
-    """The same with ``v_ver`` set to zero; the vortex-ring rule is written in it [m/s]."""
+    """Induced velocity with ``v_ver`` set to zero, in which the vortex-ring rule is written [m/s]."""
 
     @classmethod
     def above(cls, dtype: jnp.dtype) -> "Inflow":
-        """Above every root, from where Newton's method falls on the largest; see :func:`solved`."""
+        """Return a start above every root, from which Newton's method converges to the largest; see :func:`solved`."""
         return cls(jnp.array(40.0, dtype=dtype), jnp.array(40.0, dtype=dtype))
 
 
@@ -116,7 +116,7 @@ def blade_forces(
     v_ver: Float[Array, ""],
     v_i: Float[Array, ""],
 ) -> BladeForces:
-    """Blade-element integrals [6-15], for the induced velocity ``v_i``."""
+    """Evaluate the blade-element integrals [6-15] for the induced velocity ``v_i``."""
     dtype = v_i.dtype
     x, wx = jnp.array(_RADII, dtype=dtype)[:, None], jnp.array(_RADII_W, dtype=dtype)[:, None]
     sin_psi, wpsi = jnp.array(_SIN_PSI, dtype=dtype)[None, :], jnp.array(_SIN_PSI_W, dtype=dtype)[None, :]
@@ -148,7 +148,7 @@ def solved(
     *,
     steps: int,
 ) -> Float[Array, ""]:
-    """The largest root v_i of T(v_i) = 2 rho A v_i sqrt(v_hor^2 + (v_ver - v_i)^2) [5], by Newton's method.
+    """Solve for the largest root v_i of T(v_i) = 2 rho A v_i sqrt(v_hor^2 + (v_ver - v_i)^2) [5], by Newton's method.
 
     Right of the largest root the balance falls and is concave, so that Newton's steps fall on the root monotonically;
     a start just left of it jumps to the right side first. The gradient is that of the root (one differentiable step
@@ -170,7 +170,7 @@ def solved(
 
 
 def vortex_ring(inflow: Inflow, v_ver: Float[Array, ""]) -> Float[Array, ""]:
-    """Induced velocity [m/s]: the momentum balance's, or in slow descent that of the empirical rule [18, 19]."""
+    """Return the induced velocity [m/s]: of the momentum balance, or in slow descent of the empirical rule [18, 19]."""
     v_i, v_h = inflow.v_i, inflow.v_h
     x = v_ver / v_h
     ring = v_h * (1.0 + x * (1.125 + x * (-1.372 + x * (1.718 - 0.655 * x))))
@@ -187,7 +187,7 @@ def rotor(
     *,
     steps: int = 2,
 ) -> tuple[BladeForces, Inflow]:
-    """Forces of one rotor, and the inflow to start from the next time. ``steps`` of Newton's method for each root.
+    """Return the forces of one rotor and its inflow, after ``steps`` of Newton's method for each root.
 
     Two are exact to float32 from a millisecond before, in any usual manoeuvre; from :meth:`Inflow.above`, take 16.
     """
@@ -201,7 +201,7 @@ def rotor(
 
 @eqx.filter_jit
 def hover_coefficient(prop: Propeller, omega: Float[Array, ""]) -> Float[Array, ""]:
-    """c_T = T / omega^2 of a rotor in still air [N s^2]; the same at every speed."""
+    """Return c_T = T / omega^2 of a rotor in still air [N s^2]; it does not depend on the speed."""
     zero = jnp.zeros_like(omega)
     forces, _ = rotor(prop, omega, zero, zero, Inflow.above(omega.dtype), steps=16)
     return forces.thrust / omega**2

@@ -28,7 +28,7 @@ class RateLoop(eqx.Module):
 
 
 def default_rate_loop() -> RateLoop:
-    """Settles in about 0.1 s on both quadrotors of the paper."""
+    """Return gains that settle in about 0.1 s on both quadrotors of the paper."""
     return RateLoop(
         kp=jnp.array([25.0, 25.0, 12.5]),
         ki=jnp.array([37.0, 37.0, 37.0]),
@@ -56,16 +56,16 @@ class LinearDragQuadrotor(AbstractSubstepDynamics[RotorState]):
 
     @classmethod
     def of(cls, vehicle: Vehicle, dt: float, *, thrust_error: float = 0.035) -> "LinearDragQuadrotor":
-        """The realistic defaults: +3.5 % thrust, rotor drag 0.3, 0.3, 0.37 1/s."""
+        """Build the model with rotor drag of 0.3, 0.3, 0.37 1/s and, by default, +3.5 % of thrust."""
         return cls(vehicle, default_rate_loop(), jnp.array(1.0 + thrust_error), jnp.array([0.3, 0.3, 0.37]), dt)
 
     def init(self, x: State) -> RotorState:
-        """Hovering rotors, no rotation."""
+        """Return the state of a vehicle that hovers at ``x``, without rotation."""
         motors = jnp.ones(4, dtype=x.p.dtype) * self.vehicle.hover_speed
         return RotorState(x, jnp.zeros_like(x.p), motors, jnp.zeros_like(x.p), jnp.zeros_like(x.p), jnp.zeros_like(x.p))
 
     def state(self, s: RotorState) -> State:
-        """(p, R, v)."""
+        """Return (p, R, v)."""
         return s.x
 
     def with_state(self, s: RotorState, x: State) -> RotorState:
@@ -82,7 +82,7 @@ class LinearDragQuadrotor(AbstractSubstepDynamics[RotorState]):
         return s
 
     def substep(self, s: RotorState, u: Command, effects: ExternalEffects) -> RotorState:
-        """One millisecond: rate loop, motors, forces, rigid body."""
+        """Advance one millisecond: rate loop, motors, forces, rigid body."""
         vehicle = self.vehicle
         speeds, integral = self.rate_loop(s, u)
         motors = speeds + (s.motors - speeds) * jnp.exp(-SUBSTEP / vehicle.motor_tau)
@@ -92,7 +92,7 @@ class LinearDragQuadrotor(AbstractSubstepDynamics[RotorState]):
         return rigid_body(s, motors, integral, force, torque, mass, inertia, effects.push)
 
     def rate_loop(self, s: RotorState, u: Command) -> tuple[Float[Array, "4"], Float[Array, "3"]]:
-        """Rotor speeds [rad/s] to command, and the integral of the rate error [rad]."""
+        """Return the commanded rotor speeds [rad/s] and the integral of the rate error [rad]."""
         vehicle, loop = self.vehicle, self.loop
         low, high = vehicle.command_min, vehicle.command_max
         error = jnp.clip(u.omega, low.omega, high.omega) - s.omega
@@ -104,7 +104,7 @@ class LinearDragQuadrotor(AbstractSubstepDynamics[RotorState]):
         return jnp.sqrt(jnp.clip(thrusts, idle, vehicle.thrust_max / 4.0) / vehicle.thrust_coefficient), integral
 
     def mixed(self, thrust: Float[Array, ""], torque: Float[Array, "3"]) -> Float[Array, "4"]:
-        """Thrust of each rotor [N] that gives the collective ``thrust`` [N] and the ``torque`` [Nm]."""
+        """Return the thrust of each rotor [N] that gives the collective ``thrust`` [N] and the ``torque`` [Nm]."""
         arm, kappa = self.vehicle.arm, self.vehicle.torque_ratio
         levers = jnp.stack([arm[1], arm[0], kappa])
         return thrust / 4.0 + signs(thrust.dtype).T @ (torque / levers) / 4.0
@@ -112,7 +112,7 @@ class LinearDragQuadrotor(AbstractSubstepDynamics[RotorState]):
     def wrench(
         self, s: RotorState, motors: Float[Array, "4"], thrusts: Float[Array, "4"], wind: Float[Array, "3"]
     ) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-        """Force [N] and torque [Nm] of all rotors in the body frame; the inverse of the mixer, plus rotor drag."""
+        """Return force [N] and torque [Nm] of all rotors, body frame: the inverse of the mixer, plus rotor drag."""
         vehicle = self.vehicle
         levers = jnp.stack([vehicle.arm[1], vehicle.arm[0], vehicle.torque_ratio])
         torque = levers * (signs(thrusts.dtype) @ thrusts)

@@ -1,4 +1,4 @@
-"""What a quadrotor is and what it is told: state x = (p, R, v), command u = (c, omega).
+"""State x = (p, R, v) and command u = (c, omega) of a quadrotor.
 
 Frames, here and everywhere: the world frame has z up; the body frame is forward-left-up; ``R`` maps body to world.
 """
@@ -38,11 +38,11 @@ class State(eqx.Module):
 
     @classmethod
     def at(cls, p: Float[Array, "3"]) -> "State":
-        """At rest and level at the position ``p`` [m]."""
+        """Return the state at rest and level at the position ``p`` [m]."""
         return cls(p, jnp.eye(3, dtype=p.dtype), jnp.zeros_like(p))
 
     def vector(self) -> Float[Array, "15"]:
-        """[p, vec R (row by row), v]."""
+        """Return [p, vec R (row by row), v]."""
         return jnp.concatenate([self.p, self.R.reshape(9), self.v])
 
 
@@ -56,20 +56,20 @@ class Command(eqx.Module):
 
     @classmethod
     def hover(cls) -> "Command":
-        """u_hover = [9.81, 0, 0, 0]."""
+        """Return u_hover = [9.81, 0, 0, 0]."""
         return cls(jnp.array(STANDARD_GRAVITY), jnp.zeros(3))
 
     def vector(self) -> Float[Array, "4"]:
-        """[c, omega]."""
+        """Return [c, omega]."""
         return jnp.concatenate([self.c[None], self.omega])
 
     @classmethod
     def of(cls, vector: Float[Array, "4"]) -> "Command":
-        """Inverse of :meth:`vector`."""
+        """Return the command of a vector; the inverse of :meth:`vector`."""
         return cls(vector[0], vector[1:])
 
 
 def where(condition: Array, yes: T, no: T) -> T:
-    """``jnp.where`` leaf by leaf, for a scalar condition."""
+    """Apply ``jnp.where`` leaf by leaf, for a scalar condition."""
     chosen: T = jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
     return chosen

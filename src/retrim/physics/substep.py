@@ -34,10 +34,10 @@ class AbstractSubstepDynamics(AbstractDynamics[X]):
 
     @abc.abstractmethod
     def substep(self, s: X, u: Command, effects: ExternalEffects) -> X:
-        """One millisecond under the command ``u``."""
+        """Advance one millisecond under the command ``u``."""
 
     def step(self, s: X, u: Command, a_ext: Float[Array, "3"]) -> X:
-        """One control tick in calm air, pushed by ``a_ext``."""
+        """Advance one control tick in calm air, pushed by ``a_ext``."""
         effects = ExternalEffects.of(a_ext.dtype, push=a_ext)
         after, _ = lax.scan(lambda s, _: (self.substep(s, u, effects), None), s, length=round(self.dt / SUBSTEP))
         return after
@@ -50,7 +50,7 @@ def check_tick(dt: float, name: str) -> None:
 
 
 def signs(dtype: jnp.dtype) -> Float[Array, "3 4"]:
-    """:data:`SIGNS` as an array."""
+    """Return :data:`SIGNS` as an array."""
     return jnp.array(SIGNS, dtype=dtype)
 
 
@@ -81,7 +81,7 @@ def rigid_body(
     push: Float[Array, "3"],
     wanted_slow: Float[Array, "3"] | None = None,
 ) -> RotorState:
-    """One semi-implicit millisecond under ``force`` [N] and ``torque`` [Nm] in the body frame; attitude on SO(3)."""
+    """Advance one semi-implicit millisecond under ``force`` [N] and ``torque`` [Nm], body frame; attitude on SO(3)."""
     h = SUBSTEP
     omega_dot = (torque - jnp.cross(s.omega, inertia * s.omega)) / inertia
     omega = s.omega + h * omega_dot

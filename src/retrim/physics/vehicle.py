@@ -31,12 +31,12 @@ class Esc(eqx.Module):
     """Smallest throttle."""
 
     def speed(self, throttle: Float[Array, "*rotors"]) -> Float[Array, "*rotors"]:
-        """Rotor speed [rad/s]."""
+        """Return the rotor speed [rad/s]."""
         d = throttle * (2048.0 - self.d_min) + self.d_min
         return self.base + self.linear * d + self.root * jnp.sqrt(d)
 
     def throttle(self, speed: Float[Array, "*rotors"]) -> Float[Array, "*rotors"]:
-        """Inverse of :meth:`speed`."""
+        """Return the throttle of a rotor speed; the inverse of :meth:`speed`."""
         rise = jnp.maximum(speed - self.base, 0.0)
         root_d = 2.0 * rise / (self.root + jnp.sqrt(self.root**2 + 4.0 * self.linear * rise))
         return (root_d**2 - self.d_min) / (2048.0 - self.d_min)
@@ -52,7 +52,7 @@ class Vehicle(eqx.Module):
     arm: Float[Array, "2"]
     """Distance of the rotors from the centre along body x and y [m]."""
     thrust_max: Float[Array, ""]
-    """Of all four rotors together [N]."""
+    """Static thrust of all four rotors together [N]."""
     omega_max: Float[Array, "3"]
     """Largest body rates that the rate loop accepts [rad/s]."""
     motor_tau: Float[Array, ""]
@@ -62,7 +62,7 @@ class Vehicle(eqx.Module):
     motor_max: Float[Array, ""]
     """Largest speed of a rotor [rad/s]."""
     rotor_inertia: Float[Array, ""]
-    """Of one motor and propeller about its axis [kg m^2]."""
+    """Inertia of one motor and propeller about its axis [kg m^2]."""
     thrust_coefficient: Float[Array, ""]
     """c_T in T = c_T Omega^2 of one rotor [N s^2]."""
     torque_ratio: Float[Array, ""]
@@ -106,7 +106,7 @@ class Vehicle(eqx.Module):
 
 
 def small() -> Vehicle:
-    """The paper's small quadrotor.
+    """Return the paper's small quadrotor.
 
     Mass, inertia, arm length 0.06 m, thrust and motor time constant: Table IV of the paper (inertia to three digits:
     the description published with it). Rate limits, c_T, kappa, speeds, rotor inertia and the speed controllers'
@@ -137,7 +137,7 @@ def small() -> Vehicle:
 
 
 def kingfisher() -> Vehicle:
-    """The Agilicious platform's research quadrotor: every constant as published with that platform.
+    """Return the Agilicious platform's research quadrotor: every constant as published with that platform.
 
     kappa alone is blade-element theory's for these 5.1 in rotors (the description lists 0.022 m).
     """
@@ -166,7 +166,7 @@ def kingfisher() -> Vehicle:
 
 
 def large() -> Vehicle:
-    """The paper's large quadrotor.
+    """Return the paper's large quadrotor.
 
     Mass, inertia, arm length 0.13 m (with the kingfisher's aspect), thrust and motor time constant: Table IV of the
     paper. All else is the kingfisher's, from which it was built.
@@ -182,7 +182,7 @@ def large() -> Vehicle:
 
 
 def payload_inertia(mass: float, *, side: float = 0.05, below: float = 0.03) -> Float[Array, "3"]:
-    """Inertia [kg m^2] that a cube of ``mass`` [kg] and ``side`` [m] adds, its centre ``below`` the vehicle's [m].
+    """Return the inertia [kg m^2] that a cube of ``mass`` [kg] and ``side`` [m] adds, centred ``below`` [m].
 
     The shift of the centre of mass is left out.
     """
@@ -191,7 +191,7 @@ def payload_inertia(mass: float, *, side: float = 0.05, below: float = 0.03) -> 
 
 
 def with_payload(vehicle: Vehicle, mass: float) -> Vehicle:
-    """A vehicle that knows that it carries a load: 0.07 kg make the paper's small quadrotor 0.26 kg.
+    """Return a vehicle whose command includes a load: 0.07 kg make the paper's small quadrotor 0.26 kg.
 
     Its thrust command is normalised by the mass of both. For a load that the vehicle does not know of, see
     :class:`retrim.physics.Payload`.

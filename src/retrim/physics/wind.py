@@ -1,4 +1,4 @@
-"""Air that moves: steady wind, gusts, a fan. Wind acts through the relative air velocity at rotors and body."""
+"""Wind: steady, Dryden gusts, the jet of a fan. Wind acts through the relative air velocity at rotors and body."""
 
 import math
 
@@ -21,7 +21,7 @@ class SteadyWind(eqx.Module):
     """World [m/s]."""
 
     def __call__(self, t: Float[Array, ""], x: State) -> ExternalEffects:
-        """Blown at by ``wind``."""
+        """Return the wind."""
         return ExternalEffects.of(x.p.dtype, wind=self.wind)
 
 
@@ -47,7 +47,7 @@ class Turbulence(eqx.Module):
         key: Key[Array, ""],
         n: int = 64,
     ) -> "Turbulence":
-        """Frozen eddies of scale ``length`` [m] carried past at ``speed`` [m/s].
+        """Draw frozen eddies of scale ``length`` [m], carried past at ``speed`` [m/s].
 
         Sinusoid k has a frequency from the k-th n-quantile of the spectrum, so that each carries the same energy:
         with s = L omega / V, the energy below s is 2 atan(s) / pi along the wind, and (2 atan(s) - s / (1 + s^2)) / pi
@@ -65,14 +65,14 @@ class Turbulence(eqx.Module):
         return cls(rate, 2.0 * jnp.pi * random.uniform(k_phase, (n, 3)), sigma)
 
     def __call__(self, t: Float[Array, ""]) -> Float[Array, "3"]:
-        """Gust at ``t``: along, across and up [m/s]."""
+        """Return the gust at ``t``: along, across and up [m/s]."""
         n = self.rate.shape[0]
         amplitude = self.sigma * math.sqrt(2.0 / n)
         return amplitude * jnp.sum(jnp.cos(self.rate * t + self.phase), axis=0)
 
 
 def axes_along(direction: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """Rows: along ``direction`` (not vertical), across it in the horizontal plane, and up."""
+    """Return a matrix of rows: along ``direction`` (not vertical), across it in the horizontal plane, and up."""
     along = direction / jnp.linalg.norm(direction)
     across = jnp.cross(jnp.array([0.0, 0.0, 1.0], dtype=along.dtype), along)
     across = across / jnp.linalg.norm(across)
@@ -88,7 +88,7 @@ class Dryden(eqx.Module):
 
     @classmethod
     def of(cls, mean: Float[Array, "3"], *, key: Key[Array, ""], altitude: float = 10.0 * FEET) -> "Dryden":
-        """Gusts as strong as they are in a wind of that speed; the mean is horizontal, ``altitude`` >= 3.048 m.
+        """Draw the gusts of a horizontal mean wind at an ``altitude`` of at least 3.048 m.
 
         sigma_w = 0.1 of the wind at 20 ft, here ``mean``; lengths and the other sigmas by the altitude in feet.
         """
@@ -105,7 +105,7 @@ class Dryden(eqx.Module):
         return cls(mean, Turbulence.of(jnp.array(speed), length, sigma, key=key))
 
     def __call__(self, t: Float[Array, ""], x: State) -> ExternalEffects:
-        """Blown at by mean and gust."""
+        """Return the wind, mean plus gust, at time ``t``."""
         return ExternalEffects.of(x.p.dtype, wind=self.mean + self.turbulence(t) @ axes_along(self.mean))
 
 
@@ -140,7 +140,7 @@ class Fan(eqx.Module):
         key: Key[Array, ""],
         intensity: float = 0.15,
     ) -> "Fan":
-        """With gusts of ``intensity`` times the speed, eddies as large as the outlet is wide."""
+        """Draw a jet with gusts of ``intensity`` times its speed and eddies as large as the outlet is wide."""
         if not (speed > 0 and width > 0 and 0 <= intensity < 1) or float(jnp.linalg.norm(direction[:2])) == 0.0:
             raise ValueError(
                 f"Fan: speed = {speed}, width = {width}, intensity = {intensity}, direction = {direction} cannot be"
@@ -149,7 +149,7 @@ class Fan(eqx.Module):
         return cls(outlet, direction, jnp.array(speed), jnp.array(width), eddies)
 
     def __call__(self, t: Float[Array, ""], x: State) -> ExternalEffects:
-        """Blown at by the jet where the vehicle is."""
+        """Return the wind of the jet at the vehicle's position."""
         axes = axes_along(self.direction)
         along, *off = axes @ (x.p - self.outlet)
         width = self.width + self.SPREAD * jnp.maximum(along, 0.0)

@@ -45,7 +45,7 @@ class AbstractHover(AbstractTask):
         return self.goal
 
     def reset(self, key: Key[Array, ""]) -> Start:
-        """Goal +- 1 m per axis, yaw within ``heading``, pitch and roll within 18 degrees, 0.1 m/s of velocity noise."""
+        """Draw a start: goal +- 1 m per axis, yaw within ``heading``, pitch and roll within 18 degrees, 0.1 m/s."""
         kp, ka, kv = random.split(key, 3)
         p = self.goal + random.uniform(kp, (3,), minval=-1.0, maxval=1.0)
         roll, pitch, turn = random.uniform(ka, (3,), minval=-1.0, maxval=1.0)
@@ -62,18 +62,18 @@ class AbstractHover(AbstractTask):
 
 
 class Hover(AbstractHover):
-    """With the paper's reward."""
+    """Hover with the paper's reward."""
 
     def reward(self, t: Float[Array, ""], x: State, u: Command) -> Float[Array, ""]:
-        """r_pos + r_vel + r_act of the paper. The rate term acts on the commanded body rates, which Eq. (1) obeys."""
+        """Return r_pos + r_vel + r_act of the paper; the rate term acts on the commanded body rates."""
         return _printed(self.goal, x, u)
 
 
 class L2Hover(AbstractHover):
-    """With a reward that has a tip at the goal: the paper's is flat there, and a policy stays centimetres off."""
+    """Hover with a reward that has a tip at the goal: the paper's is flat there and leaves an error of centimetres."""
 
     def reward(self, t: Float[Array, ""], x: State, u: Command) -> Float[Array, ""]:
-        """The paper's reward - 3 (sqrt(|p - goal|^2 + (1 cm)^2) - 1 cm)."""
+        """Return the paper's reward - 3 (sqrt(|p - goal|^2 + (1 cm)^2) - 1 cm)."""
         tip = jnp.sqrt(jnp.sum((x.p - self.goal) ** 2) + 0.01**2) - 0.01
         return _printed(self.goal, x, u) - 3.0 * tip
 

@@ -115,7 +115,7 @@ class Keypoints(AbstractObservation[KeypointMemory]):
         return dataclasses.replace(self, occlusion=True, dropout=jnp.array(dropout))
 
     def init(self, x: State) -> KeypointMemory:
-        """As if the vehicle had come in a straight line, without turning, and hovered by its commands."""
+        """Return the memory of a vehicle that came in a straight line, without turning, under hover commands."""
         frames = self.history(x, jnp.zeros_like(x.p))
         bits = lax.bitcast_convert_type(jnp.sum(x.p + x.v).astype(jnp.float32), jnp.int32)
         commands = jnp.zeros((COMMANDS, 4), dtype=x.p.dtype)
@@ -123,7 +123,7 @@ class Keypoints(AbstractObservation[KeypointMemory]):
         return KeypointMemory(frames, commands, PoseFilter.near(x, k_pose), key)
 
     def history(self, x: State, omega: Float[Array, "3"]) -> Float[Array, "depth 14"]:
-        """Frames of a motion with constant velocity and body rates that ends in ``x``, oldest first."""
+        """Return the frames of a motion with constant velocity and body rates that ends in ``x``, oldest first."""
         ago = self.dt * jnp.arange(self.depth - 1, -1, -1, dtype=x.p.dtype)
 
         def frame(s: Float[Array, ""]) -> Float[Array, "14"]:
@@ -132,20 +132,20 @@ class Keypoints(AbstractObservation[KeypointMemory]):
         return jax.vmap(frame)(ago)
 
     def stacked(self, frames: Float[Array, "depth 14"]) -> Float[Array, "70"]:
-        """The five frames that are shown, newest first."""
+        """Return the five frames of the observation, newest first."""
         return frames[:: -self.stride].reshape(-1)
 
     def features(self, frames: Float[Array, "depth 14"]) -> Float[Array, "70"]:
-        """Whitened; frames that fit no motion, as when points come into sight, are cut off."""
+        """Return whitened frames, clipped where they fit no motion, as when points come into sight."""
         return jnp.clip(self.whiten @ (self.stacked(frames) - self.mean), -FEATURE_LIMIT, FEATURE_LIMIT)
 
     def pixels(self, x: State) -> tuple[Float[Array, "7 2"], Bool[Array, " 7"]]:
-        """Where the points appear, cut off far outside the image, and which are visible."""
+        """Return the projections of the points, clipped far outside the image, and which are visible."""
         seen = jax.vmap(self.camera.project)(in_camera(x, self.ground()))
         return jnp.clip(seen.pixel, -FAR, FAR), seen.visible
 
     def ground(self) -> Float[Array, "7 3"]:
-        """The points, world [m]."""
+        """Return the points, world [m]."""
         flat = jnp.array(PATTERN, dtype=self.goal.dtype)
         return self.goal[None] + jnp.concatenate([flat, jnp.full((7, 1), -BELOW, dtype=flat.dtype)], axis=1)
 
@@ -181,7 +181,7 @@ class Keypoints(AbstractObservation[KeypointMemory]):
 
 
 def random_motion(key: Key[Array, ""], goal: Float[Array, "3"]) -> tuple[State, Float[Array, "3"]]:
-    """A random state near the goal and body rates, for representation learning; the key is consumed."""
+    """Draw a random state near the goal, and body rates, for encoder pretraining; the key is consumed."""
     kp, kr, ky, kv, kw = random.split(key, 5)
     p = goal + random.uniform(kp, (3,), goal.dtype, minval=-1.2, maxval=1.2)
     R = so3.rotz(0.4 * random.normal(ky, (), goal.dtype)) @ so3.exp(0.2 * random.normal(kr, (3,), goal.dtype))

@@ -1,4 +1,4 @@
-"""o = h(x): what a policy sees. The same function serves roll-outs, evaluation and flight."""
+"""Observations o = h(x). The same function serves roll-outs, evaluation and flight."""
 
 import abc
 from typing import Generic, TypeVar
@@ -25,11 +25,11 @@ class AbstractObservation(eqx.Module, Generic[M]):
 
     @abc.abstractmethod
     def init(self, x: State) -> M:
-        """Memory at the start of a flight or roll-out."""
+        """Return the memory at the start of a flight or roll-out."""
 
     @abc.abstractmethod
     def __call__(self, memory: M, t: Float[Array, ""], x: State, last: Command) -> tuple[Float[Array, " o"], M]:
-        """Observation at time ``t`` [s], given the command issued one tick ago; and the new memory."""
+        """Return the observation at time ``t`` [s], given the command issued one tick ago, and the new memory."""
 
 
 class StateObs(AbstractObservation[Float[Array, "history 4"]]):
@@ -45,17 +45,17 @@ class StateObs(AbstractObservation[Float[Array, "history 4"]]):
 
     @property
     def size(self) -> int:
-        """15 + 4 ``history``."""
+        """Length of the observation: 15 + 4 ``history``."""
         return 15 + 4 * self.history
 
     def init(self, x: State) -> Float[Array, "history 4"]:
-        """As if the vehicle had hovered until now."""
+        """Return the memory of a vehicle that has hovered until now."""
         return jnp.zeros((self.history, 4), dtype=x.p.dtype)
 
     def __call__(
         self, memory: Float[Array, "history 4"], t: Float[Array, ""], x: State, last: Command
     ) -> tuple[Float[Array, " o"], Float[Array, "history 4"]]:
-        """Scaled state and commands."""
+        """Return the scaled state and commands."""
         scaled = jnp.concatenate([(last.c / STANDARD_GRAVITY - 1.0)[None], last.omega / self.omega_max])
         memory = jnp.concatenate([memory, scaled[None]])[1:]
         state = jnp.concatenate([(x.p - self.origin) / POSITION_SCALE, x.R.reshape(9), x.v / VELOCITY_SCALE])

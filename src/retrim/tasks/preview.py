@@ -1,4 +1,4 @@
-"""What a control engineer would show a tracking policy: where it should be, now and soon."""
+"""Observation of a tracking policy: the reference relative to the vehicle, now and up to 0.4 s ahead."""
 
 import equinox as eqx
 import jax
@@ -25,17 +25,17 @@ class Preview(AbstractObservation[Float[Array, "history 4"]]):
 
     @property
     def size(self) -> int:
-        """35 + 4 ``history``."""
+        """Length of the observation: 35 + 4 ``history``."""
         return 3 * len(POSITIONS) + 3 * len(VELOCITIES) + 9 + 3 + 2 + 4 * self.history
 
     def init(self, x: State) -> Float[Array, "history 4"]:
-        """As if the vehicle had hovered until now."""
+        """Return the memory of a vehicle that has hovered until now."""
         return jnp.zeros((self.history, 4), dtype=x.p.dtype)
 
     def __call__(
         self, memory: Float[Array, "history 4"], t: Float[Array, ""], x: State, last: Command
     ) -> tuple[Float[Array, " o"], Float[Array, "history 4"]]:
-        """Relative to the vehicle, in world axes."""
+        """Return the reference relative to the vehicle, in world axes, with attitude, velocity and commands."""
         scaled = jnp.concatenate([(last.c / STANDARD_GRAVITY - 1.0)[None], last.omega / self.omega_max])
         memory = jnp.concatenate([memory, scaled[None]])[1:]
         soon = jax.vmap(self.reference)(t + jnp.array(POSITIONS, dtype=t.dtype))

@@ -35,7 +35,7 @@ class AbstractTask(eqx.Module):
 
         @property
         def observation(self) -> AbstractObservation[Any]:
-            """h(x): what the policy sees, in training and in flight."""
+            """h(x), the observation of training."""
     else:
         dt: eqx.AbstractVar[float]
         horizon: eqx.AbstractVar[int]
@@ -75,7 +75,7 @@ class AbstractTask(eqx.Module):
 
     @abc.abstractmethod
     def reward(self, t: Float[Array, ""], x: State, u: Command) -> Float[Array, ""]:
-        """r(x_t, u_t), differentiable; ``u`` is the command that acts from ``t`` on."""
+        """Return r(x_t, u_t), differentiable; ``u`` is the command that acts from ``t`` on."""
 
     @abc.abstractmethod
     def terminated(self, t: Float[Array, ""], x: State) -> Bool[Array, ""]:
@@ -91,14 +91,14 @@ class AbstractTask(eqx.Module):
 
 
 def within(box: Float[Array, ""], x: State, centre: Float[Array, "3"]) -> Bool[Array, ""]:
-    """Whether ``x`` is finite, and no farther than ``box`` [m] from ``centre`` (world) along any axis."""
+    """Return whether ``x`` is finite, and no farther than ``box`` [m] from ``centre`` (world) along any axis."""
     finite = jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(x)])
     inside: Bool[Array, ""] = jnp.all(jnp.abs(x.p - centre) <= box) & jnp.all(finite)
     return inside
 
 
 def huber(y: Float[Array, " n"]) -> Float[Array, ""]:
-    """Huber loss with threshold 1 of the 2-norm of ``y``: |y|^2 / 2 up to 1, |y| - 1/2 beyond.
+    """Return the Huber loss with threshold 1 of the 2-norm of ``y``: |y|^2 / 2 up to 1, |y| - 1/2 beyond.
 
     The paper says "the Huber loss" of a vector and leaves open whether of its norm or of each component; the norm does
     not depend on the choice of axes. Exact, with an exact gradient, at zero.

@@ -33,7 +33,7 @@ class AbstractTrack(AbstractTask):
     horizon: int = eqx.field(static=True, default=150)
 
     def reset(self, key: Key[Array, ""]) -> Start:
-        """Anywhere on the reference, away from it by the spread, 0.3 m/s of velocity noise, within 18 degrees."""
+        """Draw a start anywhere on the reference, within the spread of it, 0.3 m/s and 18 degrees."""
         k_join, k_time, kp, ka, kv = random.split(key, 5)
         joins = self.reference.joins
         span = joins[random.randint(k_join, (), 0, joins.shape[0])]
@@ -81,22 +81,22 @@ class AbstractTrack(AbstractTask):
 
 
 class Track(AbstractTrack):
-    """With the paper's reward."""
+    """Tracking with the paper's reward."""
 
     def reward(self, t: Float[Array, ""], x: State, u: Command) -> Float[Array, ""]:
-        """-L_H(p - p_ref) - L_H(v - v_ref) - 0.1 L_H(u - u_hover)."""
+        """Return -L_H(p - p_ref) - L_H(v - v_ref) - 0.1 L_H(u - u_hover)."""
         here = self.reference(t)
         return -huber(x.p - here.p) - huber(x.v - here.v) - 0.1 * huber(u.vector() - Command.hover().vector())
 
 
 class L2Track(AbstractTrack):
-    """With a reward that is five times as sharp in position, and asks for the reference's own command.
+    """Tracking with a reward five times as steep in position, around the reference's own command.
 
     The paper's trades centimetres for tilt, even without any disturbance.
     """
 
     def reward(self, t: Float[Array, ""], x: State, u: Command) -> Float[Array, ""]:
-        """-L_H(5 (p - p_ref)) - L_H(v - v_ref) - 0.1 L_H(u - u_ref) - 0.5 (1 - cos of the heading error)."""
+        """Return -L_H(5 (p - p_ref)) - L_H(v - v_ref) - 0.1 L_H(u - u_ref) - 0.5 (1 - cos of the heading error)."""
         here = self.reference(t)
         heading = jnp.stack([jnp.cos(here.heading), jnp.sin(here.heading)])
         astray = 1.0 - jnp.sum(heading * x.R[:2, 0])

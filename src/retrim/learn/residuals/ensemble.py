@@ -36,7 +36,7 @@ class EnsembleResidual(eqx.Module):
         members: int = 3,
         hidden: tuple[int, ...] = (128, 128),
     ) -> "EnsembleResidual":
-        """Fresh networks that differ in their seeds; the last layer is zero, so that they predict nothing yet."""
+        """Return fresh networks that differ in their seeds; the last layer is zero, so that they predict zero."""
         sizes = (19, *hidden, 3)
 
         def member(key: Key[Array, ""]) -> tuple[eqx.nn.Linear, ...]:
@@ -64,7 +64,7 @@ class EnsembleResidual(eqx.Module):
         )
 
     def __call__(self, x: State, u: Command) -> Float[Array, "3"]:
-        """Mean prediction of the members."""
+        """Return the mean prediction of the members [m/s^2]."""
         return jnp.mean(self.members(x, u), axis=0)
 
     def members(self, x: State, u: Command) -> Float[Array, "members 3"]:
@@ -82,7 +82,7 @@ class EnsembleState(eqx.Module):
 
     @classmethod
     def of(cls, residual: EnsembleResidual, optimiser: optax.GradientTransformation) -> "EnsembleState":
-        """Before the first fit."""
+        """Return the state before the first fit."""
         vectors = jax.tree.map(
             lambda l: jnp.ones(l.weight.shape[1], dtype=l.weight.dtype) / l.weight.shape[1] ** 0.5,
             residual.layers,
