@@ -16,7 +16,11 @@ MAX_TOML_BYTES = 1_000_000
 
 
 def load(name: str, overlay: Path | None = None) -> Preset:
-    """Return the preset ``name``, overlaid with a TOML file.
+    """Return a preset.
+
+    Args:
+        name: As ``hover/fast``; ``PRESETS`` has all of them.
+        overlay: A TOML file with values on top.
 
     Raises:
         ConfigError: There is no such preset, or the file cannot be used.
@@ -41,7 +45,11 @@ def load_for(task: str, name: str) -> Preset:
 
 
 def overlaid(preset: Preset, overlay: Path) -> Preset:
-    """Return the preset with the values of a TOML file on top.
+    """Return a preset with the values of a TOML file on top.
+
+    Args:
+        preset: What lies below.
+        overlay: The file; a relative vehicle file in it is looked up beside it.
 
     Raises:
         ConfigError: The file cannot be read, is not TOML, or has a key or value that does not fit.
@@ -88,7 +96,11 @@ def parse(text: str | bytes, *, source: str) -> Preset:
 
 
 def changed(preset: Preset, **tables: Any) -> Preset:
-    """Return the preset with some values replaced, as in ``changed(preset, adapt={"num_updates": 5})``.
+    """Return a preset with some values replaced, as in ``changed(preset, adapt={"num_updates": 5})``.
+
+    Args:
+        preset: What lies below.
+        **tables: Values, and tables of values.
 
     Raises:
         ConfigError: A key or value does not fit.

@@ -22,7 +22,16 @@ class AbstractController(eqx.Module, Generic[M]):
 
     @abc.abstractmethod
     def __call__(self, memory: M, t: Float[Array, ""], x: State) -> tuple[Command, M]:
-        """Return the command at time ``t`` [s] since the start of the flight, and the new memory."""
+        """Decide the next command.
+
+        Args:
+            memory: What :meth:`init` or the last call returned.
+            t: Time since the start of the flight [s].
+            x: Measured state.
+
+        Returns:
+            The command, and the new memory of the same shapes.
+        """
 
     def accepted(self, memory: M, u: Command) -> M:
         """Return the memory after the plant accepted ``u`` instead of the command that was issued last."""

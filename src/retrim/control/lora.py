@@ -44,9 +44,16 @@ class LoraPolicy(eqx.Module):
     def of(
         cls, base: Policy, *, key: Key[Array, ""], ranks: tuple[int, ...] = RANKS, scale: float = SCALE
     ) -> "LoraPolicy":
-        """Return a fresh delta, one rank per layer: A uniform within 1 / sqrt(fan-in) (Kaiming), B zero.
+        """Return a fresh delta: A uniform within 1 / sqrt(fan-in) (Kaiming), B zero, so that nothing changes yet.
 
-        Raises ``ValueError`` unless there is a rank for each layer, from 1 to the smaller side of its matrix.
+        Args:
+            base: Policy to adapt.
+            key: Consumed.
+            ranks: One rank per layer (the paper's for two hidden layers by default).
+            scale: Factor of B A.
+
+        Raises:
+            ValueError: There is no rank for each layer, from 1 to the smaller side of its matrix.
         """
         if len(ranks) != len(base.layers):
             raise ValueError(f"LoRA: {len(ranks)} ranks {ranks} for {len(base.layers)} layers")

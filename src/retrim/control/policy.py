@@ -33,7 +33,14 @@ class Policy(eqx.Module):
     def of(
         cls, observation_size: int, vehicle: Vehicle, *, key: Key[Array, ""], hidden: tuple[int, ...] = (512, 512)
     ) -> "Policy":
-        """Return a fresh network: kernels N(0, 0.01 / mean of fan-in and fan-out), biases zero; it hovers."""
+        """Return a fresh network: kernels N(0, 0.01 / mean of fan-in and fan-out), biases zero; it commands hover.
+
+        Args:
+            observation_size: Length of the observation.
+            vehicle: It gives the limits of the commands.
+            key: Consumed.
+            hidden: Widths of the hidden layers.
+        """
         sizes = (observation_size, *hidden, 4)
         layers = []
         for fan_in, fan_out, k in zip(sizes[:-1], sizes[1:], random.split(key, len(sizes) - 1), strict=True):

@@ -87,13 +87,25 @@ def fingerprint(policy: Policy) -> str:
 
 
 def save_delta(path: str | Path, policy: LoraPolicy) -> None:
-    """Write what a low-rank policy has learnt, without its base: about 50 kB for the paper's network."""
+    """Write what a low-rank policy has learnt, without its base: about 50 kB for the paper's network.
+
+    Args:
+        path: The file; its folder is made if need be.
+        policy: Delta and base; the file names the base by a hash.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
     about = {"base": fingerprint(policy.base), **lora_header(policy)}
     write_whole(Path(path), wire.pack(policy.delta, kind="delta", about=about))
 
 
 def load_delta(path: str | Path, base: Policy) -> LoraPolicy:
-    """Read a delta and put it on its base; ``.merged()`` flies.
+    """Read a delta and put it on its base; ``.merged()`` of the result flies.
+
+    Args:
+        path: The file.
+        base: The policy that the delta was made for.
 
     Raises:
         CheckpointError: The file is missing, damaged or of another kind, or made for another base.

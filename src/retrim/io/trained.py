@@ -18,7 +18,16 @@ from .files import read_bounded, write_whole
 
 
 def save_policy(path: str | Path, policy: Policy, preset: Preset) -> None:
-    """Write a policy and the preset that it was trained with; the folder is made if need be."""
+    """Write a policy and the preset that it was trained with.
+
+    Args:
+        path: The file; its folder is made if need be.
+        policy: What to write.
+        preset: It says how to fly the policy.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
     write_policy(path, policy, {"preset": dump(preset), "task": preset.task})
 
 
@@ -34,7 +43,16 @@ def load_policy(path: str | Path) -> tuple[Policy, Preset]:
 
 
 def save_learnt(path: str | Path, state: LearnerState, preset: Preset) -> None:
-    """Write what a flight has learnt: policy, residual and optimiser states, with the preset."""
+    """Write what a flight has learnt: policy, residual and optimiser states, with the preset.
+
+    Args:
+        path: The file; its folder is made if need be.
+        state: As ``pilot.state`` of an adaptive pilot.
+        preset: Preset of the flight.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
     policy = state.policy.policy
     low_rank = lora_header(policy) if isinstance(policy, LoraPolicy) else {}
     about = {"preset": dump(preset), "architecture": architecture(policy.merged()), **low_rank}

@@ -62,7 +62,13 @@ class BemQuadrotor(AbstractSubstepDynamics[BemState]):
 
     @classmethod
     def of(cls, vehicle: Vehicle, dt: float, *, thrust_error: float = 0.035) -> "BemQuadrotor":
-        """Build the model with a thrust map that is wrong by ``thrust_error``: u_hover gives (1 + thrust_error) m g.
+        """Build the model of a vehicle.
+
+        Args:
+            vehicle: Its constants.
+            dt: Control tick [s], a whole number of milliseconds.
+            thrust_error: By how much more than commanded the rotors give, as a share: in still air, u_hover gives
+                (1 + thrust_error) m g.
 
         T / Omega^2 of a propeller in still air is constant, so one number calibrates the whole range.
         """

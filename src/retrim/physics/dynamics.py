@@ -53,7 +53,16 @@ class AbstractDynamics(eqx.Module, Generic[X]):
 
     @abc.abstractmethod
     def step(self, s: X, u: Command, a_ext: Float[Array, "3"]) -> X:
-        """Advance one tick under the command ``u`` and the acceleration ``a_ext`` (world [m/s^2]), both held."""
+        """Advance one control tick.
+
+        Args:
+            s: State of the model.
+            u: Command, held over the tick.
+            a_ext: External acceleration, world [m/s^2], held over the tick.
+
+        Returns:
+            The state of the model at the end of the tick.
+        """
 
 
 def f_a(x: State, u: Command, a_ext: Float[Array, "3"]) -> StateDot:

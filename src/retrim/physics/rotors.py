@@ -56,7 +56,13 @@ class LinearDragQuadrotor(AbstractSubstepDynamics[RotorState]):
 
     @classmethod
     def of(cls, vehicle: Vehicle, dt: float, *, thrust_error: float = 0.035) -> "LinearDragQuadrotor":
-        """Build the model with rotor drag of 0.3, 0.3, 0.37 1/s and, by default, +3.5 % of thrust."""
+        """Build the model of a vehicle, with rotor drag of 0.3, 0.3, 0.37 1/s.
+
+        Args:
+            vehicle: Its constants.
+            dt: Control tick [s], a whole number of milliseconds.
+            thrust_error: By how much more than commanded the rotors give, as a share.
+        """
         return cls(vehicle, default_rate_loop(), jnp.array(1.0 + thrust_error), jnp.array([0.3, 0.3, 0.37]), dt)
 
     def init(self, x: State) -> RotorState:

@@ -54,7 +54,20 @@ class SensorModel(eqx.Module):
         gyro: float = 0.0,
         accelerometer: float = 0.0,
     ) -> "SensorModel":
-        """Build a sensor model from plain numbers; by default exact, without latency, every 10 ms."""
+        """Build a sensor model from plain numbers; by default exact, without latency, every 10 ms.
+
+        Args:
+            position: Standard deviation per axis [m].
+            velocity: Standard deviation per axis [m/s].
+            attitude: Standard deviation per body axis [rad].
+            dropout: Probability that a sample is lost.
+            latency: Age of a sample when it arrives [ms].
+            gyro: Standard deviation of the body rates per axis [rad/s].
+            accelerometer: Standard deviation of the acceleration per axis [m/s^2].
+
+        Raises:
+            ValueError: A deviation or time is negative, or the probability is none.
+        """
         return cls(
             jnp.array(position),
             jnp.array(velocity),
@@ -78,7 +91,16 @@ class SensorModel(eqx.Module):
         return State(x.p + self.position * p, x.R @ so3.exp(self.attitude * r), x.v + self.velocity * v)
 
     def received(self, queue: State, xs: State, key: Key[Array, ""]) -> State:
-        """The queue (oldest first, ``held`` long) after the true states ``xs``, one per period, were sampled."""
+        """Sample true states.
+
+        Args:
+            queue: Samples that were under way, oldest first, :attr:`held` of them.
+            xs: True states, one per period (leading axis).
+            key: Consumed.
+
+        Returns:
+            The queue after the last sample.
+        """
 
         def one(queue: State, step: tuple[State, Key[Array, ""]]) -> tuple[State, None]:
             x, key = step

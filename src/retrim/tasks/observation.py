@@ -29,7 +29,17 @@ class AbstractObservation(eqx.Module, Generic[M]):
 
     @abc.abstractmethod
     def __call__(self, memory: M, t: Float[Array, ""], x: State, last: Command) -> tuple[Float[Array, " o"], M]:
-        """Return the observation at time ``t`` [s], given the command issued one tick ago, and the new memory."""
+        """Observe once; called at every tick.
+
+        Args:
+            memory: What :meth:`init` or the last call returned.
+            t: Time of the task [s].
+            x: State.
+            last: Command issued one tick ago.
+
+        Returns:
+            The observation, and the new memory of the same shapes.
+        """
 
 
 class StateObs(AbstractObservation[Float[Array, "history 4"]]):

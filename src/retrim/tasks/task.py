@@ -75,7 +75,13 @@ class AbstractTask(eqx.Module):
 
     @abc.abstractmethod
     def reward(self, t: Float[Array, ""], x: State, u: Command) -> Float[Array, ""]:
-        """Return r(x_t, u_t), differentiable; ``u`` is the command that acts from ``t`` on."""
+        """Return the reward r(x_t, u_t), differentiable in x and u.
+
+        Args:
+            t: Time of the task [s].
+            x: State at ``t``.
+            u: Command that acts from ``t`` on.
+        """
 
     @abc.abstractmethod
     def terminated(self, t: Float[Array, ""], x: State) -> Bool[Array, ""]:
