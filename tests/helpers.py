@@ -25,10 +25,10 @@ def random_command(key):
     return Command(9.81 + random.normal(kc, ()), random.normal(kw, (3,)))
 
 
-def hover_task(*, horizon=5, history=0, heading=math.pi, box=5.0, dt=0.02):
+def hover_task(*, horizon=5, history=0, heading=math.pi, box=5.0, dt=0.02, make=Hover):
     goal = jnp.array(GOAL)
     observation = StateObs(goal, small().omega_max, history)
-    return Hover(goal, observation, jnp.array(box), jnp.array(heading), dt, horizon)
+    return make(goal, observation, jnp.array(box), jnp.array(heading), dt, horizon)
 
 
 def hover_env(dynamics=None, *, delay_ticks=0, **task):

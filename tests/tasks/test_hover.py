@@ -15,7 +15,7 @@ from retrim.learn import rollout
 from retrim.physics import Command, State, small, so3
 from retrim.plants import Measurement
 from retrim.runtime import ControllerPilot
-from retrim.tasks import StateObs, huber
+from retrim.tasks import Hover, L2Hover, StateObs, huber
 
 
 @pytest.mark.parametrize(
@@ -40,8 +40,30 @@ def test_reward_by_hand():
     assert task.reward(jnp.array(0.0), State.at(jnp.array(GOAL)), Command.hover()) == 0.0
 
 
-def test_reward_is_differentiable_everywhere(key):
-    task = hover_task()
+@pytest.mark.parametrize("away", [(0.0, 0.0, 0.0), (0.03, 0.0, 0.04), (-0.6, 0.8, 0.0)])
+def test_the_l2_reward_has_a_tip_at_the_goal(away, key):
+    """It is the paper's - 3 (sqrt(d^2 + (1 cm)^2) - 1 cm), whatever attitude, velocity and command."""
+    x, u = random_state(key), random_command(key)
+    x = replaced(x, p=jnp.array(GOAL) + jnp.array(away))
+    paper, ours = hover_task().reward(jnp.array(0.0), x, u), hover_task(make=L2Hover).reward(jnp.array(0.0), x, u)
+    d = math.hypot(*away)
+    assert float(ours - paper) == pytest.approx(-3.0 * (math.hypot(d, 0.01) - 0.01), abs=1e-12)
+
+
+def test_only_the_l2_reward_is_steep_close_to_the_goal():
+    """Three centimetres off, the slope of the paper's has fallen to 0.75 per metre; the tip's is 2.85 more."""
+    x = State.at(jnp.array(GOAL) + jnp.array([0.03, 0.0, 0.0]))
+    slopes = [
+        float(jax.grad(lambda p, task=task: task.reward(jnp.array(0.0), replaced(x, p=p), Command.hover()))(x.p)[0])
+        for task in (hover_task(), hover_task(make=L2Hover))
+    ]
+    assert slopes[0] == pytest.approx(-0.75)
+    assert slopes[1] == pytest.approx(-0.75 - 3.0 * 0.03 / math.hypot(0.03, 0.01))
+
+
+@pytest.mark.parametrize("make", [Hover, L2Hover])
+def test_reward_is_differentiable_everywhere(make, key):
+    task = hover_task(make=make)
     for x, u in [(State.at(jnp.array(GOAL)), Command.hover()), (random_state(key), random_command(key))]:
         gradient = jax.grad(lambda xu: task.reward(jnp.array(0.0), *xu))((x, u))
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))

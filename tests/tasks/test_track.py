@@ -15,8 +15,8 @@ from retrim.learn import Env, rollout
 from retrim.physics import Command, PointMass, State, small, so3
 from retrim.plants import Measurement
 from retrim.runtime import ControllerPilot
-from retrim.tasks import L2Track, Preview, Reference, Start, StateObs, Track
-from retrim.tasks.reference import circle, star
+from retrim.tasks import L2Track, Preview, Reference, Start, StateObs, Track, huber
+from retrim.tasks.shapes import circle, star
 
 
 @pytest.fixture(scope="module")
@@ -60,6 +60,21 @@ def test_sharp_reward_by_hand(nose):
     u = Command.of(nose(jnp.array(3.0)).u + jnp.array([0.6, 0.0, 0.8, 0.0]))
     wanted = -(2.0 + 0.125 + 0.1 * 0.5 + 0.5 * (1.0 - 0.5))
     assert float(tracking(nose, L2Track).reward(jnp.array(3.0), x, u)) == pytest.approx(wanted, rel=1e-6)
+
+
+def test_l2_reward_against_the_papers(loop, key):
+    """Five times as sharp in position, another command asked for, and half of 1 - cos of the heading error."""
+    t, x, u = jnp.array(4.0), random_state(key), random_command(key)
+    here, hover = loop(t), np.array([9.81, 0.0, 0.0, 0.0])
+    off, issued = x.p - here.p, u.vector()
+    nose = np.array([math.cos(float(here.heading)), math.sin(float(here.heading))])
+    difference = -(huber(5.0 * off) - huber(off)) - 0.1 * (huber(issued - here.u) - huber(issued - hover))
+    difference -= 0.5 * (1.0 - float(nose @ np.asarray(x.R)[:2, 0]))
+    found = tracking(loop, L2Track).reward(t, x, u) - tracking(loop).reward(t, x, u)
+    assert float(found) == pytest.approx(float(difference), rel=1e-12)
+    near = replaced(on(loop, 4.0), p=here.p + jnp.array([0.0, 0.0, 0.1]))
+    own = Command.of(here.u)
+    assert float(tracking(loop, L2Track).reward(t, near, own)) == pytest.approx(-0.5 * (5.0 * 0.1) ** 2, rel=1e-6)
 
 
 def test_what_each_reward_wants(loop):

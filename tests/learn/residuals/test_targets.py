@@ -2,6 +2,7 @@
 
 import math
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -40,6 +41,20 @@ def test_a_row_holds_the_state_at_its_tick_and_the_command_that_acted(key):
     rows = residual_targets(window, PointMass(DT), delay_ticks=2)
     np.testing.assert_array_equal(rows.x.p, window.x.p[2:19])
     np.testing.assert_array_equal(rows.u.c, window.u.c[:17])
+
+
+@pytest.mark.parametrize("delay", [0, 1])
+def test_measured_accelerations_take_the_place_of_differences(delay, key):
+    """Noise of the velocity then leaves the targets alone; without the measurement it is magnified by 1 / dt."""
+    window = random_field_flight(linear_drag, key, n=20, delay_ticks=delay)
+    clean = residual_targets(window, PointMass(DT), delay_ticks=delay)
+    measured = jnp.concatenate([jnp.diff(window.x.v, axis=0) / DT, jnp.zeros((1, 3))])
+    rows = residual_targets(window, PointMass(DT), delay_ticks=delay, a_gt=measured)
+    np.testing.assert_allclose(rows.a_res, clean.a_res, atol=1e-10)
+    noisy = eqx.tree_at(lambda w: w.x.v, window, window.x.v + 0.1 * jax.random.normal(key, (20, 3)))
+    aided = residual_targets(noisy, PointMass(DT), delay_ticks=delay, a_gt=measured)
+    np.testing.assert_allclose(aided.a_res, clean.a_res, atol=1e-10)
+    assert float(jnp.abs(residual_targets(noisy, PointMass(DT), delay_ticks=delay).a_res - clean.a_res).max()) > 1.0
 
 
 def test_a_window_must_be_longer_than_the_delay(key):

@@ -1,0 +1,78 @@
+"""What the models with rotors tell a plant beside the state: which commands they take, how body and rotors turn."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from helpers import random_command, random_state, replaced
+from retrim.physics import BemQuadrotor, Command, LinearDragQuadrotor, RotorState, State, large, small
+from retrim.physics.substep import AbstractSubstepDynamics
+
+MODELS = {"linear drag": LinearDragQuadrotor, "bem": BemQuadrotor}
+
+
+@pytest.mark.parametrize("make", MODELS.values(), ids=MODELS)
+@pytest.mark.parametrize("vehicle", [small, large])
+def test_command_limits_are_those_of_the_vehicle(make, vehicle):
+    low, high = make.of(vehicle(), 0.02).command_limits
+    np.testing.assert_array_equal(low.vector(), vehicle().command_min.vector())
+    np.testing.assert_array_equal(high.vector(), vehicle().command_max.vector())
+    assert (low.vector() < Command.hover().vector()).all()
+    assert (high.vector() > Command.hover().vector()).all()
+
+
+def test_the_linear_model_obeys_no_command_beyond_its_limits():
+    """A command beyond them moves the vehicle as the limit itself does."""
+    model = LinearDragQuadrotor.of(small(), 0.02)
+    _, high = model.command_limits
+    wild = Command(10.0 * high.c, 10.0 * high.omega)
+    step = eqx.filter_jit(lambda u: model.step(model.init(State.at(jnp.zeros(3))), u, jnp.zeros(3)))
+    jax.tree.map(np.testing.assert_array_equal, step(wild), step(high))
+
+
+@pytest.mark.parametrize("make", MODELS.values(), ids=MODELS)
+def test_rotor_state_is_what_the_model_turns_with(make, key):
+    """Before the first tick: no body rate, four equal rotors. After a roll command: a roll rate, and unequal rotors."""
+    model = make.of(small(), 0.02, thrust_error=0.0)
+    x = random_state(key)
+    s = model.init(x)
+    found = model.rotor_state(s)
+    assert isinstance(found, RotorState)
+    jax.tree.map(np.testing.assert_array_equal, found.x, x)
+    np.testing.assert_array_equal(found.omega, 0.0)
+    np.testing.assert_allclose(found.motors, small().hover_speed, rtol=0.05)
+    roll = Command(jnp.array(9.81), jnp.array([3.0, 0.0, 0.0]))
+    after = eqx.filter_jit(model.step)(model.init(State.at(jnp.zeros(3))), roll, jnp.zeros(3))
+    turning = model.rotor_state(after)
+    jax.tree.map(np.testing.assert_array_equal, turning.x, model.state(after))
+    assert float(turning.omega[0]) > 0.2
+    right, left = turning.motors[jnp.array([0, 2])], turning.motors[jnp.array([1, 3])]
+    assert float(left.min()) > float(right.max())
+
+
+class Bare(AbstractSubstepDynamics[State]):
+    """A model without rotors and limits."""
+
+    dt: float = eqx.field(static=True, default=0.02)
+
+    def init(self, x):
+        return x
+
+    def state(self, s):
+        return s
+
+    def with_state(self, s, x):
+        return x
+
+    def substep(self, s, u, effects):
+        return replaced(s, p=s.p + 1e-3 * s.v)
+
+
+def test_a_model_need_have_neither(key):
+    x = random_state(key)
+    assert Bare().command_limits is None
+    assert Bare().rotor_state(x) is None
+    moved = Bare().step(x, random_command(key), jnp.zeros(3))
+    np.testing.assert_allclose(moved.p, x.p + 0.02 * x.v, rtol=1e-12)
