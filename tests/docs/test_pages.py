@@ -61,7 +61,9 @@ def test_toml_files_of_pages_are_accepted(tmp_path):
 def test_commands_of_documents_exist():
     shown = set[str]()
     for page in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *DOCS.glob("*.md"), *(DOCS / "how-to").glob("*.md")):
-        shown |= set(re.findall(r"^(?:\.venv/bin/)?retrim ([a-z]+)", page.read_text(), re.M))
+        for block in re.finditer(r"^```(?P<kind>[^\n]*)\n(?P<text>.*?)^```$", page.read_text(), re.M | re.S):
+            if not block["kind"]:
+                shown |= set(re.findall(r"^(?:\.venv/bin/)?retrim ([a-z]+)", block["text"], re.M))
     assert shown <= set(COMMANDS)
     assert {"pretrain", "fly", "sweep"} <= shown
 
