@@ -1,66 +1,58 @@
-"""A residual of your own: three numbers instead of a neural network, fitted in one line.
+"""A residual model of your own: three numbers instead of neural networks, in the same loop.
 
-You learn that any (x, u) -> acceleration corrects a model, how flight data become its targets, and how to improve a
-policy by hand: what AdaptivePilot does for you, in the open. Printed are the fitted bias, and the error before and
-after.
+You learn the four methods that a residual model needs, and to put it into a set-up; the learner then corrects its
+simulator with it. Printed are the hover error without and with adaptation, and the bias that was learnt.
 """
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
-from jaxtyping import Array
+from jaxtyping import Array, Key
 
-from retrim import ControllerPilot, PolicyController, SimPlant, fly
-from retrim.config import factory as build
-from retrim.config import presets
-from retrim.learn import PolicyState, bptt, residual_targets
-from retrim.learn.pretrain import starts
-from retrim.physics import BemQuadrotor, Command, Constant, Hybrid, State, small
+from retrim import Command, Scenario, Setup, State, Targets, changed, fly, load
 
-QUICK = {"pretrain": {"epochs": 100, "envs": 8, "horizon": 100, "hidden": [32, 32]}}
+QUICK = {
+    "pretrain": {"num_updates": 100, "num_envs": 8, "horizon": 100, "hidden_sizes": [32, 32]},
+    "adapt": {"num_updates": 3, "num_envs": 4, "fit_steps": 20, "fit_every": 1.0, "update_every": 2.0},
+}
 
 
 class Bias(eqx.Module):
-    """The same missing acceleration everywhere [m/s²]. Depend on ``x`` and ``u`` as you like."""
+    """The same acceleration is missing everywhere; its state is mean and standard deviation per axis [m/s²]."""
 
-    a: Array
+    def init(self, key: Key[Array, ""]) -> tuple[Array, Array]:
+        """Predict nothing before the first fit."""
+        return jnp.zeros(3), jnp.zeros(3)
 
-    def __call__(self, x: State, u: Command) -> Array:
-        """In the state ``x`` under the command ``u``."""
-        return self.a
+    def fit(self, state: tuple[Array, Array], rows: Targets) -> tuple[tuple[Array, Array], Array]:
+        """Take mean and spread of the rows that count; also return the error that is left [m/s²]."""
+        weight = (rows.valid / jnp.maximum(rows.valid.sum(), 1))[:, None].astype(rows.a_res.dtype)
+        mean = jnp.sum(weight * rows.a_res, axis=0)
+        std = jnp.sqrt(jnp.sum(weight * (rows.a_res - mean[None]) ** 2, axis=0))
+        return (mean, std), jnp.sqrt(jnp.sum(std**2))
+
+    def predict(self, state: tuple[Array, Array], x: State, u: Command) -> Array:
+        """Return the mean; depend on ``x`` and ``u`` as you like."""
+        return state[0]
+
+    def spread(self, state: tuple[Array, Array], x: State, u: Command) -> Array:
+        """Return the standard deviation."""
+        return state[1]
 
 
 def main(*, quick: bool = False) -> None:
-    """Fly, fit, improve, fly again."""
-    preset = presets.changed(presets.load("fast"), **(QUICK if quick else {}))
-    policy = build.pretrained(preset)
-    task, nominal = build.task(preset), build.nominal(preset)
-    plant = SimPlant(BemQuadrotor.of(small(), presets.DT), Constant(jnp.array([2.0, 2.0, 2.0])))
-    pilot = ControllerPilot(PolicyController(task.observation, policy))
-    x0, goal, ticks = build.flight_starts(preset, 1)[0], np.array(preset.goal), 200 if quick else 500
-
-    log = fly(plant, pilot, x0, ticks=ticks)
-    print(f"before: {np.linalg.norm(log.p[-100:] - goal, axis=1).mean():.3f} m off")
-
-    # What the model missed in each tick of the last two seconds; the best constant is its mean.
-    rows = residual_targets(log.window(100), nominal, delay=preset.plant_delay)
-    bias = Bias(jnp.mean(rows.a_res, axis=0))
-    print(f"fitted bias: {', '.join(f'{a:.2f}' for a in bias.a.tolist())} m/s², where the push is 2 along each axis")
-
-    # Thirty steps of back-propagation through the corrected model.
-    epochs, envs = (5, 4) if quick else (30, 10)
-    optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(optax.cosine_decay_schedule(1e-3, epochs)))
-    before = PolicyState(policy, optimiser.init(policy.params))
-    x0s = starts(task, jax.random.key(1), epochs, envs)
-    improve = eqx.filter_jit(bptt)
-    after, losses = improve(before, Hybrid(nominal, bias), task, x0s, optimiser=optimiser, delay=preset.delay)
-    print(f"improved: loss {float(losses[0]):.3f} -> {float(losses[-1]):.3f}")
-
-    pilot.controller = PolicyController(task.observation, after.policy)  # the swap, between two ticks
-    log = fly(plant, pilot, x0, ticks=ticks)
-    print(f"after:  {np.linalg.norm(log.p[-100:] - goal, axis=1).mean():.3f} m off")
+    """Adapt with the bias instead of the ensemble."""
+    preset = changed(load("hover/fast"), **(QUICK if quick else {}))
+    setup, ticks = Setup.of(preset, residual_model=Bias()), 250 if quick else 1500
+    policy, x0 = setup.pretrained(), setup.flight_starts(1)[0]
+    for method in ("base", "full"):
+        pilot = setup.pilot(policy, method, jax.random.key(1))
+        log = fly(Scenario("large").make(), pilot, x0, ticks=ticks)
+        error = np.linalg.norm(log.p[-100:] - preset.goal, axis=1).mean()
+        print(f"{method}: {error:.3f} m off over the last 2 s")
+    mean, _ = pilot.state.residual
+    print(f"learnt: {', '.join(f'{a:.2f}' for a in mean.tolist())} m/s², where the push is 2 along each axis")
 
 
 if __name__ == "__main__":

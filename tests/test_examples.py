@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-EXAMPLES = sorted((Path(__file__).parents[1] / "examples").glob("*.py"))
+FOLDER = Path(__file__).parents[1] / "examples"
+EXAMPLES = sorted(FOLDER.glob("*.py"))
 NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.?\d*(?:e[-+]?\d+)?|nan|inf)(?![\w])", re.IGNORECASE)
 
 
@@ -26,5 +27,7 @@ def test_an_example_runs(path, capsys, monkeypatch, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_there_are_examples():
-    assert len(EXAMPLES) == 7
+def test_every_file_of_the_folder_is_an_example_or_belongs_to_one():
+    assert [path.stem[:2] for path in EXAMPLES] == [f"0{i}" for i in range(1, 9)]
+    text = "".join(path.read_text() for path in EXAMPLES)
+    assert all(path.name in text for path in FOLDER.iterdir() if path.is_file() and path.suffix != ".py")

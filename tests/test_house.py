@@ -1,9 +1,11 @@
-"""The house rules that a machine can check: layers, docstrings, sizes, no addresses in the pins."""
+"""The house rules that a machine can check: layers, docstrings, sizes, imports, no addresses in the pins."""
 
 import ast
 import importlib
 import inspect
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -12,7 +14,14 @@ from importlinter import cli as importlinter
 import retrim
 
 ROOT = Path(__file__).parent.parent
-SOURCES = sorted((ROOT / "src" / "retrim").rglob("*.py"))
+HOUSE = ROOT / "src" / "retrim"
+SOURCES = sorted(HOUSE.rglob("*.py"))
+ROOMS = sorted(folder.name for folder in HOUSE.iterdir() if (folder / "__init__.py").exists())
+PACKAGES = sorted({"retrim" + "".join(f".{part}" for part in p.parent.relative_to(HOUSE).parts) for p in SOURCES})
+
+
+def lines(paths):
+    return sum(len(path.read_text().splitlines()) for path in paths)
 
 
 def test_layers(monkeypatch):
@@ -20,15 +29,26 @@ def test_layers(monkeypatch):
     assert importlinter.lint_imports(config_filename="pyproject.toml") == 0
 
 
-FOLDERS = ("physics", "tasks", "control", "learn", "adapt")
+def test_every_room_has_its_place_among_the_layers():
+    text = (ROOT / "pyproject.toml").read_text()
+    (layers,) = re.findall(r"^layers = (\[.*\])$", text, re.M)
+    placed = {name.strip() for layer in ast.literal_eval(layers) for name in layer.split("|")}
+    apart = {name for name in ROOMS if f'source_modules = ["retrim.{name}"]' in text}
+    assert set(ROOMS) <= placed | apart
 
 
-@pytest.mark.parametrize("package", ["retrim", *(f"retrim.{name}" for name in FOLDERS)])
+@pytest.mark.parametrize("package", PACKAGES)
 def test_public_names_have_docstrings(package):
     module = importlib.import_module(package)
-    for name, thing in vars(module).items():
-        if not name.startswith("_") and (inspect.isclass(thing) or inspect.isfunction(thing)):
-            assert inspect.getdoc(thing), f"{package}.{name} has no docstring"
+    assert inspect.getdoc(module)
+    public = [name for name in dir(module) if not name.startswith("_")]
+    for thing in (getattr(module, name) for name in public):
+        if (inspect.isclass(thing) or inspect.isfunction(thing)) and thing.__module__.startswith("retrim"):
+            assert inspect.getdoc(thing), f"{package}: {thing.__name__} has no docstring"
+            methods = vars(thing).items() if inspect.isclass(thing) else ()
+            for name, method in methods:
+                if inspect.isfunction(method) and not name.startswith("_"):
+                    assert inspect.getdoc(method), f"{package}: {thing.__name__}.{name} has no docstring"
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(ROOT)))
@@ -37,6 +57,13 @@ def test_files_are_small_and_have_no_junk_drawers(path):
     assert len(text.splitlines()) <= 300
     assert path.stem not in {"utils", "common", "helpers", "misc"}
     assert ast.get_docstring(ast.parse(text)) or not text.strip()
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_no_room_outgrows_the_house(room):
+    mine = lines((HOUSE / room).rglob("*.py"))
+    assert mine <= 0.2 * lines(SOURCES)
+    assert room != "cli" or mine <= 900
 
 
 def test_only_viz_imports_matplotlib():
@@ -49,11 +76,42 @@ def test_pins_hold_names_and_versions_only():
         assert re.fullmatch(r"[A-Za-z0-9._-]+==[^ ]+( ; .+)?", line), line
 
 
-def test_importing_retrim_starts_no_backend():
-    """An array made at import would; in a fresh interpreter, since here one is running already."""
-    import subprocess
-    import sys
+def test_every_public_name_resolves():
+    assert len(set(retrim.__all__)) == len(retrim.__all__)
+    for name in retrim.__all__:
+        assert getattr(retrim, name) is not None
+    with pytest.raises(AttributeError):
+        retrim.no_such_name  # noqa: B018
 
-    code = "import retrim, retrim.cli, jax._src.xla_bridge as b; assert not b._backends, b._backends"
-    subprocess.run([sys.executable, "-c", code], check=True)
-    assert retrim.PRESETS
+
+QUICK_IMPORT = """
+import sys
+import retrim
+from retrim.cli.main import main
+
+assert "jax" not in sys.modules, "import retrim imports jax"
+for words in (["--help"], ["--version"], [], ["fyl"]):
+    try:
+        main(words)
+    except SystemExit as end:
+        print(words, end.code)
+assert "jax" not in sys.modules, "retrim --help imports jax"
+for package in {packages!r}:
+    __import__(package)
+for name in retrim.__all__:
+    getattr(retrim, name)
+import jax._src.xla_bridge as bridge
+
+assert not bridge._backends, "an array is made at import"
+"""
+
+
+def test_importing_retrim_and_help_are_quick_and_no_import_starts_a_backend():
+    """In a fresh interpreter, since here one is running already."""
+    code = QUICK_IMPORT.format(packages=PACKAGES)
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stderr
+    assert "['--help'] 0" in ran.stdout
+    assert "[] 2" in ran.stdout
+    assert "['fyl'] 2" in ran.stdout
+    assert "did you mean 'fly'?" in ran.stderr

@@ -1,5 +1,7 @@
 """The online learner: pure functions of a window of flight, without state of its own and without a clock."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -24,8 +26,8 @@ class LearnerState(eqx.Module):
     """What has been learnt so far, in two halves, so that two processes can own one each."""
 
     policy: PolicyState
-    residual: eqx.Module
-    """State of the residual model."""
+    residual: Any
+    """State of the residual model: a pytree of arrays."""
 
 
 class FitReport(eqx.Module):
@@ -69,7 +71,7 @@ class OnlineLearner(eqx.Module):
         return LearnerState(fresh, _fresh_residual(self.residual_model, key))
 
     @eqx.filter_jit
-    def fit_residual(self, state: eqx.Module, window: Window) -> tuple[eqx.Module, FitReport]:
+    def fit_residual(self, state: Any, window: Window) -> tuple[Any, FitReport]:
         """Fit the residual model to a window, from where the last fit ended.
 
         Args:
@@ -86,7 +88,7 @@ class OnlineLearner(eqx.Module):
 
     @eqx.filter_jit
     def update_policy(
-        self, state: PolicyState, residual: eqx.Module, window: Window, key: Key[Array, ""]
+        self, state: PolicyState, residual: Any, window: Window, key: Key[Array, ""]
     ) -> tuple[PolicyState, Verdict]:
         """Re-train the policy by back-propagation in the corrected model, and judge the result.
 
@@ -125,9 +127,8 @@ class OnlineLearner(eqx.Module):
 
 
 @eqx.filter_jit
-def _fresh_residual(model: ResidualModel, key: Key[Array, ""]) -> eqx.Module:
-    state: eqx.Module = model.init(key)
-    return state
+def _fresh_residual(model: ResidualModel, key: Key[Array, ""]) -> Any:
+    return model.init(key)
 
 
 def _drawn(window: Window, key: Key[Array, ""], n: int) -> Start:

@@ -6,7 +6,6 @@ the way (a new flight, a lost message) never becomes the base of the next one.
 
 from typing import Protocol, runtime_checkable
 
-import equinox as eqx
 import jax
 from jax import random
 from jaxtyping import Array, Key
@@ -62,7 +61,7 @@ class PolicyWorker:
     def __init__(self, learner: OnlineLearner, state: LearnerState, key: Key[Array, ""]) -> None:
         self._learner, self._key = learner, key
         self._policy: PolicyState = state.policy
-        self._residual: eqx.Module = state.residual
+        self._residual = state.residual
 
     def learn(self, window: Window) -> PolicyUpdate | Rejection:
         """Re-train; the window gives starts for the gate."""
