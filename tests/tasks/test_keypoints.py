@@ -1,6 +1,5 @@
 """Keypoints: as published, whitened, out of sight, under the command that acted; learning to see."""
 
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
