@@ -12,6 +12,8 @@ from .sensors import SENSORS
 from .vehicle_file import VehicleSpec
 from .vehicles import make_vehicle, name_of, vehicle_from
 
+THRUST_ERROR = 0.035  # of the plants by default
+
 
 @dataclass(frozen=True)
 class Scenario:
@@ -23,7 +25,7 @@ class Scenario:
     vehicle: str | VehicleSpec | None = None
     """None: that which the policy was trained for, or the plant's own."""
     sensors: str = "ideal"
-    thrust_error: float = 0.035
+    thrust_error: float = THRUST_ERROR
     """By how much more than commanded the rotors give, as a share; bem and simple only."""
     reference: str | None = None
     """What a tracking policy follows; None: what it was trained on."""
@@ -43,6 +45,8 @@ class Scenario:
             raise ConfigError(
                 f"plant {self.plant!r} measures its true state; sensors {self.sensors!r} need bem or simple"
             )
+        if self.thrust_error != THRUST_ERROR and not entry.has_thrust_error:
+            raise ConfigError(f"plant {self.plant!r} has its own thrust map; a thrust error needs bem or simple")
         if not -0.5 <= self.thrust_error <= 0.5:
             raise ConfigError(f"thrust error {self.thrust_error} must be between -0.5 and 0.5")
 
@@ -54,7 +58,9 @@ class Scenario:
             return entry
         if not callable(entry):
             raise ConfigError(f"plant {self.plant!r} is a {type(entry).__name__}, not a function of a PlantRequest")
-        return PlantEntry(entry, about=(entry.__doc__ or self.plant).strip().splitlines()[0], has_sensors=True)
+        return PlantEntry(
+            entry, about=(entry.__doc__ or self.plant).strip().splitlines()[0], has_sensors=True, has_thrust_error=True
+        )
 
     def vehicle_name(self, trained_for: str | VehicleSpec) -> str:
         """Return the name of the vehicle that flies a policy trained for ``trained_for``."""

@@ -1,0 +1,168 @@
+"""Presets: their numbers, and what cannot be one."""
+
+import math
+
+import pytest
+
+from retrim import ConfigError
+from retrim.config import PRESETS, Setup, changed, load
+from retrim.config.loading import dump, parse
+
+
+def test_presets_survive_json():
+    for name, preset in PRESETS.items():
+        assert preset.name == name
+        assert parse(dump(preset), source="test") == preset
+
+
+def test_the_papers_numbers():
+    paper = load("hover/paper")
+    p, a = paper.pretrain, paper.adapt
+    assert (p.num_updates, p.num_envs, p.horizon, p.hidden_sizes) == (300, 100, 150, (512, 512))
+    assert (a.window, a.fit_every, a.fit_steps, a.update_every, a.num_updates, a.num_envs) == (
+        100,
+        3.0,
+        100,
+        5.0,
+        30,
+        10,
+    )
+    assert (paper.command_history, paper.delay_ticks, paper.dt) == (0, 0, 0.02)
+    assert Setup.of(paper).env.task.observation.size == 15
+    assert Setup.of(load("hover/released")).env.task.observation.size == 27
+    assert load("track/paper").adapt.window == load("track/preview").adapt.window == 250
+    vision = load("vision/paper")
+    assert (vision.pretrain.num_updates, vision.pretrain.num_envs) == (500, 300)
+    assert (vision.adapt.num_updates, vision.adapt.num_envs) == (50, 30)
+
+
+def test_a_hundred_hertz_has_the_same_times():
+    fast, fine = load("hover/fast"), load("hover/100hz")
+    for ticks in (
+        lambda p: p.pretrain.horizon,
+        lambda p: p.adapt.window,
+        lambda p: p.delay_ticks,
+        lambda p: p.plant_delay_ticks,
+        lambda p: p.command_history,
+    ):
+        assert ticks(fine) * fine.dt == pytest.approx(ticks(fast) * fast.dt)
+
+
+@pytest.mark.parametrize(
+    ("tables", "message"),
+    [
+        ({"track": {"reference": "circle"}}, r"a table \[track\] needs task = 'track', not 'hover'"),
+        ({"vision": {}}, r"a table \[vision\] needs task = 'vision', not 'hover'"),
+        ({"options": {"a": 1}}, r"a table \[options\] is for a task of one's own, not for 'hover'"),
+        ({"dt": 0.0205}, r"dt = 0\.0205 s must be a whole number of milliseconds"),
+        ({"dt": 0.001}, r"dt: Input should be greater than or equal to 0\.002"),
+        ({"plant_delay_ticks": 5, "adapt": {"window": 14}}, r"adapt\.window = 14 is too short for plant_delay_ticks"),
+        ({"pretrain": {"hidden_sizes": []}}, r"pretrain\.hidden_sizes: "),
+        ({"pretrain": {"max_grad_norm": 0.0}}, r"pretrain\.max_grad_norm: Input should be greater than 0"),
+        ({"actuator_tau": -0.1}, r"actuator_tau: Input should be greater than 0"),
+        ({"reward": "l3"}, r"reward: Input should be 'paper' or 'l2'"),
+    ],
+)
+def test_what_does_not_fit_together(tables, message):
+    with pytest.raises(ConfigError, match=message) as error:
+        changed(load("hover/fast"), **tables)
+    assert "\n" not in str(error.value)
+
+
+def test_several_mistakes_are_all_named():
+    with pytest.raises(
+        ConfigError, match=r"adapt\.window: .*; pretrain\.num_envs: |pretrain\.num_envs: .*; adapt\.window: "
+    ):
+        changed(load("hover/fast"), adapt={"window": 1}, pretrain={"num_envs": 0})
+
+
+DEFAULTS = {
+    "pretrain": (300, 100, 150, 5e-3, 0.999, None, (512, 512), math.pi),
+    "adapt": (100, "ensemble", 3.0, 100, 1e-2, 1e-3, 5.0, 30, 10, 1e-3, None, 0.2, 1.0),
+    "rest": ("small", 0.02, (0.0, 0.0, 1.0), 5.0, 0, 0, 1, None),
+}
+OURS = {
+    "hover/fast": {
+        "command_history": 2,
+        "delay_ticks": 1,
+        "pretrain": {
+            "num_updates": 150,
+            "num_envs": 16,
+            "adam_b2": 0.95,
+            "max_grad_norm": 1.0,
+            "max_start_yaw": 0.1 * math.pi,
+        },
+        "adapt": {"max_grad_norm": 1.0},
+    },
+    "hover/released": {
+        "command_history": 3,
+        "delay_ticks": 2,
+        "pretrain": {"num_updates": 200, "num_envs": 200},
+    },
+    "track/preview": {
+        "task": "track",
+        "reward": "l2",
+        "command_history": 2,
+        "delay_ticks": 1,
+        "actuator_tau": 0.033,
+        "track": {"reference": "circle+figure8+star", "observation": "preview", "start_spread": 1.0},
+        "pretrain": {"num_updates": 600, "num_envs": 32, "horizon": 100, "learning_rate": 3e-3, "max_grad_norm": 1.0},
+        "adapt": {"window": 250, "max_grad_norm": 1.0},
+    },
+    "track/paper": {
+        "task": "track",
+        "track": {"reference": "circle", "observation": "state", "start_spread": 0.3},
+        "adapt": {"window": 250},
+    },
+    "vision/paper": {
+        "task": "vision",
+        "delay_ticks": 1,
+        "vision": {"occlusion": False, "pixel_noise": 0.0, "dropout": 0.0, "whiten_pixels": False}
+        | {"encoder_steps": 3000},
+        "pretrain": {"num_updates": 500, "num_envs": 300, "learning_rate": 1e-3, "max_start_yaw": 0.1 * math.pi},
+        "adapt": {"num_updates": 50, "num_envs": 30, "update_latency": 5.0},
+    },
+    "vision/ideal": {
+        "task": "vision",
+        "reward": "l2",
+        "delay_ticks": 1,
+        "vision": {"occlusion": False, "pixel_noise": 0.5, "dropout": 0.0, "whiten_pixels": True}
+        | {"encoder_steps": 3000},
+        "pretrain": {
+            "num_updates": 300,
+            "num_envs": 16,
+            "learning_rate": 3e-3,
+            "adam_b2": 0.95,
+            "max_grad_norm": 1.0,
+            "hidden_sizes": (256, 256),
+            "max_start_yaw": 0.1 * math.pi,
+        },
+        "adapt": {"max_grad_norm": 1.0},
+    },
+}
+OURS["vision/occluded"] = OURS["vision/ideal"] | {
+    "vision": {"occlusion": True, "pixel_noise": 1.0, "dropout": 0.05, "whiten_pixels": True, "encoder_steps": 3000}
+}
+OURS["hover/100hz"] = OURS["hover/fast"] | {
+    "dt": 0.01,
+    "command_history": 4,
+    "delay_ticks": 2,
+    "plant_delay_ticks": 2,
+    "pretrain": OURS["hover/fast"]["pretrain"] | {"horizon": 300},
+    "adapt": {"max_grad_norm": 1.0, "window": 200},
+}
+
+
+def test_defaults_are_the_papers():
+    paper = PRESETS["hover/paper"]
+    assert tuple(vars(paper.pretrain).values()) == DEFAULTS["pretrain"]
+    assert tuple(vars(paper.adapt).values()) == DEFAULTS["adapt"]
+    names = ("vehicle", "dt", "goal", "termination_box", "command_history", "delay_ticks", "plant_delay_ticks")
+    assert tuple(getattr(paper, name) for name in (*names, "actuator_tau")) == DEFAULTS["rest"]
+
+
+def test_results_depend_on_these_numbers():
+    """What each preset changes of the paper's, written out once more: published results were made with them."""
+    assert set(OURS) | {"hover/paper"} == set(PRESETS)
+    for name, tables in OURS.items():
+        assert PRESETS[name] == changed(PRESETS["hover/paper"], name=name, **tables), name

@@ -1,0 +1,258 @@
+"""Names: what is registered, what is imported from one's own module, and what does not exist."""
+
+import sys
+import textwrap
+import types
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import random
+
+from helpers import tiny_preset
+from retrim import ConfigError
+from retrim.config import Scenario, Setup, changed, disturbance, load, registry
+from retrim.config.disturbances import DISTURBANCES
+from retrim.config.plants import PLANTS
+from retrim.config.registry import Registry
+from retrim.config.residuals import RESIDUALS
+from retrim.config.sensors import SENSORS
+from retrim.config.tasks import REFERENCES, TASKS, make_reference
+from retrim.config.vehicles import VEHICLES
+from retrim.physics import Command, State
+from retrim.runtime import FunctionPilot, fly
+
+REGISTRIES = {
+    "vehicle": VEHICLES,
+    "disturbance": DISTURBANCES,
+    "sensor": SENSORS,
+    "plant": PLANTS,
+    "task": TASKS,
+    "reference": REFERENCES,
+    "residual": RESIDUALS,
+}
+
+MINE = """
+import jax.numpy as jnp
+from retrim import Hover, PlantEntry, SimPlant, TaskEntry
+from retrim.learn import EnsembleModel
+from retrim.physics import Constant, LinearDragQuadrotor, small
+from retrim.plants import SensorModel
+from retrim.tasks import Reference
+
+NUMBER = 3
+
+
+class Higher(Hover):
+    def error(self, t, x):
+        return x.p[2]
+
+
+def task(request):
+    observation = request.state_observation()
+    goal = jnp.array([0.0, 0.0, request.options["height"]])
+    return Higher(goal, observation, jnp.array(5.0), jnp.array(0.3), request.preset.dt, request.preset.pretrain.horizon)
+
+
+entry = TaskEntry(task, "hover/paper")
+
+
+def no_task(request):
+    raise ValueError("a task of mine needs a height")
+
+
+def plant(request):
+    '''A plant of mine.
+
+    More about it.
+    '''
+    model = LinearDragQuadrotor.of(request.vehicle, request.dt, thrust_error=request.thrust_error)
+    return SimPlant(model, request.disturbance, sensors=request.sensors, seed=request.seed)
+
+
+plant_entry = PlantEntry(plant, "a plant of mine", own_vehicle="mine")
+
+
+def gust(key, size):
+    if size is not None and size > 5.0:
+        raise ValueError("no more than 5 m/s^2")
+    return Constant(jnp.array([1.0 if size is None else size, 0.0, 0.0]))
+
+
+class Zero(EnsembleModel):
+    pass
+
+
+def residual(request):
+    return Zero(jnp.array(request.preset.goal), request.vehicle.omega_max, jnp.array(0.1), jnp.array(0.0), steps=2)
+
+
+def no_residual(request):
+    return 3
+
+
+def vehicle():
+    return small()
+
+
+def no_vehicle():
+    return "a vehicle"
+
+
+def sensors():
+    return SensorModel.of(position=0.5)
+
+
+def reference():
+    return Reference.of(lambda t: [0.0, 0.0, 1.0 + 0.1 * t], seconds=5.0)
+"""
+
+
+@pytest.fixture
+def mine(tmp_path, monkeypatch):
+    """A module of one's own in the current folder, under a name of this test."""
+    name = f"mine_{tmp_path.name.replace('-', '_')}"
+    (tmp_path / f"{name}.py").write_text(textwrap.dedent(MINE))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [p for p in sys.path if p not in ("", str(tmp_path))])
+    yield name
+    sys.modules.pop(name, None)
+
+
+# ---- the registry itself
+
+
+def test_a_thing_is_registered_once():
+    things = Registry("thing", example="module:name")
+    assert things.register("one", 1) == 1
+    assert things.find("one") == things["one"] == 1
+    with pytest.raises(ConfigError, match="there is a thing 'one' already"):
+        things.register("one", 2)
+    assert things.find("one") == 1
+    assert list(things) == ["one"]
+    assert len(things) == 1
+
+
+@pytest.mark.parametrize("name", ["", "a:b", "a+b", "a=b", "a b", "a\n"])
+def test_names_that_cannot_be(name):
+    with pytest.raises(ConfigError, match="must not be empty nor contain"):
+        Registry("thing", example="module:name").register(name, 1)
+
+
+@pytest.mark.parametrize("kind", REGISTRIES)
+def test_an_unknown_name_lists_the_names_and_the_nearest(kind):
+    known = REGISTRIES[kind]
+    nearest = max(known, key=len)
+    with pytest.raises(ConfigError, match=rf"no {kind} '{nearest}x'; did you mean '{nearest}'\? there are ") as error:
+        known.find(nearest + "x")
+    for name in known:
+        assert name in str(error.value)
+    assert "module:name" in str(error.value)
+    assert "\n" not in str(error.value)
+    with pytest.raises(ConfigError, match=f"no {kind} 'qqqqqq'; there are"):
+        known.find("qqqqqq")
+
+
+def test_installed_packages_bring_names(monkeypatch):
+    asked = []
+
+    def entry_points(group):
+        asked.append(group)
+        return [types.SimpleNamespace(name="theirs", load=lambda: "found")]
+
+    monkeypatch.setattr(registry, "entry_points", entry_points)
+    assert VEHICLES.find("theirs") == "found"
+    assert asked == ["retrim.vehicles"]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("no_such_module:thing", "ModuleNotFoundError: No module named 'no_such_module'"),
+        ("{mine}:nothing", "AttributeError: .*has no attribute 'nothing'"),
+        ("{mine}:", "AttributeError: "),
+        (":thing", "ValueError: "),
+        ("broken:thing", "ZeroDivisionError: division by zero"),
+        ("unfinished:thing", "SyntaxError: "),
+        ("leaving:thing", "SystemExit|RuntimeError"),
+    ],
+)
+def test_a_module_that_cannot_be_imported(mine, tmp_path, text, message):
+    (tmp_path / "broken.py").write_text("1 / 0")
+    (tmp_path / "unfinished.py").write_text("def thing(:")
+    (tmp_path / "leaving.py").write_text("raise RuntimeError('not today')")
+    name = text.format(mine=mine)
+    with pytest.raises(ConfigError, match=f"vehicle '{name}' cannot be imported: {message}"):
+        VEHICLES.find(name)
+
+
+# ---- things of one's own
+
+
+def test_ones_own_task(mine):
+    preset = changed(tiny_preset(), task=f"{mine}:task", options={"height": 2.5})
+    setup = Setup.of(preset)
+    assert type(setup.env.task).__name__ == "Higher"
+    np.testing.assert_array_equal(setup.flown.home(), [0.0, 0.0, 2.5])
+    assert setup.env.task.horizon == preset.pretrain.horizon
+    assert setup.learner.env.task is setup.flown
+    assert float(setup.flight_starts(1)[0].p[2]) == pytest.approx(2.5, abs=1.0)
+    entry = changed(tiny_preset(), task=f"{mine}:entry", options={"height": 2.5})
+    assert type(Setup.of(entry).env.task).__name__ == "Higher"
+
+
+@pytest.mark.parametrize(("name", "message"), [("NUMBER", "is a int, not a function"), ("no_task", "needs a height")])
+def test_a_task_that_is_none(mine, name, message):
+    with pytest.raises(ConfigError, match=message):
+        Setup.of(changed(tiny_preset(), task=f"{mine}:{name}"))
+
+
+def test_ones_own_plant_vehicle_sensors_and_disturbance(mine):
+    scenario = Scenario(f"{mine}:gust=2.5+none", f"{mine}:plant", f"{mine}:vehicle", f"{mine}:sensors")
+    assert scenario.entry.about == "A plant of mine."
+    plant = scenario.make(dt=0.01, seed=3)
+    assert plant.dt == 0.01
+    log = fly(plant, FunctionPilot(lambda m: Command.hover()), State.at(jnp.array([0.0, 0.0, 1.0])), ticks=20)
+    assert log.v[-1, 0] == pytest.approx(0.5, rel=0.05)  # 2.5 m/s^2 for 0.2 s
+    assert 0.2 < (log.measured.p - log.p).std() < 0.8
+    own = Scenario(plant=f"{mine}:plant_entry")
+    assert own.vehicle_name("small") == "mine"
+    with pytest.raises(ConfigError, match="flies its own vehicle, mine"):
+        Scenario(plant=f"{mine}:plant_entry", vehicle="large")
+
+
+def test_a_size_that_ones_own_disturbance_refuses(mine):
+    with pytest.raises(ConfigError, match=rf"disturbance '{mine}:gust=7': no more than 5"):
+        disturbance(f"{mine}:gust=7")
+
+
+def test_a_plant_that_is_none(mine):
+    with pytest.raises(ConfigError, match="is a int, not a function of a PlantRequest"):
+        Scenario(plant=f"{mine}:NUMBER")
+
+
+def test_a_vehicle_that_is_none(mine):
+    with pytest.raises(ConfigError, match="is a str, not a function that gives a Vehicle"):
+        Scenario(vehicle=f"{mine}:no_vehicle").make()
+    with pytest.raises(ConfigError, match="vehicle"):
+        Setup.of(changed(tiny_preset(), vehicle=f"{mine}:NUMBER"))
+
+
+def test_ones_own_residual(mine):
+    setup = Setup.of(changed(tiny_preset(), adapt={"residual": f"{mine}:residual"}))
+    assert type(setup.learner.residual_model).__name__ == "Zero"
+    assert setup.learner.residual_model.steps == 2
+    state = setup.learner.init(setup.new_policy(random.key(0)), random.key(1))
+    assert isinstance(state.residual, eqx.Module)
+    with pytest.raises(ConfigError, match="gives a int without init, fit, predict and spread"):
+        Setup.of(changed(tiny_preset(), adapt={"residual": f"{mine}:no_residual"}))
+
+
+def test_ones_own_reference(mine):
+    found = make_reference(f"{mine}:reference")
+    np.testing.assert_allclose(found(jnp.array(2.0)).p, [0.0, 0.0, 1.2], atol=1e-6)
+    setup = Setup.of(changed(load("track/paper"), pretrain={"hidden_sizes": (8,)}), f"{mine}:reference")
+    np.testing.assert_allclose(setup.flown.reference(jnp.array(2.0)).p, [0.0, 0.0, 1.2], atol=1e-6)
+    with pytest.raises(ConfigError, match=r"reference 'circle': a hover policy follows none"):
+        Setup.of(tiny_preset(), "circle")

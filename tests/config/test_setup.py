@@ -1,0 +1,286 @@
+"""From a preset's numbers to objects: every number arrives where it acts, for every preset."""
+
+import dataclasses
+import itertools
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import random
+
+from helpers import tiny_preset
+from retrim import ConfigError
+from retrim.config import PRESETS, Scenario, Setup, changed, load, setup
+from retrim.config.vehicles import make_vehicle
+from retrim.learn import policy_loss
+from retrim.physics.actuators import Lagged
+from retrim.physics.dynamics import PointMass
+from retrim.runtime import fly
+from retrim.tasks import Hover, Keypoints, L2Hover, L2Track, Preview, StateObs, Track
+
+pytestmark = pytest.mark.usefixtures("optax_promotion")
+
+
+@pytest.fixture(scope="module", params=PRESETS)
+def built(request):
+    """A preset, with a small network, and its set-up."""
+    preset = changed(load(request.param), pretrain={"hidden_sizes": (12, 12)})
+    with jax.numpy_dtype_promotion("standard"):
+        return preset, Setup.of(preset)
+
+
+# ---- the environment
+
+
+def test_every_clock_ticks_alike(built):
+    preset, made = built
+    for env in (made.env, made.learner.env):
+        assert env.dynamics.dt == env.task.dt == preset.dt
+    assert made.flown.dt == preset.dt
+    assert Scenario().make(dt=preset.dt).dt == preset.dt
+
+
+def test_the_model_has_the_presets_delay_and_lag(built):
+    preset, made = built
+    assert preset.delay_ticks == {"hover/paper": 0, "track/paper": 0, "hover/released": 2, "hover/100hz": 2}.get(
+        preset.name, 1
+    )
+    for env in (made.env, made.learner.env):
+        assert env.delay_ticks == preset.delay_ticks
+        if preset.name == "track/preview":
+            assert isinstance(env.dynamics, Lagged)
+            assert float(env.dynamics.tau) == preset.actuator_tau == 0.033
+            assert isinstance(env.dynamics.base, PointMass)
+        else:
+            assert preset.actuator_tau is None
+            assert isinstance(env.dynamics, PointMass)
+
+
+def test_the_task_has_the_presets_numbers(built):
+    preset, made = built
+    kinds = {("hover", "paper"): Hover, ("hover", "l2"): L2Hover, ("vision", "paper"): Hover, ("vision", "l2"): L2Hover}
+    kinds |= {("track", "paper"): Track, ("track", "l2"): L2Track}
+    for task in (made.env.task, made.flown):
+        assert type(task) is kinds[preset.task, preset.reward]
+        assert task.horizon == preset.pretrain.horizon
+        assert float(task.box) == preset.termination_box
+        if preset.task == "track":
+            assert float(task.spread) == preset.track.start_spread
+        else:
+            np.testing.assert_array_equal(task.goal, preset.goal)
+            assert float(task.heading) == pytest.approx(preset.pretrain.max_start_yaw)
+    sharp = {"track/preview", "vision/ideal", "vision/occluded"}
+    assert (preset.reward == "l2") == (preset.name in sharp)
+
+
+def test_the_observation_has_the_presets_numbers(built):
+    preset, made = built
+    seen = made.env.task.observation
+    vehicle = make_vehicle(preset.vehicle)
+    np.testing.assert_array_equal(seen.omega_max, vehicle.omega_max)
+    if preset.task == "vision":
+        assert isinstance(seen, Keypoints)
+        assert not seen.occlusion  # never in training
+        assert float(seen.noise) == preset.vision.pixel_noise
+        assert bool(jnp.all(seen.whiten == jnp.eye(70))) == (not preset.vision.whiten_pixels)
+        assert seen.dt == preset.dt
+        assert seen.delay_ticks == preset.plant_delay_ticks
+    else:
+        assert type(seen) is (Preview if preset.name == "track/preview" else StateObs)
+        assert seen.history == preset.command_history
+
+
+def test_occlusion_is_switched_on_in_flight_alone(built):
+    preset, made = built
+    flown = made.flown.observation_in_flight
+    if preset.name == "vision/occluded":
+        assert flown.occlusion
+        assert float(flown.dropout) == preset.vision.dropout == 0.05
+        assert float(flown.noise) == preset.vision.pixel_noise == 1.0
+        np.testing.assert_array_equal(flown.whiten, made.env.task.observation.whiten)
+        assert not made.learner.env.task.observation.occlusion  # nor in updates
+    else:
+        assert flown is made.flown.observation
+
+
+def test_a_policy_has_the_presets_layers_and_the_vehicles_limits(built):
+    preset, made = built
+    policy = made.new_policy(random.key(0))
+    sizes = (made.env.task.observation.size, *preset.pretrain.hidden_sizes, 4)
+    assert [layer.weight.shape for layer in policy.layers] == [(b, a) for a, b in itertools.pairwise(sizes)]
+    vehicle = make_vehicle(preset.vehicle)
+    np.testing.assert_array_equal(policy.u_max.vector(), vehicle.command_max.vector())
+    np.testing.assert_array_equal(policy.u_min.vector(), vehicle.command_min.vector())
+
+
+# ---- the learner
+
+
+def test_the_learner_has_the_presets_numbers(built):
+    preset, made = built
+    a, learner = preset.adapt, made.learner
+    assert learner.plant_delay_ticks == preset.plant_delay_ticks
+    assert learner.num_updates == a.num_updates
+    assert learner.num_envs == a.num_envs
+    assert float(learner.policy_rate) == a.learning_rate
+    assert float(learner.max_grad_norm) == (math.inf if a.max_grad_norm is None else a.max_grad_norm)
+    assert (a.max_grad_norm is None) == (
+        preset.name in ("hover/paper", "hover/released", "track/paper", "vision/paper")
+    )
+    model = learner.residual_model
+    np.testing.assert_array_equal(model.origin, preset.goal)
+    np.testing.assert_array_equal(model.omega_max, made.vehicle.omega_max)
+    assert float(model.learning_rate) == a.fit_learning_rate == 1e-2
+    assert float(model.spectral_weight) == a.spectral_weight == 1e-3
+    assert model.steps == a.fit_steps
+    assert learner.env.task is made.flown
+
+
+@pytest.mark.parametrize("latency", ["fixed", "measured"])
+def test_the_pilot_has_the_presets_schedule(built, latency, monkeypatch):
+    preset, made = built
+    a, learners, pilots = preset.adapt, [], []
+
+    class Learner(setup.LockstepLearner):
+        def __init__(self, worker, latency_s, dt):
+            learners.append((worker.layer, latency_s, dt))
+            super().__init__(worker, latency_s, dt)
+
+    class Pilot(setup.AdaptivePilot):
+        def __init__(self, observation, state, scheduled, *, dt, window):
+            pilots.append((observation, [each.every_s for each in scheduled], dt, window))
+            super().__init__(observation, state, scheduled, dt=dt, window=window)
+
+    monkeypatch.setattr(setup, "LockstepLearner", Learner)
+    monkeypatch.setattr(setup, "AdaptivePilot", Pilot)
+    made.pilot(made.new_policy(random.key(0)), "full", random.key(1), latency=latency)
+    fixed = latency == "fixed"
+    assert learners == [
+        ("residual", a.fit_latency if fixed else None, preset.dt),
+        ("policy", a.update_latency if fixed else None, preset.dt),
+    ]
+    assert pilots == [(made.flown.observation_in_flight, [a.fit_every, a.update_every], preset.dt, a.window)]
+
+
+def test_methods(built):
+    _, made = built
+    policy = made.new_policy(random.key(0))
+    with pytest.raises(ValueError, match="needs a key"):
+        made.pilot(policy, "full")
+    full, low_rank = (made.pilot(policy, method, random.key(1)) for method in ("full", "lora"))
+    jax.tree.map(np.testing.assert_array_equal, full.state.policy.policy, policy)
+    delta = low_rank.state.policy.policy
+    jax.tree.map(np.testing.assert_array_equal, delta.base, policy)
+    assert [thin.down.shape[0] for thin in delta.delta] == [4, 10, 1]
+    assert float(delta.scale) == 4.0
+    jax.tree.map(np.testing.assert_array_equal, delta.merged(), policy)
+
+
+# ---- the optimiser of pretraining
+
+
+def moves(optimiser, gradients):
+    """What the optimiser does to a parameter under these gradients."""
+
+    def step(memory, gradient):
+        change, memory = optimiser.update(gradient, memory, jnp.zeros(4))
+        return memory, change[0]
+
+    return np.asarray(jax.lax.scan(step, optimiser.init(jnp.zeros(4)), jnp.tile(jnp.array(gradients)[:, None], 4))[1])
+
+
+def test_pretraining_falls_along_a_cosine(built):
+    preset, made = built
+    p = preset.pretrain
+    steps = -moves(made.optimiser, np.full(p.num_updates, 0.1))
+    wanted = 0.5 * p.learning_rate * (1.0 + np.cos(np.pi * np.arange(p.num_updates) / p.num_updates))
+    np.testing.assert_allclose(steps, wanted, rtol=1e-4)
+
+
+def test_pretraining_clips_if_the_preset_says_so(built):
+    """Four entries of 0.5 have the norm 1: a larger gradient moves the parameter no farther where that is the limit."""
+    preset, made = built
+    limit = preset.pretrain.max_grad_norm
+    assert limit in (None, 1.0)
+    assert (limit is None) == (preset.name in ("hover/paper", "hover/released", "track/paper", "vision/paper"))
+    at_limit, beyond = (moves(made.optimiser, [0.01, 0.01, huge])[-1] for huge in (0.5, 5.0))
+    assert (at_limit == pytest.approx(beyond)) == (limit is not None)
+
+
+def test_pretraining_has_the_presets_second_decay(built):
+    """After a large gradient and a zero one, Adam's second moment tells its decay."""
+    preset, made = built
+    b1, b2, rate = 0.9, preset.pretrain.adam_b2, preset.pretrain.learning_rate
+    moved = moves(made.optimiser, [0.4, 0.0])[1]
+    m, v = b1 * (1 - b1) * 0.4 / (1 - b1**2), b2 * (1 - b2) * 0.16 / (1 - b2**2)
+    cosine = 0.5 * (1 + math.cos(math.pi / preset.pretrain.num_updates))
+    assert float(moved) == pytest.approx(-rate * cosine * m / (math.sqrt(v) + 1e-8), rel=1e-6)
+
+
+# ---- what a caller may get wrong
+
+
+def test_what_does_not_fit_is_one_line():
+    for wrong in (
+        changed(load("vision/ideal"), dt=0.008),  # a frame is no whole number of ticks
+        changed(load("vision/ideal"), plant_delay_ticks=9),
+    ):
+        with pytest.raises(ConfigError, match="preset 'vision/ideal': ") as error:
+            Setup.of(wrong)
+        assert "\n" not in str(error.value)
+
+
+# ---- starts
+
+
+def test_flight_starts_follow_from_seed_and_home_alone():
+    one, other = Setup.of(tiny_preset()), Setup.of(changed(load("hover/released"), pretrain={"hidden_sizes": (8,)}))
+    for a, b in zip(one.flight_starts(3, seed=5), other.flight_starts(3, seed=5), strict=True):
+        np.testing.assert_array_equal(a.vector(), b.vector())
+    starts = one.flight_starts(40)
+    assert not np.array_equal(starts[0].p, one.flight_starts(1, seed=1)[0].p)
+    p = np.stack([x.p for x in starts])
+    assert np.all(np.abs(p - one.preset.goal) <= 1.0)
+    assert np.all(p.std(axis=0) > 0.4)
+    assert 0.05 < np.stack([x.v for x in starts]).std() < 0.2
+
+
+# ---- at 100 Hz
+
+
+def test_a_hundred_hertz_trains_flies_and_adapts():
+    preset = changed(
+        load("hover/100hz"),
+        pretrain={"hidden_sizes": (32, 32), "num_updates": 60, "num_envs": 8, "horizon": 120},
+        adapt={"fit_steps": 20, "num_updates": 3, "num_envs": 4, "window": 60}
+        | {"fit_every": 0.5, "update_every": 0.8, "fit_latency": 0.1, "update_latency": 0.25},
+    )
+    made = Setup.of(preset)
+    chunks = list(made.pretraining(1))
+    assert sum(losses.shape[0] for _, losses in chunks) == 60
+    policy = chunks[-1][0]
+    x0 = jax.vmap(made.env.task.reset)(random.split(random.key(7), 16))
+    fresh, trained = (policy_loss(p, made.env, x0) for p in (made.new_policy(random.key(1)), policy))
+    assert float(trained) < 0.9 * float(fresh)
+    for scenario in (Scenario("small", "simple"), Scenario("small", "bem")):
+        plant = scenario.make(preset.vehicle, dt=preset.dt)
+        assert plant.dt == 0.01
+        pilot = made.pilot(policy, "full", random.key(3))
+        log = fly(plant, pilot, made.flight_starts(1)[0], ticks=130)
+        assert len(log.t) == 131
+        np.testing.assert_allclose(np.diff(log.t), 0.01)
+        assert log.missed_ticks == 0
+        assert [e.kind for e in log.events][:1] == ["residual"]
+        np.testing.assert_allclose([e.t for e in log.events if e.kind == "residual"], [0.6, 1.1])
+        np.testing.assert_allclose([e.t for e in log.events if e.kind in ("policy", "rejected")], [1.05])
+        assert float(jnp.linalg.norm(log.p[-1] - np.array(preset.goal))) < 1.5
+
+
+def test_a_set_up_is_built_once_per_process():
+    from retrim.config.loading import dump
+
+    text = dump(dataclasses.replace(tiny_preset(), name="once"))
+    assert setup.setup_for(text) is setup.setup_for(text)
+    assert setup.setup_for(text).preset.name == "once"

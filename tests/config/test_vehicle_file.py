@@ -1,0 +1,137 @@
+"""Vehicle files: a plausible quadrotor flies on both plants; an impossible one is one line that names the key."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from retrim import ConfigError
+from retrim.config import PRESETS, Scenario, Setup, changed, load, read_vehicle
+from retrim.physics import Command, State
+from retrim.runtime import FunctionPilot, fly
+
+SEVEN_INCH = {
+    "mass": "1.2",
+    "inertia": "[0.008, 0.009, 0.015]",
+    "arm": "[0.105, 0.12]",
+    "thrust_max": "52.0",
+    "rates_max": "[8.0, 8.0, 4.0]",
+    "motor_tau": "0.04",
+    "propeller_diameter": "7.0",
+}
+
+
+@pytest.fixture
+def vehicle_file(tmp_path):
+    def written(file_name="seven_inch.toml", **changes):
+        lines = {k: v for k, v in (SEVEN_INCH | changes).items() if v is not None}
+        path = tmp_path / file_name
+        path.write_text("".join(f"{key} = {value}\n" for key, value in lines.items()))
+        return path
+
+    return written
+
+
+def test_a_seven_inch_quadrotor(vehicle_file):
+    spec = read_vehicle(vehicle_file())
+    assert spec.name == "seven_inch"
+    vehicle = spec.build()
+    assert float(vehicle.mass) == 1.2
+    np.testing.assert_array_equal(vehicle.inertia, [0.008, 0.009, 0.015])
+    np.testing.assert_array_equal(vehicle.arm, [0.105, 0.12])
+    np.testing.assert_array_equal(vehicle.omega_max, [8.0, 8.0, 4.0])
+    assert float(vehicle.command_max.c) == pytest.approx(52.0 / 1.2)
+    assert float(vehicle.propeller.radius) == pytest.approx(3.5 * 0.0254, rel=0.02)
+    assert float(vehicle.motor_min) < float(vehicle.hover_speed) < float(vehicle.motor_max)
+    # A quarter of the largest thrust at 90 % of the largest speed:
+    assert float(vehicle.thrust_coefficient * (0.9 * vehicle.motor_max) ** 2) == pytest.approx(13.0)
+    assert read_vehicle(vehicle_file(file_name="other.toml")).name == "other"
+
+
+@pytest.mark.parametrize("plant", ["bem", "simple"])
+@pytest.mark.parametrize("propeller", [None, "7.0"])
+def test_it_hovers_on_hover_commands(vehicle_file, plant, propeller):
+    """Within 5 cm over a second, without an error of the thrust map."""
+    path = vehicle_file(propeller_diameter=propeller)
+    made = Scenario(plant=plant, vehicle=str(path), thrust_error=0.0).make()
+    x0 = State.at(jnp.array([0.3, -0.2, 1.5]))
+    log = fly(made, FunctionPilot(lambda measurement: Command.hover()), x0, ticks=50)
+    assert np.linalg.norm(log.p - log.p[0], axis=1).max() < 0.05
+
+
+def test_its_drag_is_what_the_file_says(vehicle_file):
+    spec = read_vehicle(vehicle_file(drag_area="[0.01, 0.02, 0.03]"))
+    np.testing.assert_array_equal(spec.build().drag_area, [0.01, 0.02, 0.03])
+
+
+def test_a_preset_keeps_the_content_of_its_vehicle_file(vehicle_file, tmp_path):
+    """The file is found beside the overlay, and is needed only once."""
+    path = vehicle_file()
+    overlay = tmp_path / "overlay.toml"
+    overlay.write_text("vehicle = 'seven_inch.toml'\n")
+    preset = load("hover/fast", overlay)
+    path.unlink()
+    assert preset.vehicle.name == "seven_inch"
+    setup = Setup.of(preset)
+    assert float(setup.vehicle.mass) == 1.2
+    np.testing.assert_array_equal(setup.env.task.observation.omega_max, [8.0, 8.0, 4.0])
+    assert float(Scenario().make(preset.vehicle)._model.vehicle.mass) == 1.2
+
+
+def test_a_scenario_keeps_the_content_of_its_vehicle_file(vehicle_file):
+    path = vehicle_file()
+    scenario = Scenario(vehicle=str(path))
+    path.unlink()
+    assert scenario.vehicle_name("small") == "seven_inch"
+    assert float(scenario.make("small")._model.vehicle.mass) == 1.2
+
+
+IMPOSSIBLE = [
+    ({"mass": "-1.2"}, r"mass: Input should be greater than 0\.005"),
+    ({"mass": "1200.0"}, r"mass: Input should be less than or equal to 50"),  # grams
+    ({"mass": "'heavy'"}, r"mass: Input should be a valid number"),
+    ({"mass": "true"}, r"mass: Input should be a valid number"),
+    ({"mass": None}, r"mass: is missing"),
+    ({"inertia": "[80.0, 90.0, 150.0]"}, r"inertia = .* is too large for 1\.2 kg .* is it in g cm\^2"),
+    ({"inertia": "[0.002, 0.003, 0.015]"}, r"inertia = .* no body has one moment larger than the sum"),
+    ({"inertia": "[0.008, 0.009]"}, r"inertia\.2: is missing|inertia\.2: Field required|inertia: "),
+    ({"arm": "[0.1, -0.1]"}, r"arm\.1: Input should be greater than 0"),
+    ({"thrust_max": "12.0"}, r"thrust_max = 12\.0 N must exceed 1\.2 times the weight of 11\.7"),
+    ({"rates_max": "[8.0, nan, 4.0]"}, r"rates_max\.1: Input should be "),
+    ({"motor_tau": "0.0"}, r"motor_tau: Input should be greater than 0"),
+    ({"motor_tau": "40.0"}, r"motor_tau: Input should be less than or equal to 0\.5"),  # ms
+    ({"propeller": "'9 inch'"}, r"propeller: Input should be '3 inch' or '5 inch'"),
+    ({"propeller_diameter": "-7.0"}, r"propeller_diameter: Input should be greater than 0"),
+    ({"drag_area": "[0.0, 0.1, 0.1]"}, r"drag_area\.0: Input should be greater than 0"),
+    ({"propelller": "'5 inch'"}, r"propelller: unknown key; did you mean 'propeller'\?"),
+    ({"name": "3"}, r"name: Input should be a valid string"),
+]
+
+
+@pytest.mark.parametrize(("changes", "message"), IMPOSSIBLE)
+def test_impossible_vehicles_are_refused_by_name(vehicle_file, changes, message):
+    path = vehicle_file(**changes)
+    for use in (lambda: read_vehicle(path), lambda: Scenario(vehicle=str(path))):
+        with pytest.raises(ConfigError, match=message) as error:
+            use()
+        assert "\n" not in str(error.value)
+        assert str(path) in str(error.value)
+
+
+def test_a_vehicle_file_that_is_none(tmp_path):
+    with pytest.raises(ConfigError, match=r"nothing\.toml: no such file"):
+        read_vehicle(tmp_path / "nothing.toml")
+    (tmp_path / "text.toml").write_text("this is a letter")
+    with pytest.raises(ConfigError, match=r"text\.toml: not TOML"):
+        read_vehicle(tmp_path / "text.toml")
+
+
+def test_an_impossible_vehicle_in_a_preset():
+    table = dict(
+        zip(SEVEN_INCH, (1.2, (0.008, 0.009, 0.015), (0.1, 0.1), 10.0, (8.0, 8.0, 4.0), 0.04, 7.0), strict=True)
+    )
+    with pytest.raises(ConfigError, match=r"thrust_max = 10\.0 N must exceed"):
+        changed(PRESETS["hover/fast"], vehicle=table | {"name": "weak"})
+    strong = changed(PRESETS["hover/fast"], vehicle=table | {"name": "strong", "thrust_max": 50.0})
+    assert dataclasses.asdict(strong.vehicle)["thrust_max"] == 50.0

@@ -1,0 +1,171 @@
+"""Policies with their presets, and what a flight has learnt: exact round trips; headers that lie are refused."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import random
+
+from helpers import tiny_preset
+from retrim import CheckpointError, load_learnt, load_policy, save_learnt, save_policy
+from retrim.config import PRESETS, Setup, changed, load
+from retrim.config.loading import dump
+from retrim.control import Policy
+from retrim.io import read_policy, write_policy
+from retrim.io.checkpoint import architecture, lora_header
+from retrim.physics import small
+from retrim.transport import wire
+
+
+@pytest.fixture(scope="module")
+def setup():
+    return Setup.of(tiny_preset(pretrain={"hidden_sizes": (12, 12)}, adapt={"window": 30}))
+
+
+@pytest.fixture(scope="module")
+def states(setup):
+    """A learner state of each method with numbers in every leaf: weights, moments and counters."""
+    policy = setup.new_policy(random.key(4))
+
+    def filled(leaf):
+        numbers = np.random.default_rng(leaf.size).normal(size=leaf.shape)
+        return jnp.asarray(numbers if jnp.issubdtype(leaf.dtype, jnp.floating) else 37 + leaf, dtype=leaf.dtype)
+
+    with jax.numpy_dtype_promotion("standard"):
+        each = {"full": policy, "lora": setup.low_rank(policy, random.key(5))}
+        return {k: jax.tree.map(filled, setup.learner.init(p, random.key(6))) for k, p in each.items()}
+
+
+def preset_with(preset, **values):
+    """JSON of a preset with values that no check has seen, as in ``pretrain={"horizon": 10**9}``."""
+    tables = json.loads(dump(preset))
+    for name, value in values.items():
+        tables[name] = tables[name] | value if isinstance(value, dict) else value
+    return json.dumps(tables)
+
+
+LIES = [
+    (
+        {"pretrain": {"hidden_sizes": [64, 64]}},
+        r"architecture 23-12-12-4, but its preset 'hover/fast' needs 23-64-64-4",
+    ),
+    ({"command_history": 3}, r"architecture 23-12-12-4, but its preset 'hover/fast' needs 27-12-12-4"),
+    ({"delay_ticks": 99}, r"delay_ticks: Input should be less than or equal to 20"),
+    ({"pretrain": {"horizon": 10**9}}, r"pretrain\.horizon: Input should be less than or equal to 1000000"),
+    ({"pretrain": {"num_envs": "many"}}, r"pretrain\.num_envs: Input should be a valid integer"),
+    ({"adapt": {"fit_every": float("inf")}}, r"adapt\.fit_every"),
+    ({"vehicle": "medium"}, "no vehicle 'medium'"),
+    ({"task": "somersault"}, "no task 'somersault'"),
+    ({"more": 3}, "more: "),
+]
+
+
+# ---- policies
+
+
+def test_round_trip_is_exact(tmp_path, setup):
+    policy = setup.new_policy(random.key(4))
+    path = tmp_path / "deep" / "policy.safetensors"
+    save_policy(path, policy, setup.preset)
+    for place in (path, path.parent):
+        found, preset = load_policy(place)
+        jax.tree.map(np.testing.assert_array_equal, found, policy)
+        assert preset == setup.preset
+
+
+SIZES = {"hover/fast": 23, "hover/released": 27, "hover/paper": 15, "hover/100hz": 31, "track/preview": 43}
+SIZES |= {"track/paper": 15, "vision/ideal": 89, "vision/occluded": 89, "vision/paper": 89}
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_every_preset_comes_back_from_its_file(tmp_path, name):
+    preset = changed(load(name), pretrain={"hidden_sizes": (8,)})
+    policy = Policy.of(SIZES[name], small(), key=random.key(0), hidden=(8,))
+    save_policy(tmp_path / "policy.safetensors", policy, preset)
+    assert load_policy(tmp_path)[1] == preset
+
+
+def test_a_policy_is_read_without_its_preset(tmp_path):
+    """A file whose preset is gone or of another version: weights and header are still read, and never its preset."""
+    policy = Policy.of(15, small(), key=random.key(0), hidden=(8,))
+    path = tmp_path / "policy.safetensors"
+    for about in ({}, {"preset": "of another version"}):
+        write_policy(path, policy, about)
+        found, header = read_policy(path)
+        jax.tree.map(np.testing.assert_array_equal, found, policy)
+        assert header.get("preset") == about.get("preset")
+        with pytest.raises(CheckpointError, match=r"policy\.safetensors, header, preset"):
+            load_policy(path)
+
+
+@pytest.mark.parametrize(("values", "message"), LIES)
+def test_a_header_that_lies_is_refused_even_with_a_checksum(tmp_path, setup, values, message):
+    path = tmp_path / "policy.safetensors"
+    write_policy(path, setup.new_policy(random.key(4)), {"preset": preset_with(setup.preset, **values)})
+    with pytest.raises(CheckpointError, match=message) as error:
+        load_policy(path)
+    assert "\n" not in str(error.value)
+
+
+# ---- what was learnt
+
+
+@pytest.mark.parametrize("method", ["full", "lora"])
+def test_what_was_learnt_comes_back_bit_for_bit(tmp_path, setup, states, method):
+    path = tmp_path / "deep" / "learnt.safetensors"
+    save_learnt(path, states[method], setup.preset)
+    found, preset = load_learnt(path)
+    assert preset == setup.preset
+    assert jax.tree.structure(found) == jax.tree.structure(states[method])
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(states[method]), strict=True):
+        assert a.dtype == b.dtype
+        np.testing.assert_array_equal(a, b)
+
+
+def rewritten(path, setup, state, preset, **header):
+    """Write a state with any header, and with the checksum of both."""
+    policy = state.policy.policy
+    low_rank = lora_header(policy) if hasattr(policy, "delta") else {}
+    about = {"preset": preset, "architecture": architecture(policy.merged()), **low_rank} | header
+    path.write_bytes(wire.pack(state, kind="learnt", about=about))
+
+
+@pytest.mark.parametrize(("values", "message"), LIES)
+def test_a_header_of_learnt_weights_that_lies_is_refused(tmp_path, setup, states, values, message):
+    path = tmp_path / "learnt.safetensors"
+    rewritten(path, setup, states["full"], preset_with(setup.preset, **values))
+    with pytest.raises(CheckpointError, match=message):
+        load_learnt(path)
+
+
+@pytest.mark.parametrize(
+    ("header", "message"),
+    [
+        ({"ranks": "4-10"}, "no usable ranks and scale of a low-rank delta"),
+        ({"ranks": "4-99-1"}, "no usable ranks and scale of a low-rank delta"),
+        ({"ranks": "4-x-1"}, "no usable ranks and scale of a low-rank delta"),
+        ({"scale": "nan"}, "no usable ranks and scale of a low-rank delta"),
+        ({"ranks": "4-9-1"}, r"has shape \(10, 12\), expected \(9, 12\)"),
+        ({"architecture": "23-12-13-4"}, "architecture 23-12-13-4, but its preset"),
+        ({"architecture": "everything"}, "architecture everything, but its preset"),
+    ],
+)
+def test_a_low_rank_header_that_lies_is_refused(tmp_path, setup, states, header, message):
+    path = tmp_path / "learnt.safetensors"
+    rewritten(path, setup, states["lora"], dump(setup.preset), **header)
+    with pytest.raises(CheckpointError, match=message):
+        load_learnt(path)
+
+
+def test_a_policy_is_not_what_was_learnt(tmp_path, setup, states):
+    path = tmp_path / "file.safetensors"
+    save_policy(path, setup.new_policy(random.key(4)), setup.preset)
+    with pytest.raises(CheckpointError, match="holds a 'policy', expected a 'learnt'"):
+        load_learnt(path)
+    save_learnt(path, states["full"], setup.preset)
+    with pytest.raises(CheckpointError, match="holds a 'learnt', expected a 'policy'"):
+        load_policy(path)
+    with pytest.raises(CheckpointError, match=r"nothing: no such file; `retrim fly --out DIR`"):
+        load_learnt(tmp_path / "nothing")

@@ -1,0 +1,127 @@
+"""Pytrees as bytes: exact, small, checksummed, and refused by name."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import random
+from safetensors.numpy import load, save
+
+from retrim import MessageError
+from retrim.control import Policy
+from retrim.physics import small
+from retrim.transport import wire
+
+TREE = {"a": jnp.arange(6.0).reshape(2, 3), "b": (jnp.array(3), jnp.zeros(0))}
+SHAPES = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), TREE)
+
+
+def packed(tree=TREE, **about):
+    return wire.pack(tree, kind="test", about=about)
+
+
+def unpacked(data, like=TREE):
+    return wire.unpack(data, like, kind="test", source="somewhere")
+
+
+def with_header(header):
+    text = json.dumps(header).encode()
+    return len(text).to_bytes(8, "little") + text
+
+
+def edited(data, change=None, **header):
+    """The message with other tensors or another header, without the checksum's consent."""
+    tensors = load(data)
+    return save(change(tensors) if change else tensors, metadata=wire._metadata(data) | header)
+
+
+@pytest.mark.parametrize("like", [TREE, SHAPES])
+def test_round_trip_is_exact(like):
+    found = unpacked(packed(who="me"), like)
+    assert jax.tree.structure(found) == jax.tree.structure(TREE)
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(TREE), strict=True):
+        assert a.dtype == b.dtype
+        np.testing.assert_array_equal(a, b)
+    assert wire.describe(packed(who="me"), kind="test", source="test")["who"] == "me"
+    assert wire.names(TREE).keys() == {"a", "b.0", "b.1"}
+
+
+def test_an_empty_tree_is_a_message():
+    assert unpacked(packed(()), ()) == ()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda t: {"a": t["a"], "b.0": t["b.0"]}, r"tensor 'b\.1' is missing"),
+        (lambda t: t | {"c": np.zeros(1)}, r"unexpected tensor 'c'; expected a, b\.0, b\.1"),
+        (lambda t: t | {"a": np.zeros((3, 2))}, r"tensor 'a' has shape \(3, 2\), expected \(2, 3\)"),
+        (lambda t: t | {"a": np.zeros((2, 3), dtype=int)}, r"tensor 'a' has type int64, expected floating point"),
+        (lambda t: t | {"b.0": np.array(3.0)}, r"tensor 'b\.0' has type float64, expected integers"),
+        (lambda t: t | {"b.0": np.array(True)}, r"tensor 'b\.0' has type bool, expected integers"),
+        (lambda t: t | {"a": np.full((2, 3), np.nan)}, r"tensor 'a' has 6 weights that are not finite"),
+        (lambda t: t | {"a": t["a"] + 1e-9}, "the checksum does not match"),
+        (lambda t: t | {"b.0": np.array(4)}, "the checksum does not match"),
+    ],
+)
+def test_tensors_that_do_not_fit(change, message):
+    with pytest.raises(MessageError, match=f"somewhere: {message}"):
+        unpacked(edited(packed(), change))
+
+
+def test_a_changed_header_breaks_the_checksum():
+    with pytest.raises(MessageError, match="the checksum does not match"):
+        unpacked(edited(packed(who="me"), who="you"))
+    with pytest.raises(MessageError, match="the checksum does not match"):
+        unpacked(edited(packed(), more="fields"))
+
+
+def test_another_kind_or_format():
+    with pytest.raises(MessageError, match="somewhere: holds a 'test', expected a 'policy'"):
+        wire.unpack(packed(), TREE, kind="policy", source="somewhere")
+    with pytest.raises(MessageError, match=r"format 'retrim/0', expected 'retrim/1'"):
+        unpacked(edited(packed(), format="retrim/0"))
+
+
+@pytest.mark.parametrize("header", [{}, {"__metadata__": None}, {"__metadata__": {}}])
+def test_a_header_without_fields(header):
+    with pytest.raises(MessageError, match=r"somewhere: format 'none', expected 'retrim/1'"):
+        unpacked(with_header(header))
+
+
+@pytest.mark.parametrize("header", [[], "text", 3, {"__metadata__": {"kind": 3}}, {"a": {"dtype": "F64"}}])
+def test_a_header_that_is_none(header):
+    with pytest.raises(MessageError, match="somewhere: not a whole safetensors file"):
+        unpacked(with_header(header))
+
+
+@pytest.mark.parametrize("dtype", ["BF16", "F8_E4M3"])
+def test_types_that_numpy_has_not(dtype):
+    width = 2 if dtype == "BF16" else 1
+    message = with_header(
+        {"__metadata__": {"format": wire.FORMAT, "kind": "test"}}
+        | {"a": {"dtype": dtype, "shape": [6], "data_offsets": [0, 6 * width]}}
+    ) + bytes(6 * width)
+    with pytest.raises(MessageError, match="somewhere: "):
+        unpacked(message)
+
+
+def test_more_bytes_than_are_accepted(monkeypatch):
+    monkeypatch.setattr(wire, "MAX_BYTES", 100)
+    with pytest.raises(MessageError, match=r"somewhere: \d+ bytes, more than the 100 that are accepted"):
+        unpacked(packed())
+
+
+def test_single_precision_is_read_in_the_expected_type():
+    single = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32) if leaf.ndim else leaf, TREE)
+    found = unpacked(packed(single))
+    assert found["a"].dtype == jnp.float64
+    np.testing.assert_array_equal(found["a"], TREE["a"])
+
+
+def test_size_of_a_paper_policy():
+    with jax.enable_x64(False):
+        data = packed(Policy.of(15, small(), key=random.key(0)))
+    assert len(data) == pytest.approx(1.09e6, rel=0.01)
