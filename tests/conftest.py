@@ -35,3 +35,20 @@ def forget_programs():
 @pytest.fixture
 def key():
     return jax.random.key(0)
+
+
+@pytest.fixture(scope="module")
+def as_a_user():
+    """Single precision and JAX's own rules of promotion, also in threads, as where no test is set up."""
+    from retrim.config.setup import setup_for
+
+    def configure(values):
+        for name, value in values.items():
+            jax.config.update(name, value)
+        setup_for.cache_clear()  # it holds arrays
+
+    user = {"jax_enable_x64": False, "jax_numpy_dtype_promotion": "standard", "jax_numpy_rank_promotion": "allow"}
+    before = {name: jax.config.values[name] for name in user}
+    configure(user)
+    yield
+    configure(before)

@@ -101,8 +101,8 @@ class Flight:
         return self.log.events
 
     def _last(self, error: np.ndarray) -> float:
-        ticks = round(self.steady_seconds / self.log.dt)
-        return float("nan") if self.log.terminated else float(error[-ticks:].mean())
+        late = self.log.t > self.log.t[-1] - self.steady_seconds + 0.5 * self.log.dt  # by time: a tick may be missed
+        return float("nan") if self.log.terminated else float(error[late].mean())
 
 
 def fly_one(

@@ -25,6 +25,7 @@ from ..viz.plots import save
 from .fleet import Fleet
 from .flights import Flight, FlightSpec
 from .interrupts import interrupts_only_set
+from .limits import check_seeds
 from .metrics import Rows
 from .reporter import Reporter
 from .run import Run
@@ -98,6 +99,7 @@ def run_sweep(sweep: Sweep, run: Run, reporter: Reporter) -> Rows:
     Raises:
         ConfigError: Something does not exist or does not fit together; found before anything is trained.
     """
+    check_seeds(sweep.seeds)
     presets = [changed(load(name), **sweep.overlay) for name in sweep.presets]
     fleets = [_fleet(preset, _untrained(preset, sweep), sweep) for preset in presets]
     for fleet in fleets:

@@ -1,0 +1,78 @@
+"""Commands as a user runs them: in this process where that is enough, in one of their own for Ctrl-C and kills."""
+
+import contextlib
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+from retrim.cli.console import console
+from retrim.cli.main import main
+
+# A policy that hovers, and updates that take no time, both within seconds.
+SMALL = """
+[pretrain]
+hidden_sizes = [64, 64]
+num_updates = 150
+[adapt]
+num_updates = 3
+num_envs = 4
+fit_steps = 20
+fit_every = 1.0
+update_every = 1.5
+fit_latency = 0.1
+update_latency = 0.3
+"""
+ENVIRONMENT = {**os.environ, "COLUMNS": "160", "NO_COLOR": "1"}
+
+
+def retrim(*words, cwd, code=0):
+    """Run a command here; return what it printed."""
+    out = io.StringIO()
+    before, console.width = sys.argv, 160
+    ended = None
+    with contextlib.chdir(cwd), contextlib.redirect_stdout(out), contextlib.redirect_stderr(out):
+        try:
+            main([str(word) for word in words])
+        except SystemExit as end:
+            ended = end.code
+        finally:
+            sys.argv = before
+    assert ended == code, out.getvalue()
+    return out.getvalue()
+
+
+def results(folder, name="results.json"):
+    return json.loads((folder / name).read_text())
+
+
+def started(words, cwd, setup=""):
+    """Start a command in a process of its own, whose Ctrl-C works whoever runs the tests."""
+    listening = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
+    code = f"{listening}\nfrom retrim.cli.main import main\n{setup}\nmain({[str(word) for word in words]!r})"
+    return subprocess.Popen(
+        [sys.executable, "-u", "-c", code],
+        cwd=cwd,
+        env={**ENVIRONMENT, "FORCE_COLOR": "1", "TERM": "xterm"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+    )
+
+
+def interrupted(words, cwd, *, after):
+    """Run, send Ctrl-C once the output shows ``after`` or that file is there; return exit code and output."""
+    process, seen = started(words, cwd), b""
+    deadline = time.monotonic() + 180
+    while time.monotonic() < deadline and process.poll() is None:
+        if isinstance(after, bytes):
+            seen += process.stdout.read1(4096)
+        else:
+            time.sleep(0.005)
+        if after in seen if isinstance(after, bytes) else after.exists():
+            break
+    process.send_signal(signal.SIGINT)
+    rest, _ = process.communicate(timeout=120)
+    return process.returncode, (seen + rest).decode()
