@@ -60,7 +60,7 @@ def test_the_fan_blows_at_the_goal_and_nowhere_else():
     fan = disturbance("fan")
     at_goal = np.stack([fan(jnp.array(t), HERE).wind for t in np.arange(0.0, 20.0, 1.0)]).mean(axis=0)
     assert np.linalg.norm(at_goal) == pytest.approx(4.0, rel=0.15)
-    assert at_goal[0] == pytest.approx(at_goal[1], rel=0.1)
+    assert at_goal[0] == pytest.approx(at_goal[1], rel=0.25)
     aside = fan(jnp.array(0.0), State.at(jnp.array([1.0, -1.0, 1.0]))).wind
     assert float(jnp.linalg.norm(aside)) < 0.2
     faster = np.stack([disturbance("fan=9")(jnp.array(t), HERE).wind for t in np.arange(0.0, 20.0, 1.0)]).mean(axis=0)

@@ -232,6 +232,16 @@ def test_what_does_not_fit_is_one_line():
         assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize(
+    ("hidden", "message"), [((16, 16, 16), "3 ranks .* for 4 layers"), ((8, 16), "rank 10 for weights 16 x 8")]
+)
+def test_a_network_that_low_rank_cannot_take(hidden, message):
+    made = Setup.of(tiny_preset(pretrain={"hidden_sizes": hidden}))
+    with pytest.raises(ConfigError, match=f"preset 'hover/fast': LoRA: {message}") as error:
+        made.pilot(made.new_policy(random.key(0)), "lora", random.key(1))
+    assert "\n" not in str(error.value)
+
+
 # ---- starts
 
 
@@ -253,29 +263,29 @@ def test_flight_starts_follow_from_seed_and_home_alone():
 def test_a_hundred_hertz_trains_flies_and_adapts():
     preset = changed(
         load("hover/100hz"),
-        pretrain={"hidden_sizes": (32, 32), "num_updates": 60, "num_envs": 8, "horizon": 120},
+        pretrain={"hidden_sizes": (32, 32), "num_updates": 150, "num_envs": 8, "horizon": 120},
         adapt={"fit_steps": 20, "num_updates": 3, "num_envs": 4, "window": 60}
         | {"fit_every": 0.5, "update_every": 0.8, "fit_latency": 0.1, "update_latency": 0.25},
     )
     made = Setup.of(preset)
     chunks = list(made.pretraining(1))
-    assert sum(losses.shape[0] for _, losses in chunks) == 60
+    assert sum(losses.shape[0] for _, losses in chunks) == 150
     policy = chunks[-1][0]
     x0 = jax.vmap(made.env.task.reset)(random.split(random.key(7), 16))
     fresh, trained = (policy_loss(p, made.env, x0) for p in (made.new_policy(random.key(1)), policy))
-    assert float(trained) < 0.9 * float(fresh)
-    for scenario in (Scenario("small", "simple"), Scenario("small", "bem")):
-        plant = scenario.make(preset.vehicle, dt=preset.dt)
-        assert plant.dt == 0.01
-        pilot = made.pilot(policy, "full", random.key(3))
-        log = fly(plant, pilot, made.flight_starts(1)[0], ticks=130)
-        assert len(log.t) == 131
-        np.testing.assert_allclose(np.diff(log.t), 0.01)
-        assert log.missed_ticks == 0
-        assert [e.kind for e in log.events][:1] == ["residual"]
-        np.testing.assert_allclose([e.t for e in log.events if e.kind == "residual"], [0.6, 1.1])
-        np.testing.assert_allclose([e.t for e in log.events if e.kind in ("policy", "rejected")], [1.05])
-        assert float(jnp.linalg.norm(log.p[-1] - np.array(preset.goal))) < 1.5
+    assert float(trained) < 0.7 * float(fresh)
+    plant = Scenario("small", "simple").make(preset.vehicle, dt=preset.dt)
+    assert plant.dt == 0.01
+    pilot = made.pilot(policy, "full", random.key(3))
+    log = fly(plant, pilot, made.flight_starts(1)[0], ticks=130)
+    assert len(log.t) == 131
+    np.testing.assert_allclose(np.diff(log.t), 0.01)
+    assert log.missed_ticks == 0
+    assert log.events[0].kind == "residual"
+    np.testing.assert_allclose([e.t for e in log.events if e.kind == "residual"], [0.6, 1.1])
+    np.testing.assert_allclose([e.t for e in log.events if e.kind in ("policy", "rejected")], [1.05])
+    before, after = np.linalg.norm(log.p[[0, -1]] - np.array(preset.goal), axis=1)
+    assert after < 0.7 * before
 
 
 def test_a_set_up_is_built_once_per_process():

@@ -173,10 +173,17 @@ class Setup:
         return find_method(method).make(MethodRequest(self, policy, key, latency, state))
 
     def low_rank(self, policy: Policy | LoraPolicy, key: Key[Array, ""]) -> LoraPolicy:
-        """Return ``policy`` with a fresh low-rank delta (ranks 4, 10, 1 and scale 4, as in the paper)."""
+        """Return ``policy`` with a fresh low-rank delta (ranks 4, 10, 1 and scale 4, as in the paper).
+
+        Raises:
+            ConfigError: The policy has other than three layers, or one too narrow for its rank.
+        """
         if isinstance(policy, LoraPolicy):
             return policy
-        fresh: LoraPolicy = _low_rank(policy, random.fold_in(key, LOW_RANK_TAG))
+        try:
+            fresh: LoraPolicy = _low_rank(policy, random.fold_in(key, LOW_RANK_TAG))
+        except ValueError as error:  # whose traced message goes on for several lines
+            raise ConfigError(f"preset {self.preset.name!r}: {str(error).splitlines()[0]}") from error
         return fresh
 
     def adaptive_pilot(
