@@ -11,10 +11,9 @@ import pytest
 from jax import random
 
 from helpers import replaced, tiny_preset
-from retrim.adapt import OnlineLearner, RollingBuffer
+from retrim.adapt import OnlineLearner, RollingBuffer, Verdict
 from retrim.adapt import learner as module
 from retrim.config import Setup
-from retrim.learn import bptt
 from retrim.physics import Command, PointMass, State
 
 pytestmark = pytest.mark.usefixtures("optax_promotion")
@@ -145,13 +144,12 @@ def test_the_gate_flies_other_starts_than_training(setup, window, key, monkeypat
 
     def training(state, env, x0, *, optimiser):
         trained_on.append(x0)
-        return bptt(state, env, x0, optimiser=optimiser)
+        return state, jnp.zeros(3)
 
     def judging(candidate, incumbent, env, x0):
         judged_on.append(x0)
-        return judge(candidate, incumbent, env, x0)
+        return Verdict(jnp.array(True), jnp.array(True), jnp.array(0.0), jnp.array(0.0))
 
-    judge = module.judge
     monkeypatch.setattr(module, "bptt", training)
     monkeypatch.setattr(module, "judge", judging)
     learner = setup.learner
