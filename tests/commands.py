@@ -62,9 +62,9 @@ def started(words, cwd, setup=""):
     )
 
 
-def interrupted(words, cwd, *, after):
+def interrupted(words, cwd, *, after, setup=""):
     """Run, send Ctrl-C once the output shows ``after`` or that file is there; return exit code and output."""
-    process, seen = started(words, cwd), b""
+    process, seen = started(words, cwd, setup), b""
     deadline = time.monotonic() + 180
     while time.monotonic() < deadline and process.poll() is None:
         if isinstance(after, bytes):

@@ -1,105 +1,74 @@
 """Tracking, vision and low-rank adaptation as a user commands them, at reduced size."""
 
-import json
-
 import numpy as np
 import pytest
-from test_commands import retrim
 
-SMALL = """
-[pretrain]
-hidden = [64, 64]
-epochs = 150
-envs = 16
-horizon = 60
-[adapt]
-window = 50
-epochs = 2
-envs = 2
-iters = 10
-refine_every = 1.0
-improve_every = 1.5
-refine_charge = 0.1
-improve_charge = 0.3
-"""
+from commands import SMALL, results, retrim
+
+pytestmark = pytest.mark.usefixtures("as_a_user")
+
+TINY = (
+    SMALL.replace("num_updates = 150", "num_updates = 150\nnum_envs = 16\nhorizon = 60")
+    + 'window = 50\n[track]\nreference = "circle"\n'
+)
+SEE = (
+    SMALL.replace("num_updates = 150", "num_updates = 10\nnum_envs = 4\nhorizon = 40") + "[vision]\nencoder_steps = 5\n"
+)
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
+def folder(tmp_path_factory, as_a_user):
     """A folder with a small tracking policy in t/ and a trajectory of the user's."""
     here = tmp_path_factory.mktemp("user")
-    (here / "small.toml").write_text(SMALL)
-    (here / "see.toml").write_text("represent = 5\n" + SMALL)
-    rows = [
-        f"{t:.1f},{0.3 * np.sin(t):.4f},{0.2 * t:.4f},{1 + 0.05 * t:.4f},{0.1 * t:.4f}" for t in np.arange(0, 6, 0.5)
-    ]
+    (here / "tiny.toml").write_text(TINY)
+    (here / "see.toml").write_text(SEE)
+    rows = [f"{t:.1f},{np.sin(0.3 * t):.4f},{0.1 * t:.4f},{1 + 0.05 * t:.4f},{0.1 * t:.4f}" for t in np.arange(13.0)]
     (here / "mine.csv").write_text("t,x,y,z,yaw\n" + "\n".join(rows) + "\n")
-    out = retrim("pretrain", "track", "--config", "small.toml", "--out", "t", cwd=here)
+    out = retrim("pretrain", "track", "--config", "tiny.toml", "--out", "t", cwd=here)
     assert "track error in its own model" in out
     return here
 
 
-def results(folder, name):
-    return json.loads((folder / name / "results.json").read_text())
-
-
-def test_track_adapts_and_its_delta_flies_again(folder):
+def test_track_adapts_by_low_rank_and_its_delta_flies_again(folder):
     words = "fly", "--policy", "t", "--seconds", "4", "--disturbance", "small"
-    retrim(*words, "--reference", "circle", "--adapt", "lora", "--out", "f", cwd=folder)
-    base, lora = results(folder, "f")["rows"]
+    retrim(*words, "--adapt", "lora", "--out", "f", cwd=folder)
+    base, lora = results(folder / "f")["rows"]
     assert (base["method"], lora["method"]) == ("base", "lora")
     assert base["metric"] == "tracking_error_m"
+    assert base["reference"] == "circle"
     assert 0 <= lora["cross_track_m"] <= lora["mean"] + 1e-6
     assert (folder / "f" / "track_small.png").stat().st_size > 10_000
     assert (folder / "f" / "delta.safetensors").stat().st_size < 20_000
-    delta = "--delta", "f/delta.safetensors"
-    retrim(*words, *delta, "--reference", "circle", "--adapt", "none", "--out", "d", cwd=folder)
-    assert results(folder, "d")["rows"][0]["mean"] != base["mean"]
-    retrim("pretrain", "track", "--config", "small.toml", "--seed", "1", "--out", "other", cwd=folder)
-    out = retrim("fly", "--policy", "other", *delta, "--reference", "circle", cwd=folder, code=1)
-    assert "made for another base policy" in out
+    retrim(*words, "--delta", "f/delta.safetensors", "--adapt", "none", "--out", "d", cwd=folder)
+    assert results(folder / "d")["rows"][0]["mean"] != base["mean"]
 
 
-def test_track_follows_a_file_and_full_adaptation_is_kept(folder):
-    words = "--policy", "t", "--seconds", "4", "--adapt", "full", "--reference", "mine.csv", "--out", "c"
-    retrim("fly", *words, cwd=folder)
-    assert results(folder, "c")["rows"][1]["n"] == 1
-    retrim(
-        "fly",
-        "--policy",
-        "c/adapted.safetensors",
-        "--reference",
-        "circle",
-        "--adapt",
-        "none",
-        "--seconds",
-        "3",
-        cwd=folder,
-    )
+def test_track_follows_a_file_and_the_adapted_policy_flies_again(folder):
+    retrim("fly", "--policy", "t", "--seconds", "4", "--reference", "mine.csv", "--out", "c", cwd=folder)
+    assert [row["reference"] for row in results(folder / "c")["rows"]] == ["mine.csv", "mine.csv"]
+    words = "--policy", "c/adapted.safetensors", "--adapt", "none", "--seconds", "3"
+    retrim("fly", *words, "--out", "again", cwd=folder)
+    assert results(folder / "again")["rows"][0]["n"] == 1
 
 
 def test_star_is_flown_with_a_warning(folder):
-    words = "--policy", "t", "--seconds", "3", "--adapt", "none", "--reference", "star"
-    assert "velocity jumps by 3.0" in retrim("fly", *words, cwd=folder)
+    words = "--policy", "t", "--seconds", "3", "--adapt", "none", "--reference", "star", "--out", "star"
+    out = retrim("fly", *words, cwd=folder)
+    assert "warning: vehicle small cannot fly all of reference star" in out
+    assert "velocity jumps by 3.0" in out
 
 
-def test_vision_learns_to_see_and_flies_honestly(folder):
-    words = "--preset", "vision-honest", "--config", "see.toml", "--out", "v"
+def test_a_family_asks_which_to_fly(folder):
+    words = "--config", "tiny.toml", "--reference", "circle+figure8", "--updates", "1", "--out", "family"
+    retrim("pretrain", "track", *words, cwd=folder)
+    out = retrim("fly", "--policy", "family", "--out", "never", cwd=folder, code=1)
+    assert "trained on circle+figure8: say which to fly, as --reference circle" in out
+    assert not (folder / "never").exists()
+
+
+def test_vision_learns_to_see_and_flies_with_occlusion(folder):
+    words = "--preset", "occluded", "--config", "see.toml", "--out", "v"
     assert "vision error in its own model" in retrim("pretrain", "vision", *words, cwd=folder)
     retrim("fly", "--policy", "v", "--seconds", "3", "--disturbance", "none", "--out", "vf", cwd=folder)
     assert (folder / "vf" / "vision_none.png").exists()
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (("pretrain", "track", "--preset", "fast"), "preset 'fast' is for hover, not for track"),
-        (("pretrain", "track", "--reference", "square"), "no reference 'square'; there are circle, figure8, star"),
-        (("pretrain", "track", "--reference", "no.csv"), "no.csv"),
-        (("fly", "--policy", "t"), "say which to fly, as --reference circle"),
-        (("fly", "--policy", "t", "--reference", "moon"), "no reference 'moon'"),
-        (("fly", "--policy", "t", "--reference", "circle", "--delta", "none"), "none: no such file"),
-    ],
-)
-def test_wrong_input_gives_one_clear_message(folder, words, message):
-    assert message in retrim(*words, cwd=folder, code=1)
+    assert results(folder / "vf")["rows"][0]["n"] == 1

@@ -1,8 +1,17 @@
 """What a results file says of the command that made it, and of its time."""
 
+import json
+import signal
+import sys
+import threading
+
 import pytest
 
-from retrim.experiments.provenance import Stopwatch, said
+from retrim.errors import ConfigError
+from retrim.experiments import Run
+from retrim.experiments.interrupts import interrupts_only_set
+from retrim.experiments.provenance import command_line
+from retrim.experiments.stopwatch import Stopwatch
 
 
 @pytest.mark.parametrize(
@@ -16,7 +25,7 @@ from retrim.experiments.provenance import Stopwatch, said
     ],
 )
 def test_no_place_on_this_machine_is_recorded(words, kept, tmp_path):
-    assert said(words.format(here=tmp_path).split()) == f"retrim {kept}"
+    assert command_line(words.format(here=tmp_path).split()) == f"retrim {kept}"
 
 
 def test_programs_traced_inside_others_count_once():
@@ -24,3 +33,36 @@ def test_programs_traced_inside_others_count_once():
     for start, end in ((1.0, 2.0), (1.5, 2.5), (4.0, 4.5), (3.5, 5.0), (7.0, 8.0)):  # by their ends, as they come
         watch.compiled(start, end)
     assert watch.compile_s == pytest.approx(1.5 + 1.5 + 1.0)
+
+
+def test_a_run_leaves_no_folder_until_it_writes(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["retrim", "demo", "--out", str(tmp_path)])
+    run = Run("demo", tmp_path / "a" / "b")
+    assert not list(tmp_path.iterdir())
+    path = run.write_results([{"x": 1}], seeds=[3], losses=[0.5])
+    found = json.loads(path.read_text())
+    assert (found["command"], found["rows"], found["seeds"], found["losses"]) == ("retrim demo", [{"x": 1}], [3], [0.5])
+    assert (found["interrupted"], run.exit_code) == (False, 0)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match="file: results cannot be written there"):
+        Run("demo", tmp_path / "file")
+    kept = tmp_path / "kept"
+    kept.mkdir()
+    Run("demo", kept)
+    assert kept.is_dir()
+    assert not list(kept.iterdir())
+
+
+def test_ctrl_c_is_remembered_and_raises_where_it_may(tmp_path):
+    run = Run("demo", tmp_path / "never")
+    with run.interruptible():
+        raise KeyboardInterrupt
+    assert run.interrupted
+    assert run.exit_code == 130
+    assert not (tmp_path / "never").exists()
+    stop = threading.Event()
+    with interrupts_only_set(stop):
+        signal.raise_signal(signal.SIGINT)
+    assert stop.is_set()
+    with pytest.raises(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)

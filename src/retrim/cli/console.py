@@ -60,7 +60,9 @@ def refuse(message: str) -> int:
 
 def show_table(section: TableSection) -> None:
     """Print a table."""
-    table = Table(title=escape(section.title) or None, title_style="bold")
+    if section.title:  # as a line of its own, since a table wraps a title that is wider
+        console.print(f"[bold]{escape(section.title)}[/]", soft_wrap=True)
+    table = Table()
     for column in section.columns:
         table.add_column(escape(column))
     for row in section.rows:

@@ -21,7 +21,7 @@ def doctor() -> Callable[[threading.Event], int]:
 
 
 def _doctor() -> int:
-    wrong = sum(wrong_rows(n, jnp.float32) for n in (1_000, 16_385, 32_769))
+    wrong = sum(wrong_rows(n, jnp.dtype("float32")) for n in (1_000, 16_385, 32_769))
     if wrong:
         verdict = f"[bold red]wrong[/]: {wrong} rows of a batched product; another version of jax is needed"
     else:

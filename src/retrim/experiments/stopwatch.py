@@ -38,7 +38,7 @@ class Stopwatch:
     def compile_s(self) -> float:
         """Seconds so far in which something was being compiled."""
         with self._lock:
-            return sum(end - start for start, end in self._compiling)
+            return sum((end - start for start, end in self._compiling), start=0.0)
 
     @property
     def total_s(self) -> float:

@@ -1,0 +1,79 @@
+"""Ctrl-C at any moment: exit code 130, no traceback, and what is done is kept."""
+
+import jax
+import pytest
+
+from commands import SMALL, interrupted, results, retrim
+from helpers import tiny_preset
+from retrim import Setup, load_policy, save_policy
+
+pytestmark = pytest.mark.usefixtures("as_a_user")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, as_a_user):
+    """A folder with a policy in p/ that was never trained."""
+    here = tmp_path_factory.mktemp("user")
+    (here / "small.toml").write_text(SMALL.replace("[64, 64]", "[8]\nnum_envs = 2\nhorizon = 20"))
+    preset = tiny_preset()
+    save_policy(here / "p" / "policy.safetensors", Setup.of(preset).new_policy(jax.random.key(0)), preset)
+    return here
+
+
+PRETRAIN = "pretrain", "hover", "--config", "small.toml"
+
+
+def test_while_training_keeps_what_was_trained(folder):
+    code, out = interrupted((*PRETRAIN, "--updates", "100000", "--out", "cut"), folder, after=b"loss ")
+    assert code == 130, out
+    assert "Traceback" not in out
+    found = results(folder / "cut")
+    assert found["interrupted"]
+    assert 0 < len(found["losses"]) < 100_000
+    assert found["rows"][0]["updates"] == len(found["losses"])
+    assert load_policy(folder / "cut")[1].pretrain.num_updates == 100_000
+    retrim("fly", "--policy", "cut", "--seconds", "1", "--adapt", "none", "--out", "cut_flown", cwd=folder)
+
+
+def test_while_compiling_leaves_nothing(folder):
+    code, out = interrupted((*PRETRAIN, "--out", "never"), folder, after=b"compiling")
+    assert code == 130, out
+    assert "Traceback" not in out
+    assert "interrupted before the first steps were done; nothing was saved" in out
+    assert not (folder / "never").exists()
+
+
+def test_between_training_and_its_score_keeps_the_policy_with_results(folder):
+    path = folder / "between" / "policy.safetensors"
+    code, out = interrupted((*PRETRAIN, "--out", "between"), folder, after=path)
+    assert code == 130, out
+    assert "Traceback" not in out
+    found = results(folder / "between")
+    assert len(found["losses"]) == found["rows"][0]["updates"] == 150
+    assert load_policy(folder / "between")[1].name == "hover/fast"
+
+
+def test_between_training_and_flights_the_demo_keeps_the_policy_with_results(folder):
+    # What trains for minutes is cut as soon as its policy is there; the flights are never begun.
+    small = (
+        "from retrim.config import presets, loading\nfrom pathlib import Path\n"
+        "presets.PRESETS['hover/fast'] = loading.overlaid(presets.PRESETS['hover/fast'], Path('small.toml'))"
+    )
+    words = "demo", "--starts", "1", "--seconds", "3", "--out", "demo"
+    code, out = interrupted(words, folder, after=b"hover error in its own model", setup=small)
+    assert code == 130, out
+    assert "Traceback" not in out
+    assert len(results(folder / "demo")["losses"]) == 150
+    assert load_policy(folder / "demo")[1].pretrain.hidden_sizes == (8,)
+
+
+def test_while_flying_keeps_what_was_flown(folder):
+    words = "fly", "--policy", "p", "--seconds", "20", "--starts", "60", "--adapt", "none", "--plant", "simple"
+    code, out = interrupted((*words, "--out", "half"), folder, after=b" of 60 flights")
+    assert code == 130, out
+    assert "Traceback" not in out
+    found = results(folder / "half")
+    assert found["interrupted"]
+    assert 0 < found["rows"][0]["n"] < 60
+    assert (folder / "half" / "hover_large.png").exists()
+    assert len(list((folder / "half" / "logs").iterdir())) == found["rows"][0]["n"]

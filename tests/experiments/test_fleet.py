@@ -1,0 +1,117 @@
+"""Fleets: the same rows on any executor, progress, and what an interruption keeps."""
+
+import multiprocessing
+import signal
+import threading
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+
+import jax
+import numpy as np
+import pytest
+
+from helpers import tiny_preset
+from retrim import ConfigError, Fleet, Scenario, Setup, enable_compile_cache, load
+
+pytestmark = pytest.mark.usefixtures("as_a_user")
+
+SCENARIOS = [Scenario("small", plant="simple"), Scenario("gusts", plant="simple", sensors="mocap")]
+
+
+@pytest.fixture(scope="module")
+def fleet(as_a_user):
+    """Eight flights, too short to crash, of two policies that were never trained."""
+    soon = {"window": 20, "fit_every": 0.4, "update_every": 0.6, "fit_latency": 0.1, "update_latency": 0.2}
+    preset = tiny_preset(adapt=soon)
+    setup = Setup.of(preset)
+    policies = {seed: setup.new_policy(jax.random.key(seed)) for seed in (0, 5)}
+    return Fleet(preset, policies, SCENARIOS, starts=1, seconds=1.2)
+
+
+@pytest.fixture(scope="module")
+def flights(fleet):
+    return fleet.run()
+
+
+def test_every_combination_is_flown_once_and_in_order(fleet, flights):
+    assert [flight.spec for flight in flights.flown] == fleet.specs
+    assert len(set(fleet.specs)) == 8
+    assert not flights.interrupted
+    found = flights.rows()
+    assert [(row["disturbance"], row["method"], row["n"], row["crashes"]) for row in found] == [
+        (name, method, 2, 0) for name in ("small", "gusts") for method in ("base", "full")
+    ]
+    assert all(np.isfinite(row["mean"]) for row in found)
+    kinds = {event.kind for flight in flights.flown for event in flight.events}
+    assert {"residual", "policy"} & kinds == {"residual"} | ({"policy"} & kinds)
+    assert all(flight.events == () for flight in flights.flown if flight.spec.method == "base")
+
+
+def test_one_thread_and_two_processes_fly_the_same(fleet, flights):
+    with ThreadPoolExecutor(1) as pool:
+        assert fleet.run(pool).rows() == flights.rows()
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(2, mp_context=context, initializer=enable_compile_cache) as pool:
+        elsewhere = fleet.run(pool)
+    assert elsewhere.rows() == flights.rows()
+    for there, here in zip(elsewhere.flown, flights.flown, strict=True):
+        np.testing.assert_array_equal(there.log.p, here.log.p)
+        assert there.events == here.events
+        assert (there.learnt is None) == (here.learnt is None)
+
+
+def test_progress_counts_the_flights_that_are_over(fleet):
+    told = []
+    part = fleet.specs[:3]
+    flown = fleet.run(only=part, progress=lambda done, n: told.append((done, n)))
+    assert told == [(1, 3), (2, 3), (3, 3)]
+    assert [flight.spec for flight in flown.flown] == part
+
+
+@pytest.mark.parametrize("by", ["event", "ctrl-c"])
+def test_an_interruption_keeps_what_was_flown(fleet, by):
+    stop = threading.Event()
+
+    def progress(done, n):
+        if done == 2:
+            stop.set() if by == "event" else signal.raise_signal(signal.SIGINT)
+
+    with ThreadPoolExecutor(1) as pool:
+        found = fleet.run(pool, stop=stop, progress=progress)
+    assert stop.is_set()
+    assert found.interrupted
+    assert 2 <= len(found.flown) < 8
+    assert [flight.spec for flight in found.flown] == fleet.specs[: len(found.flown)]
+    assert sum(row["n"] for row in found.rows()) == len(found.flown)
+    assert fleet.run(stop=stop).flown == []
+
+
+def test_a_plant_that_fails_ends_the_fleet(fleet, monkeypatch):
+    from retrim import PlantError
+    from retrim.experiments import fleet as module
+
+    def broken(setup, policy, spec, *rest, **more):
+        raise PlantError(f"no plant for {spec.method}")
+
+    monkeypatch.setattr(module, "fly_one", broken)
+    with pytest.raises(PlantError, match="no plant for"):
+        fleet.run()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"starts": 0}, "0 starts: must be 1 to"),
+        ({"seconds": 0.0}, "flights of 0 s: must be"),
+        ({"seconds": float("nan")}, "flights of nan s: must be"),
+        ({"scenarios": []}, "nothing to fly"),
+        ({"methods": ()}, "nothing to fly"),
+        ({"methods": ("best",)}, "no method 'best'"),
+        ({"scenarios": [Scenario(reference="circle")]}, "a hover policy follows none"),
+        ({"seed": 2**32}, "seed 4294967296: must be 0 to"),
+    ],
+)
+def test_a_fleet_that_cannot_fly_is_refused(fleet, change, message):
+    policy = next(iter(fleet.policies.values()))
+    scenarios, seed = change.pop("scenarios", SCENARIOS), change.pop("seed", 0)
+    with pytest.raises(ConfigError, match=message):
+        Fleet(load("hover/fast"), {seed: policy}, scenarios, **change)

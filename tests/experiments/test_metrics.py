@@ -1,0 +1,102 @@
+"""Scores of flights: over which part, and what a terminated flight does to them."""
+
+import sys
+
+import numpy as np
+import pytest
+
+from made_up import DT, flight, log
+from retrim import Scenario
+from retrim.experiments import FlightSpec, rows
+from retrim.experiments.metrics import cell
+
+
+def test_the_error_is_over_the_last_seconds_and_no_others():
+    error = np.concatenate([np.full(401, 7.0), np.full(100, 0.25)])  # 10 s: rows 401 ... 500 are the last 2 s
+    assert flight(error).steady == pytest.approx(0.25)
+    assert flight(error[::-1]).steady == pytest.approx(7.0)
+    assert flight(error, steady_seconds=4.0).steady == pytest.approx((7.0 + 0.25) / 2)
+    assert flight(np.arange(501.0), steady_seconds=60.0).steady == pytest.approx(250.0)  # shorter than that: all of it
+
+
+def test_the_last_seconds_are_by_time_also_where_ticks_were_missed():
+    t = np.delete(DT * np.arange(501), np.arange(410, 460))  # a second without measurements
+    error = np.where(t > 8.0 + 1e-6, 1.0, 100.0)
+    assert flight(error, flown=log(t=t)).steady == pytest.approx(1.0)
+
+
+def test_the_peak_is_the_largest_error_after_five_seconds():
+    error = np.zeros(501)
+    error[[100, 300, 400]] = 9.0, 3.0, 2.0  # at 2, 6 and 8 s
+    assert flight(error).peak == 3.0
+    short = np.zeros(151)
+    short[[50, 100]] = 9.0, 1.0  # of 3 s: after half of it
+    assert flight(short, seconds=3.0).peak == 1.0
+
+
+def test_a_flight_has_settled_once_its_error_stays_small():
+    error = np.full(501, 0.01)
+    error[:50] = 1.0
+    error[200] = 0.2
+    assert flight(error).settle_s == pytest.approx(201 * DT)
+    assert flight(np.full(501, 0.01)).settle_s == 0.0
+    assert flight(np.full(501, 0.3)).settle_s == np.inf
+
+
+def test_a_terminated_flight_has_no_score():
+    crashed = flight(0.001, terminated=True)
+    assert np.isnan(crashed.steady)
+    assert crashed.peak == np.inf
+    assert crashed.settle_s == np.inf
+
+
+def test_the_mean_is_over_whole_flights_and_the_median_counts_a_terminated_one_as_infinite():
+    found = [flight(0.1), flight(0.3), flight(0.01, terminated=True)]
+    (row,) = rows(found)
+    assert (row["n"], row["crashes"]) == (3, 1)
+    assert row["mean"] == pytest.approx(0.2)
+    assert row["std"] == pytest.approx(np.std([0.1, 0.3], ddof=1))
+    assert row["median"] == pytest.approx(0.3)  # of 0.1, 0.3, infinity
+    assert row["errors"] == [pytest.approx(0.1), pytest.approx(0.3), None]
+    assert cell(row) == "0.200 ± 0.141, 1 of 3 crashed"
+    (row,) = rows([found[0], found[2], found[2]])
+    assert row["median"] is None
+    assert row["peak_after_5s"] is None
+    (row,) = rows(found[2:])
+    assert (row["mean"], row["std"], cell(row)) == (None, None, "crashed, 1 of 1")
+    (row,) = rows(found[:1])
+    assert (row["std"], cell(row)) == (None, "0.100")
+
+
+def test_one_row_for_each_scenario_and_method_and_for_each_seed_if_asked():
+    specs = [
+        FlightSpec(Scenario(name), method, 0, seed)
+        for name in ("none", "wind=3")
+        for method in ("base", "full")
+        for seed in (4, 5)
+    ]
+    found = [flight(float(i), spec=spec) for i, spec in enumerate(specs)]
+    assert [(row["disturbance"], row["method"], row["mean"]) for row in rows(found)] == [
+        ("none", "base", 0.5), ("none", "full", 2.5), ("wind=3", "base", 4.5), ("wind=3", "full", 6.5)
+    ]  # fmt: skip
+    by_seed = rows(found, by_seed=True)
+    assert [(row["seed"], row["mean"]) for row in by_seed] == [(4 + i % 2, float(i)) for i in range(8)]
+
+
+def test_cross_track_is_a_mean_over_the_last_seconds_too():
+    cross = np.concatenate([np.full(401, 5.0), np.full(100, 0.5)])
+    (row,) = rows([flight(1.0, cross=cross)])
+    assert row["cross_track_m"] == pytest.approx(0.5)
+    assert "cross_track_m" not in rows([flight(1.0)])[0]
+
+
+def test_rows_become_a_table_where_pandas_is_installed(monkeypatch):
+    found = rows([flight(0.1), flight(0.3)])
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(ImportError, match="pandas"):
+        found.to_pandas()
+    monkeypatch.undo()
+    pytest.importorskip("pandas")
+    table = found.to_pandas()
+    assert list(table["mean"]) == [pytest.approx(0.2)]
+    assert list(table.columns) == list(found[0])
