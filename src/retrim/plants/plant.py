@@ -125,10 +125,10 @@ def check_command(u: Command, plant: str) -> None:
             raise PlantError(f"{plant}: command refused, {name} = {value} is not finite")
 
 
-def limited(u: Command, low: Command, high: Command) -> Command:
-    """Return ``u`` within the limits of a vehicle; ``u`` itself if it already is."""
-    wanted, least, most = as_numpy(u), as_numpy(low), as_numpy(high)
-    accepted = np.clip(wanted, least, most).astype(wanted.dtype)
-    if np.array_equal(accepted, wanted):
+def limited(u: Command, low: np.ndarray, high: np.ndarray) -> Command:
+    """Return ``u`` within limits of [c, omega]; ``u`` itself if it already is."""
+    wanted = as_numpy(u)
+    if (low <= wanted).all() and (wanted <= high).all():
         return u
+    accepted = np.clip(wanted, low, high).astype(wanted.dtype)
     return Command(jnp.asarray(accepted[0]), jnp.asarray(accepted[1:]))

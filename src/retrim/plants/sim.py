@@ -13,7 +13,7 @@ from ..errors import PlantError
 from ..physics.disturbance import Disturbance
 from ..physics.state import Command, State
 from ..physics.substep import SUBSTEP, AbstractSubstepDynamics
-from .plant import Measurement, Plant, check_command, limited
+from .plant import Measurement, Plant, as_numpy, check_command, limited
 from .sensors import SensorModel
 
 FIRST_SAMPLE, INERTIAL = 2**31 - 1, 2**31 - 2  # folded into keys; no tick has these numbers
@@ -120,7 +120,8 @@ class SimPlant(Plant):
             )
         self.dt = model.dt
         self._model, self._disturbance, self._delay_s, self._sensors = model, disturbance, delay_s, sensors
-        self._limits = model.command_limits
+        limits = model.command_limits
+        self._limits = None if limits is None else (as_numpy(limits[0]), as_numpy(limits[1]))
         self._key = random.key(seed)
         self._state: SimState | None = None
         self._ticks = 0
