@@ -35,6 +35,7 @@ FILES = {
     "follows.toml": "references = ['circle']\n",
     "size.toml": "disturbances = ['wind=abc']\n",
     "method.toml": "presets = ['vision/ideal']\nmethods = ['base-do']\n",
+    "ranks.toml": "methods = ['base', 'lora']\n[overlay.pretrain]\nhidden_sizes = [64]\n",
     "overlay.toml": "[overlay]\nnonsense = 1\n",
     "notes.safetensors": "no policy",
 }
@@ -166,6 +167,7 @@ WRONG = [
         ("sweep", "method.toml"),
         "method 'base-do' turns the frame about a hover goal; it needs a policy that sees its state",
     ),
+    (("sweep", "ranks.toml"), "LoRA: 3 ranks (4, 10, 1) for 2 layers"),
     (("sweep", "overlay.toml"), "nonsense: unknown key"),
 ]
 

@@ -1,75 +1,112 @@
 """Tables at reduced size, and what stands in them."""
 
-import json
-import subprocess
-import sys
+import dataclasses
 
 import numpy as np
 import pytest
-from test_commands import ENVIRONMENT
 
-from retrim.adapt import Log
-from retrim.config.presets import Adapt, ConfigError
-from retrim.experiments.fleet import Flight, Plan
-from retrim.experiments.tables.reversing import METHODS, _errors, _lines, _moments, reversing
-from retrim.experiments.tables.tracking import tracking
-from retrim.experiments.tables.vision import vision
+from commands import results, retrim
+from helpers import tiny_preset
+from made_up import DT, flight, log
+from retrim import Scenario, changed, load
+from retrim.config import presets
+from retrim.config.presets import Adapt
+from retrim.experiments import Run
+from retrim.experiments.reporter import Silent
+from retrim.experiments.tables.document import Document, TableSection
+from retrim.experiments.tables.reversing import METHODS, _errors, _moments, _section
+from retrim.experiments.tables.study import Study, level_section, train_all
 
-TABLE = """
-from pathlib import Path
-from retrim import presets
-from retrim.cli.reproduce.task_table import Block, table
+pytestmark = pytest.mark.usefixtures("as_a_user")
 
-small = {"pretrain": {"hidden": (32, 32), "epochs": 60, "envs": 8, "horizon": 60}}
-small["adapt"] = {"window": 50, "improve_charge": 0.3, "epochs": 2, "envs": 2, "iters": 10, "improve_every": 1.5}
-ours = presets.changed(presets.load("track"), reference="circle", **small)
-blocks = [Block("seen ahead", ours, "circle", ("base", "lora"), paper=(("base", ("1", "2", "3")),))]
-raise SystemExit(table("tracking", ["# About"], blocks, plant="simple", seconds=3.0, starts=2, seed=0, folder=Path()))
-"""
+SOON = {"window": 20, "fit_every": 0.4, "update_every": 0.6, "fit_latency": 0.1, "update_latency": 0.2, "fit_steps": 5}
+TINY = {"hidden_sizes": [16, 16], "num_updates": 10, "num_envs": 2, "horizon": 20}
+LEVELS = ("none", "small", "large")
 
 
-def test_a_table_of_tracking(tmp_path):
-    ran = subprocess.run(
-        [sys.executable, "-c", TABLE], cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True, check=False
-    )
-    assert ran.returncode == 0, ran.stderr
-    text = (tmp_path / "tracking.md").read_text()
-    assert text.startswith("# About\n")
-    assert text.count("| ... cross-track |") == 2
-    assert "| paper, base | 1 | 2 | 3 |" in text
-    results = json.loads((tmp_path / "tracking.json").read_text())
-    found = [(row["disturbance"], row["method"], row["n"], row["reference"]) for row in results["rows"]]
-    assert found == [(d, m, 2, "circle") for d in ("none", "small", "large") for m in ("base", "lora")]
-    for row in results["rows"]:
+def test_a_table_of_hover_by_its_command(tmp_path, monkeypatch):
+    small = changed(tiny_preset(), pretrain=TINY, adapt={**SOON, "num_updates": 2, "num_envs": 2})
+    monkeypatch.setitem(presets.PRESETS, "hover/fast", small)
+    words = "--presets", "fast", "--seeds", "0", "3", "--seconds", "1", "--starts", "1", "--plant", "simple"
+    out = retrim("reproduce", "hover", *words, "--out", "t", cwd=tmp_path)
+    text = (tmp_path / "t" / "hover.md").read_text()
+    assert text.startswith("# Hover (Table I of the paper)\n")
+    assert "training seeds 0, 3." in text
+    assert "| paper, base | 0.128 ± 0.004 | 0.328 ± 0.001 | 1.228 ± 0.073 |" in text
+    assert "t/hover.md" in out
+    found = results(tmp_path / "t", "hover.json")
+    methods = list(dict.fromkeys(row["method"] for row in found["rows"]))
+    assert methods[0] == "base"
+    assert {"full", "lora"} <= set(methods)
+    assert [(row["disturbance"], row["method"], row["n"]) for row in found["rows"]] == [
+        (level, method, 2) for level in LEVELS for method in methods
+    ]
+    for row in found["rows"]:
         assert row["crashes"] == 2 or f"{row['mean']:.3f} ± {row['std']:.3f}" in text
-    assert (tmp_path / "tracking_track_circle_circle.png").stat().st_size > 10_000
+    assert (tmp_path / "t" / "hover_fast.png").stat().st_size > 10_000
 
 
-def test_errors_are_read_around_reversals_and_updates():
+def test_a_section_of_tracking_has_cross_track_and_the_papers_rows(tmp_path):
+    preset = changed(
+        load("track/preview"),
+        track={"reference": "circle"},
+        pretrain=TINY,
+        adapt={**SOON, "num_updates": 2, "num_envs": 2},
+    )
+    run = Run("test", tmp_path)
+    study = train_all(preset, [0], run, Silent())
+    assert list(study.policies) == [0]
+    paper = (("base", ("1", "2", "3")),)
+    scenario = Scenario(plant="simple", reference="circle")
+    made = level_section(
+        study, "circle", scenario, run, Silent(), methods=("base", "lora"), starts=1, seconds=1.0, paper=paper, stem="x"
+    )
+    section, found = made
+    assert [(row["disturbance"], row["method"], row["reference"]) for row in found] == [
+        (level, method, "circle") for level in LEVELS for method in ("base", "lora")
+    ]
+    assert [row[0] for row in section.rows] == [
+        "base policy", "... cross-track", "**adapted, LoRA**", "... cross-track", "paper, base"
+    ]  # fmt: skip
+    assert section.rows[-1] == ("paper, base", "1", "2", "3")
+    assert section.rows[1][1] == f"{found[0]['cross_track_m']:.3f}"
+    assert section.picture == tmp_path / "x.png"
+
+
+def test_an_interrupted_table_flies_nothing_more(tmp_path):
+    run = Run("test", tmp_path)
+    run.stop.set()
+    preset = tiny_preset()
+    study = train_all(preset, [0, 1], run, Silent())
+    assert study.policies == {}
+    assert level_section(Study(preset, {}, ()), "", Scenario(), run, Silent(), starts=1, seconds=1.0) is None
+    Document(run, "table", "Title", "Intro.", [0], Silent()).write()
+    assert "Interrupted: incomplete." in (tmp_path / "table.md").read_text()
+    assert results(tmp_path, "table.json")["interrupted"]
+
+
+def test_every_section_is_written_when_it_is_added(tmp_path):
+    document = Document(Run("test", tmp_path), "table", "Title", "Intro.", [0, 4], Silent(), {"more": 1})
+    document.add(TableSection(("a", "b"), (("1", "2"),), "First", "About it."), [{"x": 1}])
+    assert "## First\n\nAbout it.\n\n| a | b |\n|---|---|\n| 1 | 2 |\n" in (tmp_path / "table.md").read_text()
+    document.add(TableSection((), (), "Second", "Left out."), [{"x": 2}])
+    found = results(tmp_path, "table.json")
+    assert (found["rows"], found["seeds"], found["more"]) == ([{"x": 1}, {"x": 2}], [0, 4], 1)
+    assert (tmp_path / "table.md").read_text().count("| a | b |") == 1
+
+
+def test_errors_are_read_around_reversals_and_updates(tmp_path):
     """A reversal every 15 s; updates start every 5 s and fly a second later."""
     moments = _moments(Adapt(), 60.0)
     np.testing.assert_allclose(moments, [[15, 16, 21, 26, 30], [30, 31, 36, 41, 45], [45, 46, 51, 56, 60]])
-    t = 0.02 * np.arange(3001)
-    still = np.zeros((3001, 3)), np.tile(np.eye(3), (3001, 1, 1)), np.zeros((3001, 3)), np.zeros((3001, 4))
-    ramp = Flight(Plan("reversing", "full", 0), Log(t, *still, crashed=False), error=t, events=())
+    t = DT * np.arange(3001)
+    ramp = dataclasses.replace(flight(t, flown=log(t=t)))
     # fifty ticks, that of the moment last
     np.testing.assert_allclose(_errors(ramp, moments), moments - 0.49, atol=1e-9)
-    lines = _lines({"base": [], "full": [_errors(ramp, moments)] * 2}, moments)
-    assert len(lines) == 2 + 3 * len(METHODS)
-    assert lines[2] == "| reversed at 15 s, base policy | - |"
-    assert lines[3].startswith("| reversed at 15 s, **adapted** | 14.510 ± 0.000 | 15.510 ± 0.000 |")
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda out: reversing("track", out=out), "needs a preset for hover"),
-        (lambda out: reversing(seconds=20.0, out=out), "needs a preset for hover, 30 s and 1 start"),
-        (lambda out: tracking(preset=("slow",), out=out), "no preset 'slow'"),
-        (lambda out: vision(preset=("slow",), out=out), "no preset 'slow'"),
-    ],
-)
-def test_wrong_input_is_refused_before_anything_happens(make, message, tmp_path):
-    with pytest.raises(ConfigError, match=message):
-        make(tmp_path / "out")
-    assert not list(tmp_path.iterdir())
+    errors = {method: [] for method in METHODS} | {"full": [_errors(ramp, moments)] * 2}
+    section = _section(errors, moments, "", tmp_path / "x.png")
+    assert len(section.rows) == 3 * len(METHODS)
+    assert section.rows[0] == ("reversed at 15 s, base policy", *["-"] * 5)
+    (adapted,) = [row for row in section.rows if row[0] == "reversed at 15 s, **adapted**"]
+    assert adapted[1:3] == ("14.510 ± 0.000", "15.510 ± 0.000")
+    assert len(section.columns) == len(adapted)

@@ -83,9 +83,12 @@ class Fleet:
         check_seeds(tuple(self.policies))
         self._setups = {name: setup_for(dump(preset), name) for name in {s.reference for s in scenarios}}
         for method in methods:
-            if not find_method(method).learns:  # some do not fit every task
-                for setup in self._setups.values():
-                    setup.pilot(next(iter(self.policies.values())), method)
+            for setup in self._setups.values():  # some do not fit every task or network
+                policy = next(iter(self.policies.values()))
+                if not find_method(method).learns:
+                    setup.pilot(policy, method)
+                elif method == "lora":
+                    jax.eval_shape(setup.low_rank, policy, random.key(0))
         first = next(iter(self._setups.values()))
         self.seconds = first.flown.flight_seconds if seconds is None else seconds
         self._latency, self._state = latency, state
