@@ -1,10 +1,12 @@
 """Tasks and references by name."""
 
+import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 
 from ..errors import ConfigError
@@ -94,7 +96,17 @@ def make_reference(names: str) -> Reference:
     Raises:
         ConfigError: There is no such reference, or its file cannot be used.
     """
-    found = [_one_reference(name) for name in names.split("+")]
+    parts = names.split("+")
+    if all(name in BUILT_IN for name in parts):
+        return _built_in(names, jax.config.values["jax_enable_x64"])
+    found = [_one_reference(name) for name in parts]
+    return found[0] if len(found) == 1 else joined(found)
+
+
+@functools.cache
+def _built_in(names: str, x64: bool) -> Reference:
+    """References that never change are sampled once per process and precision; files are read again each time."""
+    found = [BUILT_IN[name]() for name in names.split("+")]
     return found[0] if len(found) == 1 else joined(found)
 
 
