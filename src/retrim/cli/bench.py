@@ -7,7 +7,7 @@ from pathlib import Path
 from ..bench.measure import bench as measure
 from ..bench.works import WORKS
 from ..experiments.run import Run
-from .console import RichReporter, show_paths
+from .console import RichReporter, show_paths, started
 
 
 def bench(works: tuple[str, ...] = tuple(WORKS), out: Path | None = None) -> Callable[[threading.Event], int]:
@@ -19,7 +19,7 @@ def bench(works: tuple[str, ...] = tuple(WORKS), out: Path | None = None) -> Cal
     """
 
     def ordered(stop: threading.Event) -> int:
-        run = Run("bench", out, stop=stop)
+        run = started(Run("bench", out, stop=stop))
         fine = measure(run, RichReporter(), works=works)
         show_paths([run.folder / "bench.md"])
         return run.exit_code or int(not fine)

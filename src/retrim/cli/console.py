@@ -10,6 +10,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from rich.table import Table
 
 from ..experiments.reporter import Advance
+from ..experiments.run import Run
 from ..experiments.tables.document import TableSection
 
 console = Console(highlight=False)
@@ -49,6 +50,13 @@ def _lines(title: str) -> Advance:
             console.print(f"{title}: {100 * share:.0f} %, {note}, {now - began:.0f} s", markup=False, soft_wrap=True)
 
     return advance
+
+
+def started(run: Run) -> Run:
+    """Return a run, after a line if it replaces results of an earlier one."""
+    if run.replaces:
+        console.print(f"results in {run.folder} are replaced", markup=False, soft_wrap=True)
+    return run
 
 
 def refuse(message: str) -> int:

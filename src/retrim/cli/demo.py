@@ -19,7 +19,7 @@ from ..experiments.run import INTERRUPTED, Run
 from ..experiments.tables.hover import PAPER
 from ..experiments.tables.study import LEVELS, Study, fly_all, level_table
 from ..experiments.training import nominal_error, train
-from .console import RichReporter, console, show_paths, show_table
+from .console import RichReporter, console, show_paths, show_table, started
 
 WHY = {
     "hover/fast": "trains in seconds, and its model has a command delay, as plants have",
@@ -56,7 +56,7 @@ def _demo(
     check_flights(starts, seconds)
     preset = load_for("hover", name)
     scenario, setup, reporter = Scenario("large", plant=plant), Setup.of(preset), RichReporter()
-    run = Run("demo", out, stop=stop)
+    run = started(Run("demo", out, stop=stop))
     console.print(f"[bold]{len(LEVELS) * 2 * starts} flights of {seconds:g} s[/]; two to three minutes on two cores")
     console.print(f"preset [bold]{preset.name}[/]: {WHY.get(preset.name, 'your choice')}")
     console.print(

@@ -20,7 +20,7 @@ from ..experiments.run import INTERRUPTED, Run
 from ..experiments.tables.document import TableSection
 from ..io.checkpoint import load_delta
 from ..io.trained import load_learnt, load_policy
-from .console import RichReporter, console, show_paths, show_table
+from .console import RichReporter, console, show_paths, show_table, started
 
 
 def fly(
@@ -90,7 +90,7 @@ def fly(
             preset, {seed: weights}, [scenario], methods=methods, starts=starts, seconds=seconds, latency=latency,
             state=state,
         )  # fmt: skip
-        run, setup = Run("fly", out, stop=stop), Setup.of(preset, follows)
+        run, setup = started(Run("fly", out, stop=stop)), Setup.of(preset, follows)
         _warn(setup, scenario)
         return _fly(fleet, setup, scenario, run)
 

@@ -19,7 +19,7 @@ from ..experiments.limits import check_seeds
 from ..experiments.outputs import write_trained
 from ..experiments.run import INTERRUPTED, Run
 from ..experiments.training import nominal_error, train
-from .console import RichReporter, console, show_paths
+from .console import RichReporter, console, show_paths, started
 
 
 def pretrain(
@@ -78,7 +78,7 @@ def _table(value: Any) -> dict[str, Any]:
 
 def _pretrain(preset: Preset, seed: int, out: Path | None, stop: threading.Event) -> int:
     setup = Setup.of(preset)
-    run, reporter = Run("pretrain", out, stop=stop), RichReporter()
+    run, reporter = started(Run("pretrain", out, stop=stop)), RichReporter()
     policy, losses = train(setup, seed, reporter=reporter, stop=stop)
     if not losses:
         console.print("interrupted before the first steps were done; nothing was saved")

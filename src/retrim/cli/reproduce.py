@@ -7,14 +7,14 @@ from pathlib import Path
 from ..experiments import tables
 from ..experiments.run import Run
 from ..experiments.tables.vision import TITLES
-from .console import RichReporter, show_paths
+from .console import RichReporter, show_paths, started
 
 Ordered = Callable[[threading.Event], int]
 
 
 def _ordered(name: str, out: Path | None, make: Callable[[Run, RichReporter], None]) -> Ordered:
     def ordered(stop: threading.Event) -> int:
-        run = Run("reproduce", out, stop=stop)
+        run = started(Run("reproduce", out, stop=stop))
         make(run, RichReporter())
         show_paths([run.folder / f"{name}.md"])
         return run.exit_code

@@ -13,7 +13,7 @@ class Window(eqx.Module):
     """The last ``n`` ticks of a flight, oldest first. While it fills, ``valid`` is false in front."""
 
     t: Float[Array, " n"]
-    """Time of each tick [s], by the plant's clock."""
+    """Time of each tick since the start of the flight [s]."""
     x: State
     """Measured state at each tick (leading axis n)."""
     u: Command
