@@ -123,6 +123,8 @@ def check_task(task: AbstractTask, *, starts: int = 16) -> None:
     _require(float(task.error(one.t, one.x)) >= 0.0, "the error is not negative")
     _require(task.home().shape == (3,) and task.target(one.t).shape == (3,), "home and target are positions")
     _require(task.dt > 0 and task.horizon > 0, "dt and horizon are positive")
+    off = float(task.error(one.t, State.at(task.target(one.t))))
+    _require(abs(off) < 1e-3, "the error at the target is zero")
     for observation, name in ((task.observation, "training"), (task.observation_in_flight, "flight")):
         memory = observation.init(one.x)
         o, later = observation(memory, one.t, one.x, u)

@@ -1,7 +1,7 @@
 """``retrim fly``."""
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from ..adapt.learner import LearnerState
@@ -13,9 +13,10 @@ from ..control.policy import Policy
 from ..errors import ConfigError
 from ..experiments.figures import picture
 from ..experiments.fleet import Fleet
+from ..experiments.flights import Flight
 from ..experiments.interrupts import interrupts_only_set
 from ..experiments.metrics import cell, rows
-from ..experiments.outputs import write_events, write_learnt, write_logs
+from ..experiments.outputs import clear_outputs, write_events, write_learnt, write_logs
 from ..experiments.run import INTERRUPTED, Run
 from ..experiments.tables.document import TableSection
 from ..io.checkpoint import load_delta
@@ -85,7 +86,7 @@ def fly(
             preset = changed(preset, adapt={"residual": residual})
         follows = _flown_reference(preset, reference)
         scenario = Scenario(disturbance, plant, vehicle, sensors, thrust_error, follows)
-        methods: tuple[str, ...] = ("base",) if adapt == "none" else ("base", adapt)
+        methods: tuple[str, ...] = ("base",) if adapt in ("none", "base") else ("base", adapt)
         fleet = Fleet(
             preset, {seed: weights}, [scenario], methods=methods, starts=starts, seconds=seconds, latency=latency,
             state=state,
@@ -109,6 +110,7 @@ def _fly(fleet: Fleet, setup: Setup, scenario: Scenario, run: Run) -> int:
     found, preset = rows(flights), setup.preset
     with interrupts_only_set(run.stop):
         run.write_results(found, seeds=list(fleet.policies), preset=preset.name)
+        clear_outputs(run.folder)
         write_events(flights, run.folder)
         write_logs(flights, run.folder)
         write_learnt(flights, preset, run.folder)
@@ -117,8 +119,21 @@ def _fly(fleet: Fleet, setup: Setup, scenario: Scenario, run: Run) -> int:
     title = f"{kind} error [m], last {steady:g} s of {fleet.seconds:g} s, {n} start{'s' * (n > 1)}"
     lines = tuple((row["disturbance"], row["method"], cell(row)) for row in found)
     show_table(TableSection(("disturbance", "method", "error"), lines, title))
+    _notes(flights, setup.preset)
     show_paths([*picture(flights, setup, scenario, run.folder), run.folder / "results.json"])
     return run.exit_code
+
+
+def _notes(flights: Sequence[Flight], preset: Preset) -> None:
+    """Say which flights crashed, and where no update took effect."""
+    for flight in flights:
+        if flight.log.terminated:
+            about = f"{flight.spec.method}, start {flight.spec.start}"
+            console.print(f"crashed: {about}, left its bounds at {flight.log.t[-1]:.2f} s", markup=False)
+    learning = [f for f in flights if f.learnt is not None]
+    if learning and not any(f.swaps for f in learning):
+        first = preset.adapt.update_every + preset.adapt.update_latency
+        console.print(f"no policy update took effect; with fixed latencies the first one comes at {first:g} s")
 
 
 def _loaded(policy: Path | None, resume: Path | None, delta: Path | None) -> tuple[Policy, Preset, LearnerState | None]:

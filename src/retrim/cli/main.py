@@ -108,10 +108,26 @@ def _command(name: str, words: list[str], stop: threading.Event) -> int:
         return refuse(f"{where}{error.strerror or error}")
     except MemoryError:
         return refuse("out of memory; use fewer --starts, smaller networks or a shorter horizon")
-    if stop.is_set() and code == 0:
-        console.print("interrupted")
-        return 130
+    except Exception as error:
+        if not any(":" in word for word in words):
+            raise
+        # A module of the user's own takes part: its mistakes are his to read, not a stack of ours.
+        return refuse(f"{_place(error)}{type(error).__name__}: {error}; retrim.testing.check_... names a broken law")
+    if stop.is_set():
+        console.print("interrupted; what was done is kept, if anything was")
+        return code or 130
     return code
+
+
+def _place(error: Exception) -> str:
+    """The last place of a user's own file in the traceback, if there is one."""
+    import traceback
+    from pathlib import Path
+
+    here = str(Path.cwd())
+    frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename.startswith(here)]
+    own = [f for f in frames if "site-packages" not in f.filename and "/src/retrim/" not in f.filename]
+    return f"{own[-1].filename}, line {own[-1].lineno}: " if own else ""
 
 
 @contextlib.contextmanager

@@ -74,7 +74,7 @@ class Scenario:
         """
         return make_vehicle(self.vehicle or trained_for)
 
-    def make(self, trained_for: str | VehicleSpec = "small", *, dt: float = 0.02, seed: int = 0) -> Plant:
+    def make(self, trained_for: str | VehicleSpec | Vehicle = "small", *, dt: float = 0.02, seed: int = 0) -> Plant:
         """Build the plant.
 
         Args:

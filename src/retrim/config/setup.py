@@ -170,7 +170,9 @@ class Setup:
         """
         from .methods import MethodRequest, find_method  # they are made of a set-up, too
 
-        return find_method(method).make(MethodRequest(self, policy, key, latency, state))
+        pilot = find_method(method).make(MethodRequest(self, policy, key, latency, state))
+        pilot.dt = self.preset.dt
+        return pilot
 
     def low_rank(self, policy: Policy | LoraPolicy, key: Key[Array, ""]) -> LoraPolicy:
         """Return ``policy`` with a fresh low-rank delta (ranks 4, 10, 1 and scale 4, as in the paper).

@@ -31,12 +31,14 @@ def vehicle_from(name: str | VehicleSpec) -> str | VehicleSpec:
     return name
 
 
-def make_vehicle(vehicle: str | VehicleSpec) -> Vehicle:
-    """Build a vehicle.
+def make_vehicle(vehicle: str | VehicleSpec | Vehicle) -> Vehicle:
+    """Build a vehicle; one that is built already is returned.
 
     Raises:
         ConfigError: There is no such vehicle, or it cannot exist.
     """
+    if isinstance(vehicle, Vehicle):
+        return vehicle
     try:
         found = vehicle_from(vehicle)
         made = found.build() if isinstance(found, VehicleSpec) else VEHICLES.find(found)()
@@ -45,9 +47,7 @@ def make_vehicle(vehicle: str | VehicleSpec) -> Vehicle:
             error if isinstance(error, ConfigError) else ConfigError(f"vehicle {name_of(vehicle)}: {error}")
         ) from error
     if not isinstance(made, Vehicle):
-        raise ConfigError(
-            f"vehicle {name_of(vehicle)!r} is a {type(made).__name__}, not a function that gives a Vehicle"
-        )
+        raise ConfigError(f"vehicle {name_of(vehicle)!r} gives a {type(made).__name__}, expected a retrim.Vehicle")
     return made
 
 

@@ -100,7 +100,9 @@ def _label(here: ExternalEffects) -> str:
 
 
 def _track(flight: Flight) -> plots.Track:
-    return plots.Track(flight.log.t, flight.log.p, flight.error, flight.swaps, flight.log.terminated)
+    return plots.Track(
+        flight.log.t, flight.log.p, flight.error, flight.swaps, flight.log.terminated, flight.steady_seconds
+    )
 
 
 def _image_track(observation: Keypoints, x: State) -> plots.ImageTrack:

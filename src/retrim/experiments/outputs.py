@@ -48,6 +48,14 @@ def write_trained(
     return path
 
 
+def clear_outputs(folder: Path) -> None:
+    """Remove what an earlier command left of flights in a folder that is used again, before new files are written."""
+    for name in ("learnt.safetensors", "adapted.safetensors", "delta.safetensors", "events.jsonl"):
+        (folder / name).unlink(missing_ok=True)
+    for log in (folder / "logs").glob("*.npz"):
+        log.unlink()
+
+
 def write_events(flights: Sequence[Flight], folder: Path) -> None:
     """Write ``events.jsonl``: what adaptation did, flight by flight."""
     lines = [
@@ -56,7 +64,7 @@ def write_events(flights: Sequence[Flight], folder: Path) -> None:
                 "event": event.kind,
                 "disturbance": flight.spec.scenario.disturbance,
                 "start": flight.spec.start,
-                "t": event.t,
+                "t": round(event.t, 6),
                 "note": event.note,
             }
         )

@@ -229,11 +229,11 @@ def _report(sweep: Sweep, kept: Sequence[dict[str, Any]], run: Run, reporter: Re
             | {"median": median if np.isfinite(median) else None, "max": worst if np.isfinite(worst) else None}
         )
         named = dict(zip(GROUP, group, strict=True))
-        spread = f"{whole.mean():.3f} ± {whole.std(ddof=len(whole) > 1):.3f}" if len(whole) else "crashed"
+        deviation = f" ± {whole.std(ddof=1):.3f}" if len(whole) > 1 else ""
+        spread = f"{whole.mean():.3f}{deviation}" if len(whole) else "crashed"
+        middle = f"{median:.3f}" if np.isfinite(median) else "crashed"
         limit = "crashed" if crashes else f"{worst:.3f}"
-        cells.append(
-            (*(str(named[name]) for name in varied), spread, f"{median:.3f}", limit, f"{crashes} of {len(flights)}")
-        )
+        cells.append((*(str(named[name]) for name in varied), spread, middle, limit, f"{crashes} of {len(flights)}"))
     intro = "Made by `retrim sweep`. Error [m] over the last seconds of each flight, over seeds and starts."
     document = Document(run, "sweep", "Sweep", intro, sweep.seeds, reporter, {"sweep": dataclasses.asdict(sweep)})
     if cells:
@@ -245,10 +245,12 @@ def _report(sweep: Sweep, kept: Sequence[dict[str, Any]], run: Run, reporter: Re
 
 
 def _bar_groups(groups: Mapping[tuple[Any, ...], list[dict[str, Any]]]) -> dict[str, dict[str, list[float]]]:
-    """Errors of whole flights by scenario and method."""
+    """Errors of flights by scenario and method, infinite for those that crashed."""
     shown: dict[str, dict[str, list[float]]] = {}
     varied = [i for i, name in enumerate(GROUP[:-1]) if len({group[i] for group in groups}) > 1] or [5]
     for group, flights in groups.items():
         label = ", ".join(str(group[i]) for i in varied)
-        shown.setdefault(label, {})[str(group[-1])] = [row["error"] for row in flights if row["error"] is not None]
+        shown.setdefault(label, {})[str(group[-1])] = [
+            float("inf") if row["error"] is None else row["error"] for row in flights
+        ]
     return shown

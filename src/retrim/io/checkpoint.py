@@ -45,6 +45,8 @@ def read_policy(path: str | Path) -> tuple[Policy, dict[str, str]]:
     file = path / "policy.safetensors" if path.is_dir() else path
     data = read_bounded(file, "`retrim pretrain hover --out DIR` makes one")
     try:
+        if wire.kind_of(data, source=str(file)) == "learnt":
+            raise CheckpointError(f"{file}: holds what a flight has learnt; go on from it with `retrim fly --resume`")
         header = wire.describe(data, kind="policy", source=str(file))
         like = policy_like(header.get("architecture", ""), source=str(file))
         policy = wire.unpack(data, like, kind="policy", source=str(file))

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..errors import RetrimError
+from ..errors import ConfigError, RetrimError
 from ..learn.window import Window
 from ..physics.state import Command, State
 from ..plants.plant import Measurement, Plant, as_numpy
@@ -140,9 +140,14 @@ def fly(
         The log, with one row more than ticks flown.
 
     Raises:
+        ConfigError: Pilot and plant tick at different rates.
         PlantError: The plant refused a command or was lost.
         FlightStopped: ``stop`` was set.
     """
+    if pilot.dt is not None and abs(pilot.dt - plant.dt) > 1e-9:
+        raise ConfigError(
+            f"the pilot was made for ticks of {pilot.dt:g} s, the plant has {plant.dt:g} s; pass dt to it"
+        )
     recorder, ended = Recorder(), False
     everyone: tuple[Observer, ...] = (recorder, *observers)
     with plant:

@@ -17,6 +17,9 @@ from .events import Event
 class Pilot(abc.ABC):
     """Flies one vehicle. It may hold whatever it needs to."""
 
+    dt: float | None = None
+    """Control period that it was made for [s]; None for any."""
+
     @abc.abstractmethod
     def reset(self, measurement: Measurement) -> None:
         """Start a flight. What was learnt before stays; what was remembered of an earlier flight does not.

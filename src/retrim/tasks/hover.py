@@ -44,6 +44,10 @@ class AbstractHover(AbstractTask):
         """Return the goal, world [m]."""
         return self.goal
 
+    def target(self, t: Float[Array, ""]) -> Float[Array, "3"]:
+        """Return the goal, world [m]; a subclass may move it, and reward, bounds and error follow."""
+        return self.goal
+
     def reset(self, key: Key[Array, ""]) -> Start:
         """Draw a start: goal +- 1 m per axis, yaw within ``heading``, pitch and roll within 18 degrees, 0.1 m/s."""
         kp, ka, kv = random.split(key, 3)
@@ -54,11 +58,11 @@ class AbstractHover(AbstractTask):
 
     def terminated(self, t: Float[Array, ""], x: State) -> Bool[Array, ""]:
         """Return whether the vehicle is outside the box, or its state not finite."""
-        return ~within(self.box, x, self.goal)
+        return ~within(self.box, x, self.target(t))
 
     def error(self, t: Float[Array, ""], x: State) -> Float[Array, ""]:
         """Return the distance from the goal [m]."""
-        return jnp.sqrt(jnp.sum((x.p - self.goal) ** 2))
+        return jnp.sqrt(jnp.sum((x.p - self.target(t)) ** 2))
 
 
 class Hover(AbstractHover):
@@ -66,7 +70,7 @@ class Hover(AbstractHover):
 
     def reward(self, t: Float[Array, ""], x: State, u: Command) -> Float[Array, ""]:
         """Return r_pos + r_vel + r_act of the paper; the rate term acts on the commanded body rates."""
-        return _printed(self.goal, x, u)
+        return _printed(self.target(t), x, u)
 
 
 class L2Hover(AbstractHover):
@@ -74,8 +78,8 @@ class L2Hover(AbstractHover):
 
     def reward(self, t: Float[Array, ""], x: State, u: Command) -> Float[Array, ""]:
         """Return the paper's reward - 3 (sqrt(|p - goal|^2 + (1 cm)^2) - 1 cm)."""
-        tip = jnp.sqrt(jnp.sum((x.p - self.goal) ** 2) + 0.01**2) - 0.01
-        return _printed(self.goal, x, u) - 3.0 * tip
+        tip = jnp.sqrt(jnp.sum((x.p - self.target(t)) ** 2) + 0.01**2) - 0.01
+        return _printed(self.target(t), x, u) - 3.0 * tip
 
 
 def _printed(goal: Float[Array, "3"], x: State, u: Command) -> Float[Array, ""]:

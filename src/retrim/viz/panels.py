@@ -65,7 +65,10 @@ def panel_figure(title: str, panels: Sequence[Panel], *, across: int = 3) -> Fig
 
 
 def bars(title: str, groups: dict[str, dict[str, list[float]]]) -> Figure:
-    """Draw one group of bars per label and one bar per method: the mean, and a dot for each flight."""
+    """Draw one group of bars per label and one bar per method: the mean, and a dot for each flight.
+
+    An infinite value is a flight that crashed; the number of these stands below the bar's place.
+    """
     methods = list(dict.fromkeys(method for group in groups.values() for method in group))
     with plt.rc_context(
         {"font.size": 10, "axes.spines.top": False, "axes.spines.right": False, "svg.fonttype": "none"}
@@ -77,11 +80,15 @@ def bars(title: str, groups: dict[str, dict[str, list[float]]]) -> Figure:
         for k, method in enumerate(methods):
             places = np.arange(len(groups)) + (k - (len(methods) - 1) / 2) * width
             color = BASE if method == "base" else COLORS[(k - 1) % len(COLORS) if k else 0]
-            means = [float(np.mean(group[method])) if group.get(method) else 0.0 for group in groups.values()]
+            finite = [[v for v in group.get(method, []) if np.isfinite(v)] for group in groups.values()]
+            means = [float(np.mean(found)) if found else 0.0 for found in finite]
             axes.bar(places, means, 0.9 * width, color=color, alpha=0.5, label=method)
-            for place, group in zip(places, groups.values(), strict=True):
-                found = group.get(method, [])
+            for place, group, found in zip(places, groups.values(), finite, strict=True):
                 axes.plot(np.full(len(found), place), found, "o", color=color, markersize=4)
+                if crashed := len(group.get(method, [])) - len(found):
+                    axes.annotate(
+                        f"{crashed} crashed", (place, 0.0), color=color, rotation=90, ha="center", va="bottom"
+                    )
         axes.set_xticks(np.arange(len(groups)), list(groups), rotation=20 if len(groups) > 4 else 0, ha="center")
         axes.set(ylabel="error [m]")
         axes.set_title(title, fontsize=12, color=INK)

@@ -31,6 +31,8 @@ class Track:
     swaps: tuple[float, ...] = ()
     """When a new policy took over [s]."""
     crashed: bool = False
+    last_s: float = 2.0
+    """The flight is scored over this long at its end [s]."""
 
 
 @dataclass(frozen=True)
@@ -99,12 +101,14 @@ def _errors(axes: Axes, base: list[Track], adapted: list[Track], spans: list[Spa
             label = f"{name}: single flights" if len(tracks) > 1 and i == 0 else None
             axes.plot(track.t, track.error, color=color, alpha=0.35, linewidth=0.8, label=label)
             if track.crashed:
-                axes.plot(track.t[-1], track.error[-1], "x", color=color, markersize=10)
-        whole = [track.error for track in tracks if not track.crashed]
+                axes.plot(track.t[-1], track.error[-1], "x", color=color, markersize=10, clip_on=False)
+                axes.annotate("crashed", (track.t[-1], track.error[-1]), color=color, fontsize=9, ha="right")
+        whole = [track for track in tracks if not track.crashed]
         if whole:
-            mean = np.mean(whole, axis=0)
-            final = f"{100 * mean[-100:].mean():.1f} cm off at the end"
-            axes.plot(tracks[0].t[: len(mean)], mean, color=color, linewidth=2.4, label=f"{name}: {final}")
+            mean, first = np.mean([track.error for track in whole], axis=0), whole[0]
+            late = first.t > first.t[-1] - first.last_s
+            final = f"{100 * mean[late].mean():.1f} cm over the last {first.last_s:g} s"
+            axes.plot(first.t, mean, color=color, linewidth=2.4, label=f"{name}: {final}")
     axes.set(xlabel="time [s]", ylabel="distance from where it should be [m]", ylim=(0, top))
     axes.margins(x=0)
 

@@ -53,7 +53,7 @@ class Document:
         """Add a section and the rows of results behind it; write both files."""
         self._sections.append(section)
         self._rows += rows
-        self.reporter.say("\n".join(section.markdown()))
+        self.reporter.say("\n".join(line for line in section.markdown() if not line.startswith("![")))
         self.write()
 
     def write(self) -> Path:
