@@ -146,7 +146,7 @@ WRONG = [
     (("fly", "--policy", "cut.safetensors"), "cut.safetensors: not a whole safetensors file"),
     (("fly", "--policy", "flipped.safetensors"), "flipped.safetensors: the checksum does not match"),
     (("fly", "--policy", "notes.safetensors"), "notes.safetensors: not a whole safetensors file"),
-    (("fly", "--policy", "learnt.safetensors"), "learnt.safetensors: holds what a flight has learnt; go on from it with"),
+    (("fly", "--policy", "learnt.safetensors"), "learnt.safetensors: holds what a flight has learnt; go on from it"),
     (("fly", "--resume", "p/policy.safetensors"), "holds a 'policy', expected a 'learnt'"),
     (("fly", "--resume", "missing"), "missing: no such file; `retrim fly --out DIR` makes a learnt.safetensors"),
     (("fly", "--resume", "learnt.safetensors", "--delta", "delta.safetensors"), "--delta goes with --policy"),

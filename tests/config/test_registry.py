@@ -233,7 +233,7 @@ def test_a_plant_that_is_none(mine):
 
 
 def test_a_vehicle_that_is_none(mine):
-    with pytest.raises(ConfigError, match="gives a str, expected a retrim.Vehicle"):
+    with pytest.raises(ConfigError, match=r"gives a str, expected a retrim\.Vehicle"):
         Scenario(vehicle=f"{mine}:no_vehicle").make()
     with pytest.raises(ConfigError, match="vehicle"):
         Setup.of(changed(tiny_preset(), vehicle=f"{mine}:NUMBER"))
