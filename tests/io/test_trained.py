@@ -165,7 +165,7 @@ def test_a_policy_is_not_what_was_learnt(tmp_path, setup, states):
     with pytest.raises(CheckpointError, match="holds a 'policy', expected a 'learnt'"):
         load_learnt(path)
     save_learnt(path, states["full"], setup.preset)
-    with pytest.raises(CheckpointError, match="holds a 'learnt', expected a 'policy'"):
+    with pytest.raises(CheckpointError, match="holds what a flight has learnt; go on from it"):
         load_policy(path)
     with pytest.raises(CheckpointError, match=r"nothing: no such file; `retrim fly --out DIR`"):
         load_learnt(tmp_path / "nothing")
