@@ -6,7 +6,8 @@ import pytest
 
 from retrim import ConfigError
 from retrim.config import PRESETS, changed, load, overlaid
-from retrim.config.loading import MAX_TOML_BYTES, parse
+from retrim.config.loading import parse
+from retrim.config.validation import MAX_TOML_BYTES
 
 
 @pytest.fixture

@@ -1,18 +1,15 @@
 """Presets from names, TOML files, flags and JSON; every mistake is one clear line."""
 
 import dataclasses
-import difflib
-import tomllib
 from pathlib import Path
 from typing import Any
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import TypeAdapter
 
 from ..errors import ConfigError
 from .presets import BUILT_IN_TASKS, PRESETS, Preset
+from .validation import read_toml, suggestion, validated
 from .vehicle_file import read_vehicle
-
-MAX_TOML_BYTES = 1_000_000
 
 
 def load(name: str, overlay: Path | None = None) -> Preset:
@@ -57,25 +54,7 @@ def overlaid(preset: Preset, overlay: Path) -> Preset:
     above = read_toml(overlay)
     if isinstance(above.get("vehicle"), str) and above["vehicle"].endswith(".toml"):
         above["vehicle"] = dataclasses.asdict(read_vehicle(overlay.parent / above["vehicle"]))
-    return _validated(merged(values(preset), above), source=str(overlay))
-
-
-def read_toml(path: Path) -> dict[str, Any]:
-    """Return the tables of a TOML file.
-
-    Raises:
-        ConfigError: It is not a regular file, too large, or not TOML.
-    """
-    try:
-        if not path.is_file():
-            raise ConfigError(f"{path}: {'not a regular file' if path.exists() else 'no such file'}")
-        if path.stat().st_size > MAX_TOML_BYTES:
-            raise ConfigError(f"{path}: larger than the {MAX_TOML_BYTES} bytes that are accepted")
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
-        raise ConfigError(f"{path}: not TOML ({error})") from error
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from error
+    return validated(Preset, merged(values(preset), above), source=str(overlay))
 
 
 def values(preset: Preset) -> dict[str, Any]:
@@ -89,10 +68,7 @@ def parse(text: str | bytes, *, source: str) -> Preset:
     Raises:
         ConfigError: It is not a preset.
     """
-    try:
-        return TypeAdapter(Preset).validate_json(text)
-    except ValidationError as error:
-        raise ConfigError(f"{source}: {_explained(error)}") from error
+    return validated(Preset, text, source=source)
 
 
 def changed(preset: Preset, **tables: Any) -> Preset:
@@ -105,7 +81,7 @@ def changed(preset: Preset, **tables: Any) -> Preset:
     Raises:
         ConfigError: A key or value does not fit.
     """
-    return _validated(merged(values(preset), tables), source="preset")
+    return validated(Preset, merged(values(preset), tables), source="preset")
 
 
 def dump(preset: Preset) -> str:
@@ -117,44 +93,3 @@ def merged(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
     """Return ``below`` with the values of ``above`` on top, table by table."""
     deep = {k: merged(below[k], v) for k, v in above.items() if isinstance(v, dict) and isinstance(below.get(k), dict)}
     return {**below, **above, **deep}
-
-
-def suggestion(name: str, known: Any) -> str:
-    """Return the nearest known name, and all of them."""
-    near = difflib.get_close_matches(name, list(known), n=1)
-    return (f"did you mean {near[0]!r}? " if near else "") + f"there are {', '.join(known)}"
-
-
-def _validated(tables: dict[str, Any], *, source: str) -> Preset:
-    try:
-        return TypeAdapter(Preset).validate_python(tables)
-    except ValidationError as error:
-        raise ConfigError(f"{source}: {_explained(error)}") from error
-
-
-def _explained(error: ValidationError) -> str:
-    """Each mistake with its path and, for an unknown key, the keys that there are."""
-    found = dict[str, str]()
-    for each in error.errors(include_url=False):
-        path = [str(part) for part in each["loc"] if not str(part).startswith("function-")]
-        where = ".".join(path) or "preset"
-        message = each["msg"].removeprefix("Value error, ")
-        if each["type"] == "unexpected_keyword_argument":
-            keys = [field.name for field in dataclasses.fields(_table(path[:-1]))]
-            message = f"unknown key; {suggestion(path[-1], keys)}"
-        found.setdefault(where, message)
-    return "; ".join(f"{where}: {message}" for where, message in found.items())
-
-
-def _table(path: list[str]) -> Any:
-    """The dataclass of a table of the preset."""
-    from . import presets, vehicle_file
-
-    tables = {
-        "pretrain": presets.Pretrain,
-        "adapt": presets.Adapt,
-        "track": presets.Track,
-        "vision": presets.Vision,
-        "vehicle": vehicle_file.VehicleSpec,
-    }
-    return tables.get(path[0], Preset) if path else Preset

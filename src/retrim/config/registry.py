@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Generic, TypeVar
 
 from ..errors import ConfigError
-from .loading import suggestion
+from .validation import suggestion
 
 T = TypeVar("T")
 

@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import jax.numpy as jnp
-from pydantic import ConfigDict, Field, TypeAdapter, ValidationError, model_validator
+from pydantic import ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
-from ..errors import ConfigError
 from ..physics.state import STANDARD_GRAVITY
 from ..physics.vehicle import Vehicle, kingfisher, small
+from .validation import read_toml, validated
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
 Three = tuple[Positive, Positive, Positive]
@@ -109,20 +109,6 @@ def read_vehicle(path: Path) -> VehicleSpec:
     Raises:
         ConfigError: The file cannot be read, or a value is missing, unknown or impossible.
     """
-    from .loading import read_toml, suggestion
-
     tables = read_toml(path)
     tables.setdefault("name", path.stem)
-    try:
-        return TypeAdapter(VehicleSpec).validate_python(tables)
-    except ValidationError as error:
-        wrong = []
-        for each in error.errors(include_url=False):
-            where = ".".join(map(str, each["loc"])) or "vehicle"
-            message = each["msg"].removeprefix("Value error, ")
-            if each["type"] == "unexpected_keyword_argument":
-                message = f"unknown key; {suggestion(where, [f.name for f in dataclasses.fields(VehicleSpec)])}"
-            elif each["type"] in ("missing", "missing_argument"):
-                message = "is missing"
-            wrong.append(f"{where}: {message}")
-        raise ConfigError(f"{path}: {'; '.join(wrong)}") from error
+    return validated(VehicleSpec, tables, source=str(path))

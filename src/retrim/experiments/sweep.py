@@ -9,15 +9,15 @@ from typing import Any
 
 import numpy as np
 from jax import random
-from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from ..config.loading import changed, dump, load, read_toml, suggestion
+from ..config.loading import changed, dump, load
 from ..config.presets import Preset
 from ..config.scenario import Scenario
 from ..config.setup import Setup
+from ..config.validation import read_toml, validated
 from ..control.policy import Policy
-from ..errors import ConfigError
 from ..io.files import write_whole
 from ..io.trained import load_policy, save_policy
 from ..viz.panels import bars
@@ -75,16 +75,7 @@ def read_sweep(path: Path) -> Sweep:
     Raises:
         ConfigError: It cannot be read, or a key or value does not fit.
     """
-    try:
-        return TypeAdapter(Sweep).validate_python(read_toml(path))
-    except ValidationError as error:
-        wrong = []
-        for each in error.errors(include_url=False):
-            where, message = ".".join(map(str, each["loc"])), each["msg"]
-            if each["type"] == "unexpected_keyword_argument":
-                message = f"unknown key; {suggestion(where, [f.name for f in dataclasses.fields(Sweep)])}"
-            wrong.append(f"{where}: {message}")
-        raise ConfigError(f"{path}: {'; '.join(wrong)}") from error
+    return validated(Sweep, read_toml(path), source=str(path))
 
 
 def run_sweep(sweep: Sweep, run: Run, reporter: Reporter) -> Rows:

@@ -1,0 +1,83 @@
+"""TOML files, and tables checked against dataclasses; every mistake is one clear line."""
+
+import dataclasses
+import difflib
+import tomllib
+import typing
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import TypeAdapter, ValidationError
+
+from ..errors import ConfigError
+
+T = TypeVar("T")
+
+MAX_TOML_BYTES = 1_000_000
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Return the tables of a TOML file.
+
+    Raises:
+        ConfigError: It is not a regular file, too large, or not TOML.
+    """
+    try:
+        if not path.is_file():
+            raise ConfigError(f"{path}: {'not a regular file' if path.exists() else 'no such file'}")
+        if path.stat().st_size > MAX_TOML_BYTES:
+            raise ConfigError(f"{path}: larger than the {MAX_TOML_BYTES} bytes that are accepted")
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
+        raise ConfigError(f"{path}: not TOML ({error})") from error
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from error
+
+
+def validated(kind: type[T], tables: dict[str, Any] | str | bytes, *, source: str) -> T:
+    """Return a dataclass made of tables, or of JSON.
+
+    Args:
+        kind: The dataclass.
+        tables: Its values, as dictionaries or as JSON.
+        source: Where they come from; messages begin with it.
+
+    Raises:
+        ConfigError: A value is missing, unknown or impossible; every mistake is named with its path.
+    """
+    adapter = TypeAdapter(kind)
+    try:
+        return adapter.validate_python(tables) if isinstance(tables, dict) else adapter.validate_json(tables)
+    except ValidationError as error:
+        raise ConfigError(f"{source}: {_explained(kind, error)}") from error
+
+
+def suggestion(name: str, known: Iterable[str]) -> str:
+    """Return the nearest known name, and all of them."""
+    near = difflib.get_close_matches(name, known := list(known), n=1)
+    return (f"did you mean {near[0]!r}? " if near else "") + f"there are {', '.join(known)}"
+
+
+def _explained(kind: type[Any], error: ValidationError) -> str:
+    """Each mistake with its path and, for an unknown key, the keys that there are."""
+    found = dict[str, str]()
+    for each in error.errors(include_url=False):
+        path = [str(part) for part in each["loc"] if not str(part).startswith("function-")]
+        where = ".".join(path) or kind.__name__.lower()
+        message = each["msg"].removeprefix("Value error, ")
+        if each["type"] == "unexpected_keyword_argument":
+            message = f"unknown key; {suggestion(path[-1], _keys(kind, path[:-1]))}"
+        elif each["type"] in ("missing", "missing_argument"):
+            message = "is missing"
+        found.setdefault(where, message)
+    return "; ".join(f"{where}: {message}" for where, message in found.items())
+
+
+def _keys(kind: type[Any], path: Sequence[str]) -> list[str]:
+    """The keys of the table at a path; a part that names no key, as the member of a union, is passed over."""
+    for part in path:
+        annotation = typing.get_type_hints(kind).get(part)
+        nested = [each for each in (annotation, *typing.get_args(annotation)) if dataclasses.is_dataclass(each)]
+        kind = typing.cast(type[Any], nested[0]) if nested else kind
+    return [field.name for field in dataclasses.fields(kind)]
