@@ -3,16 +3,35 @@
 import dataclasses
 import math
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import random
 
 from retrim.config import changed, load
 from retrim.learn import Env, Window
-from retrim.physics import Command, PointMass, State, small, so3
+from retrim.physics import AbstractSubstepDynamics, Command, PointMass, State, small, so3
 from retrim.tasks import Hover, StateObs
 
 GOAL = (0.0, 0.0, 1.0)
+
+
+class CheapModel(AbstractSubstepDynamics[State]):
+    """Eq. (1) at 1 kHz: the cheapest model that a plant can fly, without rotors and limits."""
+
+    dt: float = eqx.field(static=True, default=0.02)
+
+    def init(self, x):
+        return x
+
+    def state(self, s):
+        return s
+
+    def with_state(self, s, x):
+        return x
+
+    def substep(self, s, u, effects):
+        return PointMass(1e-3).step(s, u, effects.push)
 
 
 def random_state(key, spread=1.0):

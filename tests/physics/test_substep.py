@@ -6,9 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helpers import random_command, random_state, replaced
+from helpers import CheapModel, random_state, replaced
 from retrim.physics import BemQuadrotor, Command, LinearDragQuadrotor, RotorState, State, large, small
-from retrim.physics.substep import AbstractSubstepDynamics
 
 MODELS = {"linear drag": LinearDragQuadrotor, "bem": BemQuadrotor}
 
@@ -52,27 +51,10 @@ def test_rotor_state_is_what_the_model_turns_with(make, key):
     assert float(left.min()) > float(right.max())
 
 
-class Bare(AbstractSubstepDynamics[State]):
-    """A model without rotors and limits."""
-
-    dt: float = eqx.field(static=True, default=0.02)
-
-    def init(self, x):
-        return x
-
-    def state(self, s):
-        return s
-
-    def with_state(self, s, x):
-        return x
-
-    def substep(self, s, u, effects):
-        return replaced(s, p=s.p + 1e-3 * s.v)
-
-
 def test_a_model_need_have_neither(key):
-    x = random_state(key)
-    assert Bare().command_limits is None
-    assert Bare().rotor_state(x) is None
-    moved = Bare().step(x, random_command(key), jnp.zeros(3))
+    """One of rigid translation: at hover thrust, level and undisturbed it moves on a straight line."""
+    x = replaced(random_state(key), R=jnp.eye(3))
+    assert CheapModel().command_limits is None
+    assert CheapModel().rotor_state(x) is None
+    moved = CheapModel().step(x, Command.hover(), jnp.zeros(3))
     np.testing.assert_allclose(moved.p, x.p + 0.02 * x.v, rtol=1e-12)

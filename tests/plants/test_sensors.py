@@ -1,14 +1,13 @@
 """What a vehicle sees of itself: noise as stated, late by the latency, held where samples are lost, and repeatable."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import random
 
-from helpers import random_state
-from retrim.physics import AbstractSubstepDynamics, Command, Constant, PointMass, State, so3
+from helpers import CheapModel, random_state
+from retrim.physics import Command, Constant, State, so3
 from retrim.plants import SensorModel, SimPlant
 from retrim.runtime import FunctionPilot, fly
 
@@ -16,26 +15,8 @@ START = State.at(jnp.array([0.3, -0.2, 1.5]))
 TURN = Command(jnp.array(11.0), jnp.array([1.0, -0.5, 0.5]))
 
 
-class Simple(AbstractSubstepDynamics[State]):
-    """Eq. (1) at 1 kHz: the cheapest model that moves."""
-
-    dt: float = eqx.field(static=True)
-
-    def init(self, x):
-        return x
-
-    def state(self, s):
-        return s
-
-    def with_state(self, s, x):
-        return x
-
-    def substep(self, s, u, effects):
-        return PointMass(1e-3).step(s, u, effects.push)
-
-
 def plant(sensors=None, seed=0, dt=0.02):
-    return SimPlant(Simple(dt), Constant(jnp.zeros(3)), sensors=sensors, seed=seed)
+    return SimPlant(CheapModel(dt), Constant(jnp.zeros(3)), sensors=sensors, seed=seed)
 
 
 def samples(plant, ticks=30, u=TURN):

@@ -109,14 +109,22 @@ def _command(name: str, words: list[str], stop: threading.Event) -> int:
     except MemoryError:
         return refuse("out of memory; use fewer --starts, smaller networks or a shorter horizon")
     except Exception as error:
-        if not any(":" in word for word in words):
+        place = _place(error)
+        if not place and not any(_names_a_module(word) for word in words):
             raise
         # A module of the user's own takes part: its mistakes are his to read, not a stack of ours.
-        return refuse(f"{_place(error)}{type(error).__name__}: {error}; retrim.testing.check_... names a broken law")
+        return refuse(f"{place}{type(error).__name__}: {error}; retrim.testing.check_... names a broken law")
     if stop.is_set():
         console.print("interrupted; what was done is kept, if anything was")
         return code or 130
     return code
+
+
+def _names_a_module(word: str) -> bool:
+    """Whether a word has a module:name in it; file.csv:once is none."""
+    import re
+
+    return re.search(r"(^|[=+])[A-Za-z_][\w.]*(?<!\.csv):[A-Za-z_]\w*", word) is not None
 
 
 def _place(error: Exception) -> str:

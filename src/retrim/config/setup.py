@@ -171,7 +171,8 @@ class Setup:
         from .methods import MethodRequest, find_method  # they are made of a set-up, too
 
         pilot = find_method(method).make(MethodRequest(self, policy, key, latency, state))
-        pilot.dt = self.preset.dt
+        if pilot.dt is None:  # what a controller was made for, it does not know
+            pilot.dt = self.preset.dt
         return pilot
 
     def low_rank(self, policy: Policy | LoraPolicy, key: Key[Array, ""]) -> LoraPolicy:

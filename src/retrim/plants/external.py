@@ -12,7 +12,7 @@ from ..errors import PlantError
 from ..physics.disturbance import Disturbance
 from ..physics.effects import ExternalEffects
 from ..physics.state import STANDARD_GRAVITY, Command, State
-from .plant import Measurement, Plant, as_numpy, check_command
+from .plant import Measurement, Plant, check_command
 
 HOVER = np.array([STANDARD_GRAVITY, 0.0, 0.0, 0.0])
 
@@ -64,7 +64,7 @@ class ExternalPlant(Plant, abc.ABC):
     def step(self, u: Command) -> tuple[Measurement, Command]:
         """Advance the simulator by one tick."""
         name = type(self).__name__
-        check_command(u, name)
+        wanted = check_command(u, name)
         if self._x is None:
             raise PlantError(f"{name}: not flying; call reset first")
         times = self._ticks * self.dt + self._instants
@@ -72,7 +72,7 @@ class ExternalPlant(Plant, abc.ABC):
         after = self._advance(self._held, effects)
         dtype = self._x.p.dtype
         self._x = State(*(jnp.asarray(a, dtype=dtype) for a in after))
-        self._held = as_numpy(u).astype(np.float64)
+        self._held = wanted.astype(np.float64)
         self._ticks += 1
         return Measurement(self._ticks * self.dt, self._x, truth=self._x), u
 

@@ -114,20 +114,28 @@ def as_numpy(u: Command) -> np.ndarray:
     return np.append(np.asarray(u.c), np.asarray(u.omega))
 
 
-def check_command(u: Command, plant: str) -> None:
+def check_command(u: Command, plant: str) -> np.ndarray:
     """Refuse a command that is not finite; every plant calls this first.
+
+    Args:
+        u: The command.
+        plant: Name of the plant, for the message.
+
+    Returns:
+        The command as :func:`as_numpy` gives it.
 
     Raises:
         PlantError: It names the plant and the entry.
     """
-    for name, value in zip(("c", "omega[0]", "omega[1]", "omega[2]"), as_numpy(u).tolist(), strict=True):
+    wanted = as_numpy(u)
+    for name, value in zip(("c", "omega[0]", "omega[1]", "omega[2]"), wanted.tolist(), strict=True):
         if not math.isfinite(value):
             raise PlantError(f"{plant}: command refused, {name} = {value} is not finite")
+    return wanted
 
 
-def limited(u: Command, low: np.ndarray, high: np.ndarray) -> Command:
-    """Return ``u`` within limits of [c, omega]; ``u`` itself if it already is."""
-    wanted = as_numpy(u)
+def limited(u: Command, wanted: np.ndarray, low: np.ndarray, high: np.ndarray) -> Command:
+    """Return ``u``, which is ``wanted`` as an array, within limits of [c, omega]; ``u`` itself if it already is."""
     if (low <= wanted).all() and (wanted <= high).all():
         return u
     accepted = np.clip(wanted, low, high).astype(wanted.dtype)

@@ -135,10 +135,10 @@ class SimPlant(Plant):
 
     def step(self, u: Command) -> tuple[Measurement, Command]:
         """Advance the model by one tick; commands beyond the vehicle's limits are clipped."""
-        check_command(u, "SimPlant")
+        wanted = check_command(u, "SimPlant")
         if self._state is None:
             raise PlantError("SimPlant: not flying; call reset first")
-        accepted = u if self._limits is None else limited(u, *self._limits)
+        accepted = u if self._limits is None else limited(u, wanted, *self._limits)
         key = random.fold_in(self._key, self._ticks) if self._sensors is not None else self._key
         self._state = _advance(self._model, self._disturbance, self._delay_s, self._sensors, self._state, accepted, key)
         self._ticks += 1

@@ -44,7 +44,8 @@ class AdaptivePilot(Pilot):
             dt: Control tick [s].
             window: Ticks of flight that learners see.
         """
-        self._observation, self._dt = observation, dt
+        self._observation = observation
+        self.dt: float = dt
         self._learners = tuple(learners)
         self._periods = [max(1, round(each.every_s / dt)) for each in self._learners]
         self._buffer = RollingBuffer(window)
@@ -66,7 +67,7 @@ class AdaptivePilot(Pilot):
     def act(self, measurement: Measurement) -> Command:
         """Apply updates that are visible, fly one tick, offer windows that are due."""
         t = measurement.t - self._start
-        tick = round(t / self._dt)
+        tick = round(t / self.dt)
         self._apply(t, tick)
         u = self._pilot.act(measurement)
         self._buffer.push(t, measurement.x, u)
