@@ -28,8 +28,29 @@ def fleet(as_a_user):
 
 
 @pytest.fixture(scope="module")
-def flights(fleet):
-    return fleet.run()
+def compiled(fleet):
+    """Programs that were compiled in the fleet's first flights, after its warm-up."""
+    found = list[str]()
+
+    def note(name, seconds, **about):
+        if name.endswith("backend_compile_duration"):
+            found.append(name)
+
+    fleet.warm_up()
+    jax.monitoring.register_event_duration_secs_listener(note)
+    flights = fleet.run()
+    jax.monitoring.unregister_event_duration_listener(note)
+    return flights, found
+
+
+@pytest.fixture(scope="module")
+def flights(compiled):
+    return compiled[0]
+
+
+def test_nothing_of_a_tick_is_compiled_after_the_warm_up(compiled, fleet):
+    """What scores a flight may be; it is compiled once, after the first flights have landed."""
+    assert len(compiled[1]) <= 3
 
 
 def test_every_combination_is_flown_once_and_in_order(fleet, flights):

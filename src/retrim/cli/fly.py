@@ -91,7 +91,7 @@ def fly(
             preset, {seed: weights}, [scenario], methods=methods, starts=starts, seconds=seconds, latency=latency,
             state=state,
         )  # fmt: skip
-        run, setup = started(Run("fly", out, stop=stop)), Setup.of(preset, follows)
+        run, setup = started(Run("fly", out, stop=stop)), fleet.setups[follows]
         _warn(setup, scenario)
         return _fly(fleet, setup, scenario, run)
 

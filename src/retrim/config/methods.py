@@ -59,8 +59,6 @@ class MethodEntry:
     make: Callable[[MethodRequest], Pilot]
     label: str
     """Name in tables."""
-    learns: bool = False
-    """Whether it re-trains the policy in flight."""
 
 
 METHODS: Registry[MethodEntry] = Registry("method", example="module:name of a MethodEntry")
@@ -114,5 +112,5 @@ def _lora(request: MethodRequest) -> Pilot:
 register_method("base", MethodEntry(_base, "base policy"))
 register_method("base-i", MethodEntry(_integral, "base policy + integral action"))
 register_method("base-do", MethodEntry(_gravity_frame, "base policy + disturbance observer"))
-register_method("full", MethodEntry(_full, "**adapted, all weights**", learns=True))
-register_method("lora", MethodEntry(_lora, "**adapted, LoRA**", learns=True))
+register_method("full", MethodEntry(_full, "**adapted, all weights**"))
+register_method("lora", MethodEntry(_lora, "**adapted, LoRA**"))

@@ -231,8 +231,15 @@ class Setup:
 
 
 @functools.lru_cache(maxsize=16)
-def setup_for(preset: str, reference: str | None = None) -> Setup:
-    """Return the set-up of a preset given as JSON, built once per process, for executors."""
+def setup_for(preset: str, reference: str | None = None, fleet: str = "") -> Setup:
+    """Return a set-up, built once per process and fleet, for executors with other processes.
+
+    Args:
+        preset: As JSON.
+        reference: What is flown, by name.
+        fleet: Tells fleets apart: between two of them a file of a reference may have changed.
+    """
+    del fleet
     return Setup.of(parse(preset, source="preset"), reference)
 
 

@@ -1,18 +1,17 @@
 """Many flights of one preset: scenarios x methods x seeds x starts, on any executor."""
 
+import dataclasses
+import secrets
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from typing import Any
 
-import jax
 from jax import random
 
-from ..adapt.buffer import RollingBuffer
 from ..adapt.learner import LearnerState
 from ..config.loading import dump
-from ..config.methods import find_method
 from ..config.presets import Preset
 from ..config.scenario import Scenario
 from ..config.setup import Latency, Setup, setup_for
@@ -20,7 +19,8 @@ from ..control.lora import LoraPolicy
 from ..control.policy import Policy
 from ..errors import ConfigError
 from ..physics.state import State
-from ..runtime.flight import FlightStopped, fly
+from ..plants.plant import Measurement
+from ..runtime.flight import FlightStopped
 from .flights import Flight, FlightSpec, fly_one
 from .interrupts import interrupts_only_set
 from .limits import check_flights, check_seeds
@@ -81,20 +81,16 @@ class Fleet:
         self.preset = preset
         self.policies = dict(policies) if isinstance(policies, Mapping) else {0: policies}
         check_seeds(tuple(self.policies))
-        self._setups = {name: setup_for(dump(preset), name) for name in {s.reference for s in scenarios}}
+        self.setups = {name: Setup.of(preset, name) for name in {s.reference for s in scenarios}}
         for method in methods:
-            for setup in self._setups.values():  # some do not fit every task or network
-                policy = next(iter(self.policies.values()))
-                if not find_method(method).learns:
-                    setup.pilot(policy, method)
-                elif method == "lora":
-                    jax.eval_shape(setup.low_rank, policy, random.key(0))
-        first = next(iter(self._setups.values()))
+            for setup in self.setups.values():  # some do not fit every task or network
+                setup.pilot(next(iter(self.policies.values())), method, random.key(0))
+        first = next(iter(self.setups.values()))
         self.seconds = first.flown.flight_seconds if seconds is None else seconds
-        self._latency, self._state = latency, state
+        self._latency, self._state, self._id = latency, state, secrets.token_hex(8)
         self._starts = {
             (name, seed): setup.flight_starts(starts, seed)
-            for name, setup in self._setups.items()
+            for name, setup in self.setups.items()
             for seed in self.policies
         }
         self.specs = [
@@ -107,22 +103,18 @@ class Fleet:
 
     def warm_up(self) -> None:
         """Compile every program of the flights before the first take-off, in this process."""
-        done = set[Any]()
+        plants, pilots = set[Scenario](), set[Any]()
         for spec in self.specs:
-            setup, policy = self._setups[spec.scenario.reference], self.policies[spec.seed]
-            x0 = self._starts[spec.scenario.reference, spec.seed][0]
-            if spec.scenario not in done:
-                done.add(spec.scenario)
-                pilot = setup.pilot(policy)
-                fly(spec.scenario.make(self.preset.vehicle, dt=self.preset.dt), pilot, x0, ticks=2)
-            if find_method(spec.method).learns and (spec.scenario.reference, spec.method) not in done:
-                done.add((spec.scenario.reference, spec.method))
-                adaptive = setup.low_rank(policy, spec.key()) if spec.method == "lora" else policy
-                buffer = RollingBuffer(self.preset.adapt.window)
-                buffer.push(0.0, x0, policy.u_hover)
-                state, window = setup.learner.init(adaptive, random.key(0)), buffer.window()
-                jax.block_until_ready(setup.learner.fit_residual(state.residual, window))
-                jax.block_until_ready(setup.learner.update_policy(state.policy, state.residual, window, random.key(0)))
+            scenario, kind = spec.scenario, (spec.scenario.reference, spec.method)
+            setup, x0 = self.setups[scenario.reference], self._starts[scenario.reference, spec.seed][0]
+            if kind not in pilots:
+                pilots.add(kind)
+                pilot = setup.pilot(self.policies[spec.seed], spec.method, spec.key(), state=self._state)
+                pilot.warm_up(Measurement(0.0, x0))
+            if scenario not in plants:
+                plants.add(scenario)
+                short = dataclasses.replace(spec, method="base")
+                fly_one(setup, self.policies[spec.seed], short, x0, 2 * self.preset.dt)
 
     def run(
         self,
@@ -165,7 +157,7 @@ class Fleet:
         futures: dict[FlightSpec, Future[Flight]] = {}
         try:
             for spec in specs:
-                futures[spec] = executor.submit(_job, self._job(spec), stop if shared else None)
+                futures[spec] = self._submit(executor, spec, stop) if shared else executor.submit(_job, self._job(spec))
             for done, future in enumerate(as_completed(futures.values()), start=1):
                 future.result()
                 if progress is not None:
@@ -187,15 +179,32 @@ class Fleet:
         flown = [f.result() for f in over if f.done() and not f.cancelled() and f.exception() is None]
         return Flights(flown, interrupted=len(flown) < len(specs))
 
+    def _submit(self, executor: Executor, spec: FlightSpec, stop: threading.Event) -> Future[Flight]:
+        """Let a thread of this process fly."""
+        return executor.submit(
+            fly_one,
+            self.setups[spec.scenario.reference],
+            self.policies[spec.seed],
+            spec,
+            self._starts[spec.scenario.reference, spec.seed][spec.start],
+            self.seconds,
+            latency=self._latency,
+            state=self._state,
+            stop=stop,
+        )
+
     def _job(self, spec: FlightSpec) -> "Job":
         x0 = self._starts[spec.scenario.reference, spec.seed][spec.start]
-        return Job(dump(self.preset), self.policies[spec.seed], spec, x0, self.seconds, self._latency, self._state)
+        policy, preset = self.policies[spec.seed], dump(self.preset)
+        return Job(self._id, preset, policy, spec, x0, self.seconds, self._latency, self._state)
 
 
 @dataclass(frozen=True)
 class Job:
     """Everything that one flight needs, in a form that can be sent to another process."""
 
+    fleet: str
+    """Which fleet it belongs to."""
     preset: str
     policy: Policy | LoraPolicy
     spec: FlightSpec
@@ -205,7 +214,7 @@ class Job:
     state: LearnerState | None
 
 
-def _job(job: Job, stop: threading.Event | None) -> Flight:
-    """Fly a job, in whatever process."""
-    setup: Setup = setup_for(job.preset, job.spec.scenario.reference)
-    return fly_one(setup, job.policy, job.spec, job.x0, job.seconds, latency=job.latency, state=job.state, stop=stop)
+def _job(job: Job) -> Flight:
+    """Fly a job, in another process."""
+    setup: Setup = setup_for(job.preset, job.spec.scenario.reference, job.fleet)
+    return fly_one(setup, job.policy, job.spec, job.x0, job.seconds, latency=job.latency, state=job.state)

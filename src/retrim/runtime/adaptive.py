@@ -64,6 +64,13 @@ class AdaptivePilot(Pilot):
             learner.reset()
         self._pilot.reset(measurement)
 
+    def warm_up(self, measurement: Measurement) -> None:
+        """Compile the programs of flight and of every learner; what they learn from one tick is dropped."""
+        super().warm_up(measurement)
+        for learner, _ in self._learners:
+            learner.submit(self._buffer.window(), 0)
+            learner.reset()
+
     def act(self, measurement: Measurement) -> Command:
         """Apply updates that are visible, fly one tick, offer windows that are due."""
         t = measurement.t - self._start

@@ -32,6 +32,15 @@ class Pilot(abc.ABC):
     def act(self, measurement: Measurement) -> Command:
         """Return the command for the next tick."""
 
+    def warm_up(self, measurement: Measurement) -> None:
+        """Compile every program of a flight, before the first one: by a tick that nobody flies.
+
+        Args:
+            measurement: Of any state of the vehicle.
+        """
+        self.reset(measurement)
+        self.act(measurement)
+
     def accepted(self, u: Command) -> None:
         """Take note that the plant accepted ``u`` instead of the command that was issued last."""
         del u
