@@ -57,7 +57,7 @@ def test_a_sweep_leaves_a_table_json_a_picture_policies_and_rows(folder):
     assert found["seeds"] == [0, 1]
     assert found["sweep"]["seconds"] == 1.2
     text = (folder / "whole" / "sweep.md").read_text()
-    assert "| disturbance | method | mean ± std [m] | median [m] | maximum [m] | crashed |" in text
+    assert "| disturbance | method | mean ± std [m] | median [m] | maximum [m] |" in text
     assert all(f"| {name} | {method} | {row['mean']:.3f} ±" in text
                for (name, method), row in zip(COMBINATIONS, found["rows"], strict=True))  # fmt: skip
     assert "![sweep](sweep.png)" in text

@@ -1,6 +1,6 @@
 """From flights to rows of results."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,11 +18,35 @@ class Rows(list[dict[str, Any]]):
         return pandas.DataFrame(list(self))
 
 
-def rows(flights: Sequence[Flight], *, by_seed: bool = False) -> Rows:
-    """Return one row per scenario and method.
+CONDITIONS = ("disturbance", "method", "plant", "vehicle", "sensors", "thrust_error", "reference")
+"""What the flights of one row have in common."""
 
-    The mean is over the flights that were not terminated; the median counts a terminated flight as infinite, so that it
-    cannot hide one.
+
+def record(flight: Flight) -> dict[str, Any]:
+    """Return the figures of one flight; errors of a flight that was terminated are None."""
+    spec, crashed = flight.spec, flight.log.terminated
+    scenario = spec.scenario
+    return {
+        "disturbance": scenario.disturbance,
+        "method": spec.method,
+        "plant": scenario.plant,
+        "vehicle": flight.vehicle,
+        "sensors": scenario.sensors,
+        "thrust_error": scenario.thrust_error,
+        "reference": scenario.reference,
+        "seed": spec.seed,
+        "start": spec.start,
+        "metric": flight.metric,
+        "error": None if crashed else flight.steady,
+        "peak_after_5s": _finite(flight.peak),
+        "settle_s": _finite(flight.settle_s),
+        "cross_track_m": None if crashed else flight.cross_track,
+        "crashed": crashed,
+    }
+
+
+def rows(flights: Sequence[Flight], *, by_seed: bool = False) -> Rows:
+    """Return one row per scenario and method: :func:`summary` of each.
 
     Args:
         flights: What was flown.
@@ -32,35 +56,42 @@ def rows(flights: Sequence[Flight], *, by_seed: bool = False) -> Rows:
     for flight in flights:
         spec = flight.spec
         groups.setdefault((spec.scenario, spec.method, spec.seed if by_seed else None), []).append(flight)
-    return Rows(_row(group, by_seed) for group in groups.values())
+    keys = (*CONDITIONS, "seed") if by_seed else CONDITIONS
+    return Rows(summary([record(flight) for flight in group], keys) for group in groups.values())
 
 
-def _row(group: Sequence[Flight], by_seed: bool) -> dict[str, Any]:
-    first = group[0]
-    spec, whole = first.spec, [f for f in group if not f.log.terminated]
-    steady = np.array([f.steady for f in whole])
-    everything = np.array([np.inf if f.log.terminated else f.steady for f in group])
-    peaks, cross = [f.peak for f in group], [f.cross_track for f in whole if f.cross_track is not None]
+def summary(records: Sequence[Mapping[str, Any]], keys: Sequence[str] = CONDITIONS) -> dict[str, Any]:
+    """Return one row for flights of the same conditions.
+
+    The mean is over the flights that were not terminated; the median and the maximum count a terminated flight as
+    infinite, which is None, so that it cannot hide one.
+
+    Args:
+        records: Of :func:`record`.
+        keys: Conditions that the row repeats.
+    """
+    first = records[0]
+    everything = _column(records, "error")
+    whole = everything[np.isfinite(everything)]
+    cross = [each["cross_track_m"] for each in records if each["cross_track_m"] is not None]
     return {
-        "disturbance": spec.scenario.disturbance,
-        "method": spec.method,
-        "plant": spec.scenario.plant,
-        "vehicle": first.vehicle,
-        "sensors": spec.scenario.sensors,
-        "thrust_error": spec.scenario.thrust_error,
-        **({"reference": spec.scenario.reference} if spec.scenario.reference else {}),
-        **({"seed": spec.seed} if by_seed else {}),
-        "metric": first.metric,
-        "mean": float(steady.mean()) if len(steady) else None,
-        "std": float(steady.std(ddof=1)) if len(steady) > 1 else None,
+        **{key: first[key] for key in keys if key != "reference" or first[key]},
+        "metric": first["metric"],
+        "mean": float(whole.mean()) if len(whole) else None,
+        "std": float(whole.std(ddof=1)) if len(whole) > 1 else None,
         "median": _finite(float(np.median(everything))),
-        "peak_after_5s": _finite(float(np.median(peaks))),
-        "settle_s": _finite(float(np.median([f.settle_s for f in group]))),
+        "max": _finite(float(everything.max())),
+        "peak_after_5s": _finite(float(np.median(_column(records, "peak_after_5s")))),
+        "settle_s": _finite(float(np.median(_column(records, "settle_s")))),
         **({"cross_track_m": float(np.mean(cross))} if cross else {}),
-        "n": len(group),
-        "crashes": sum(f.log.terminated for f in group),
-        "errors": [_finite(float(e)) for e in everything],
+        "n": len(records),
+        "crashes": sum(each["crashed"] for each in records),
+        "errors": [each["error"] for each in records],
     }
+
+
+def _column(records: Sequence[Mapping[str, Any]], name: str) -> np.ndarray:
+    return np.array([np.inf if each[name] is None else each[name] for each in records])
 
 
 def cell(row: dict[str, Any]) -> str:

@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from jax import random
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
@@ -23,10 +22,10 @@ from ..io.trained import load_policy, save_policy
 from ..viz.panels import bars
 from ..viz.plots import save
 from .fleet import Fleet
-from .flights import Flight, FlightSpec
+from .flights import FlightSpec
 from .interrupts import interrupts_only_set
 from .limits import check_seeds
-from .metrics import Rows
+from .metrics import Rows, cell, record, summary
 from .reporter import Reporter
 from .run import Run
 from .tables.document import Document, TableSection
@@ -130,7 +129,7 @@ def _fly(fleet: Fleet, kept: "_Kept", run: Run, reporter: Reporter) -> None:
         for i in range(0, len(missing), BATCH):
             flown = fleet.run(stop=run.stop, only=missing[i : i + BATCH]).flown
             with interrupts_only_set(run.stop):
-                kept.add({keys[flight.spec]: _row(fleet.preset, flight) for flight in flown})
+                kept.add({keys[flight.spec]: {"preset": fleet.preset.name, **record(flight)} for flight in flown})
             advance(min(1.0, (i + BATCH) / len(missing)), f"{min(i + BATCH, len(missing))} flights")
             if run.interrupted:
                 break
@@ -181,25 +180,6 @@ def _key(preset: Preset, spec: FlightSpec, seconds: float) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def _row(preset: Preset, flight: Flight) -> dict[str, Any]:
-    spec, scenario = flight.spec, flight.spec.scenario
-    steady = None if flight.log.terminated else flight.steady
-    return {
-        "preset": preset.name,
-        "method": spec.method,
-        "disturbance": scenario.disturbance,
-        "plant": scenario.plant,
-        "vehicle": flight.vehicle,
-        "sensors": scenario.sensors,
-        "reference": scenario.reference,
-        "seed": spec.seed,
-        "start": spec.start,
-        "error": steady,
-        "peak_after_5s": None if flight.log.terminated else flight.peak,
-        "crashed": flight.log.terminated,
-    }
-
-
 GROUP = ("preset", "plant", "vehicle", "sensors", "reference", "disturbance", "method")
 
 
@@ -210,26 +190,16 @@ def _report(sweep: Sweep, kept: Sequence[dict[str, Any]], run: Run, reporter: Re
         groups.setdefault(tuple(row[name] for name in GROUP), []).append(row)
     found, cells = Rows(), list[tuple[str, ...]]()
     varied = [name for i, name in enumerate(GROUP) if len({group[i] for group in groups}) > 1 or name == "method"]
-    for group, flights in groups.items():
-        errors = np.array([np.inf if row["error"] is None else row["error"] for row in flights])
-        whole, crashes = errors[np.isfinite(errors)], sum(row["crashed"] for row in flights)
-        median, worst = float(np.median(errors)), float(errors.max())
-        found.append(
-            dict(zip(GROUP, group, strict=True))
-            | {"mean": float(whole.mean()) if len(whole) else None, "n": len(flights), "crashes": crashes}
-            | {"median": median if np.isfinite(median) else None, "max": worst if np.isfinite(worst) else None}
-        )
-        named = dict(zip(GROUP, group, strict=True))
-        deviation = f" ± {whole.std(ddof=1):.3f}" if len(whole) > 1 else ""
-        spread = f"{whole.mean():.3f}{deviation}" if len(whole) else "crashed"
-        middle = f"{median:.3f}" if np.isfinite(median) else "crashed"
-        limit = "crashed" if crashes else f"{worst:.3f}"
-        cells.append((*(str(named[name]) for name in varied), spread, middle, limit, f"{crashes} of {len(flights)}"))
+    for flights in groups.values():
+        row = summary(flights, GROUP)
+        found.append(row)
+        figures = ("crashed" if row[name] is None else f"{row[name]:.3f}" for name in ("median", "max"))
+        cells.append((*(str(flights[0][name]) for name in varied), cell(row), *figures))
     intro = "Made by `retrim sweep`. Error [m] over the last seconds of each flight, over seeds and starts."
     document = Document(run, "sweep", "Sweep", intro, sweep.seeds, reporter, {"sweep": dataclasses.asdict(sweep)})
     if cells:
         drawn = save(bars("Error at the end of the flights [m]", _bar_groups(groups)), run.folder, "sweep")
-        columns = (*varied, "mean ± std [m]", "median [m]", "maximum [m]", "crashed")
+        columns = (*varied, "mean ± std [m]", "median [m]", "maximum [m]")
         document.add(TableSection(columns, tuple(cells), picture=drawn[0]), found)
     document.write()
     return found
