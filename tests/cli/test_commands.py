@@ -135,3 +135,21 @@ def test_a_user_s_own_task_is_pretrained_and_flown_by_its_file(folder, monkeypat
     assert "entry error in its own model" in out
     retrim("fly", "--policy", "own", "--seconds", "1", "--adapt", "none", "--out", "ownf", cwd=folder)
     assert (folder / "ownf" / "entry_large.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("word", "names"),
+    [
+        ("mine:Task", True),
+        ("--task=my.tasks:Race", True),
+        ("wind+mine:push=2", True),
+        ("lap.csv:once", False),
+        ("/tmp/mine/lap.csv:laps", False),
+        ("C:/flights", False),
+        ("hover/fast", False),
+    ],
+)
+def test_words_that_name_a_module_of_the_user(word, names):
+    from retrim.cli.main import _names_a_module
+
+    assert _names_a_module(word) is names

@@ -1,12 +1,10 @@
 """Table I of the paper: hover."""
 
-from collections.abc import Sequence
-
 from ...config.scenario import Scenario
 from ..reporter import Reporter
 from ..run import Run
 from .document import Document
-from .study import PaperRows, level_section, table_presets, train_all
+from .study import Levels, PaperRows, fly_levels, table_presets
 
 PAPER: PaperRows = (  # Table I [m]
     ("base", ("0.128 ± 0.004", "0.328 ± 0.001", "1.228 ± 0.073")),
@@ -18,15 +16,27 @@ def hover(
     run: Run,
     reporter: Reporter,
     *,
-    presets: Sequence[str] = ("hover/fast", "hover/released", "hover/paper"),
-    seeds: Sequence[int] = (0, 1, 2),
-    plant: str = "bem",
-    sensors: str = "ideal",
+    presets: tuple[str, ...] = ("hover/fast", "hover/released", "hover/paper"),
+    seeds: tuple[int, ...] = (0, 1, 2),
     seconds: float = 30.0,
     starts: int = 8,
-    methods: Sequence[str] = ("base", "base-i", "base-do", "full", "lora"),
+    plant: str = "bem",
+    sensors: str = "ideal",
+    methods: tuple[str, ...] = ("base", "base-i", "base-do", "full", "lora"),
 ) -> None:
-    """Make ``hover.md``: three disturbances, for each preset, over several training seeds."""
+    """Table I: hover under three disturbances, for each preset, over several training seeds.
+
+    Args:
+        run: Folder of hover.md, hover.json and the pictures.
+        reporter: Receives progress and the sections.
+        presets: Presets to train and fly.
+        seeds: Training seeds; each also seeds the starts and the learners of its flights.
+        seconds: Length of a flight [s].
+        starts: Flights per disturbance, method and seed.
+        plant: Where the policies fly.
+        sensors: What they are shown of the state.
+        methods: How they fly.
+    """
     loaded = table_presets(presets, "hover", seeds=seeds, starts=starts, seconds=seconds)
     scenario = Scenario(plant=plant, sensors=sensors)
     intro = (
@@ -36,23 +46,8 @@ def hover(
         "paper's rows are from its own plant."
     )
     document = Document(run, "hover", "Hover (Table I of the paper)", intro, seeds, reporter)
-    for preset in loaded:
-        study = train_all(preset, seeds, run, reporter)
-        stem = f"hover_{preset.name.rpartition('/')[2]}"
-        made = level_section(
-            study,
-            f"Preset {preset.name}",
-            scenario,
-            run,
-            reporter,
-            methods=methods,
-            starts=starts,
-            seconds=seconds,
-            paper=PAPER,
-            stem=stem,
-        )
-        if made is not None:
-            document.add(*made)
-        if run.interrupted:
-            break
-    document.write()
+    sections = [
+        Levels(f"Preset {preset.name}", preset, scenario, f"hover_{preset.name.rpartition('/')[2]}", methods, PAPER)
+        for preset in loaded
+    ]
+    fly_levels(document, sections, starts=starts, seconds=seconds)

@@ -28,7 +28,12 @@ GOLDEN_HOVER = ((1800.0, 5.13804), (1850.0, 5.42739), (1900.0, 5.72464), (1950.0
 
 
 def model(run: Run, reporter: Reporter) -> None:
-    """Make ``model.md`` and the picture: thrust, drag, inflow, rate and thrust steps, battery sag."""
+    """Pictures and figures of the blade-element plant: thrust, drag, inflow, rate and thrust steps, battery sag.
+
+    Args:
+        run: Folder of model.md, model.json, model.png and model.svg.
+        reporter: Receives progress and the table.
+    """
     reporter.say("computing the curves of the blade-element model")
     panels = [thrust_panel(), drag_panel(), inflow_panel(), rate_panel(), step_panel(), sag_panel()]
     drawn, _ = plots.save(panel_figure("The plant bem", panels), run.folder, "model")

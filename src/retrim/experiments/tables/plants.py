@@ -1,6 +1,5 @@
 """One hover policy in many scenarios, on every plant."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 from ...config.plants import PLANTS
@@ -56,17 +55,24 @@ def plants(
     reporter: Reporter,
     *,
     preset: str = "hover/fast",
-    only: Sequence[str] = tuple(PLANTS),
-    seeds: Sequence[int] = (0,),
+    plant: tuple[str, ...] = ("bem", "simple", "rotorpy", "mujoco", "crazyflow"),
+    seeds: tuple[int, ...] = (0,),
     seconds: float = 30.0,
     starts: int = 8,
 ) -> None:
-    """Make ``plants.md``: one policy, as it is and adapted, on the plants ``only``.
+    """Hover of one policy, as it is and adapted, in many scenarios and on plants that others wrote.
 
-    A plant whose package is not installed is left out, with a line that says so.
+    Args:
+        run: Folder of plants.md and plants.json.
+        reporter: Receives progress and the sections.
+        preset: Preset to train with, for the small quadrotor.
+        plant: Plants to fly on. One whose package is not installed is left out, with a line that says so.
+        seeds: Training seeds; each also seeds the starts, the gusts and the learners of its flights.
+        seconds: Length of a flight [s].
+        starts: Flights per disturbance, method and seed.
     """
     (loaded,) = table_presets([preset], "hover", seeds=seeds, starts=starts, seconds=seconds)
-    for name in only:
+    for name in plant:
         PLANTS.find(name)
     own = ", ".join(f"`{name}` flies its {p.own_vehicle}" for name, p in PLANTS.items() if p.own_vehicle)
     intro = (
@@ -79,7 +85,7 @@ def plants(
     document = Document(run, "plants", "Hover in many scenarios, on every plant", intro, seeds, reporter)
     study = train_all(loaded, seeds, run, reporter)
     for title, scenario, disturbances in groups():
-        if scenario.plant not in only or run.interrupted:
+        if scenario.plant not in plant or run.interrupted:
             continue
         scenarios = [replace(scenario, disturbance=name) for name in disturbances]
         try:

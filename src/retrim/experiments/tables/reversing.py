@@ -1,6 +1,5 @@
 """Hover under a push that turns around every 15 s (the paper's Sec. IV-B.3)."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,11 +37,21 @@ def reversing(
     *,
     preset: str = "hover/fast",
     plant: str = "bem",
-    seeds: Sequence[int] = (0,),
+    seeds: tuple[int, ...] = (0,),
     seconds: float = 60.0,
     starts: int = 8,
 ) -> None:
-    """Make ``reversing.md``: the error before and after each update, its peak, and the picture."""
+    """Hover under a push that reverses every 15 s: the error before and after each update, and the picture.
+
+    Args:
+        run: Folder of reversing.md, reversing.json and the picture.
+        reporter: Receives progress and the section.
+        preset: A preset for hover, to train with.
+        plant: Where the policy flies.
+        seeds: Training seeds.
+        seconds: Length of a flight [s].
+        starts: Flights per method and seed.
+    """
     (loaded,) = table_presets([preset], "hover", seeds=seeds, starts=starts, seconds=seconds)
     scenario = Scenario("reversing", plant=plant)
     if seconds < 2 * PERIOD:

@@ -17,7 +17,7 @@ from ..metrics import cell, rows
 from ..reporter import Reporter
 from ..run import Run
 from ..training import nominal_error, train
-from .document import TableSection
+from .document import Document, TableSection
 
 LEVELS = ("none", "small", "large")
 COLUMNS = ("error [m]", "no disturbance", "small, 0.5 m/s² per axis", "large, 2 m/s² per axis")
@@ -93,25 +93,47 @@ def fly_all(
     return Flights([], interrupted=True)
 
 
-def level_section(
-    study: Study,
-    title: str,
-    base: Scenario,
-    run: Run,
-    reporter: Reporter,
-    *,
-    methods: Sequence[str] = ("base", "full"),
-    starts: int,
-    seconds: float | None,
-    paper: PaperRows = (),
-    stem: str | None = None,
-) -> tuple[TableSection, list[dict[str, Any]]] | None:
-    """Fly the paper's three levels of disturbance and lay them out: methods down, levels across.
+@dataclass(frozen=True)
+class Levels:
+    """One section of a table as the paper's: methods down, its three levels of disturbance across."""
 
-    Returns:
-        The section and its rows of results; None if nothing was flown.
+    title: str
+    preset: Preset
+    scenario: Scenario
+    """Where it is flown, but for the disturbance."""
+    stem: str
+    """Name of the picture."""
+    methods: Sequence[str] = ("base", "full", "lora")
+    paper: PaperRows = ()
+
+
+def fly_levels(document: Document, sections: Sequence[Levels], *, starts: int, seconds: float | None) -> None:
+    """Train, fly and lay out every section; the document is written after each, and when it is interrupted.
+
+    Args:
+        document: Receives the sections. Its seeds are those of training.
+        sections: What to fly; a preset is trained once.
+        starts: Flights per disturbance, method and seed.
+        seconds: Length of a flight; the task's own by default.
     """
-    scenarios = [replace(base, disturbance=level) for level in LEVELS]
+    run, reporter, studies = document.run, document.reporter, dict[Preset, Study]()
+    for section in sections:
+        if section.preset not in studies:
+            studies[section.preset] = train_all(section.preset, document.seeds, run, reporter)
+        made = _level_section(studies[section.preset], section, run, reporter, starts=starts, seconds=seconds)
+        if made is not None:
+            document.add(*made)
+        if run.interrupted:
+            break
+    document.write()
+
+
+def _level_section(
+    study: Study, section: Levels, run: Run, reporter: Reporter, *, starts: int, seconds: float | None
+) -> tuple[TableSection, list[dict[str, Any]]] | None:
+    """The section and its rows of results; None if nothing was flown."""
+    methods, title = section.methods, section.title
+    scenarios = [replace(section.scenario, disturbance=level) for level in LEVELS]
     flown = fly_all(study, scenarios, run, reporter, methods=methods, starts=starts, seconds=seconds).flown
     if not flown:
         return None
@@ -122,10 +144,10 @@ def level_section(
         f"{study.about()} The gate admitted {kinds.count('policy')} policies and refused {kinds.count('rejected')}. "
         f"{crashed} of {len(flown)} flights crashed."
     )
-    setup = Setup.of(study.preset, base.reference)
+    setup = Setup.of(study.preset, section.scenario.reference)
     first = [f for f in flown if f.spec.seed == flown[0].spec.seed and f.spec.method in ("base", "full")]
-    drawn = picture(first, setup, scenarios[-1], run.folder, stem=stem)
-    table = level_table(found, methods, paper, title)
+    drawn = picture(first, setup, scenarios[-1], run.folder, stem=section.stem)
+    table = level_table(found, methods, section.paper, title)
     return replace(table, about=about, picture=drawn[0] if drawn else None), found
 
 

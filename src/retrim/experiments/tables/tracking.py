@@ -1,7 +1,6 @@
 """Table II of the paper: circle, figure-8 and star."""
 
-from collections.abc import Sequence
-from dataclasses import replace
+from typing import Any
 
 from ...config.loading import changed
 from ...config.presets import Preset
@@ -9,7 +8,7 @@ from ...config.scenario import Scenario
 from ..reporter import Reporter
 from ..run import Run
 from .document import Document
-from .study import PaperRows, Study, level_section, table_presets, train_all
+from .study import Levels, PaperRows, fly_levels, table_presets
 
 PAPER: dict[str, PaperRows] = {  # Table II [m]
     "circle": (
@@ -37,51 +36,50 @@ s: mean ± standard deviation over flights. Cross-track: distance from the neare
 quadrotor. Preset `track/preview`: one policy, trained on all three references, sees them ahead. `track/paper`:
 the paper's observation o = [p, R, v] and reward, one policy per reference. Learning is charged to flight time
 by the preset's fixed latencies. The paper's rows are from its own plant; its circle and ours take 3 s."""
-ALL: tuple[str, ...] = ("base", "full", "lora")
 
 
 def tracking(
     run: Run,
     reporter: Reporter,
     *,
-    presets: Sequence[str] = ("track/preview", "track/paper"),
-    seeds: Sequence[int] = (0,),
-    plant: str = "bem",
+    presets: tuple[str, ...] = ("track/preview", "track/paper"),
+    seeds: tuple[int, ...] = (0,),
     seconds: float = 60.0,
     starts: int = 8,
+    plant: str = "bem",
 ) -> None:
-    """Make ``tracking.md``: three references under three disturbances, and a figure-8 that training never saw."""
+    """Table II: circle, figure-8 and star under three disturbances, and a figure-8 that training never saw.
+
+    Args:
+        run: Folder of tracking.md, tracking.json and the pictures.
+        reporter: Receives progress and the sections.
+        presets: Presets to train and fly.
+        seeds: Training seeds.
+        seconds: Length of a flight [s].
+        starts: Flights per disturbance, method and seed.
+        plant: Where the policies fly.
+    """
     loaded = table_presets(presets, "track", seeds=seeds, starts=starts, seconds=seconds)
-    sections = [section for preset in loaded for section in _sections(preset)]
-    base = Scenario(plant=plant)
+    sections = [section for preset in loaded for section in _sections(preset, plant)]
     document = Document(run, "tracking", "Tracking (Table II of the paper)", INTRO, seeds, reporter)
-    studies = dict[str, Study]()
-    for title, preset, reference, methods, paper in sections:
-        trained_on = preset.track.reference if preset.track else ""
-        key = f"{preset.name} {trained_on}"
-        if key not in studies:
-            studies[key] = train_all(preset, seeds, run, reporter)
-        stem = "_".join(["tracking", preset.name.rpartition("/")[2], reference, trained_on.replace("+", "-")])
-        made = level_section(
-            studies[key], title, replace(base, reference=reference), run, reporter,
-            methods=methods, starts=starts, seconds=seconds, paper=paper, stem=stem,
-        )  # fmt: skip
-        if made is not None:
-            document.add(*made)
-        if run.interrupted:
-            break
-    document.write()
+    fly_levels(document, sections, starts=starts, seconds=seconds)
 
 
-def _sections(preset: Preset) -> list[tuple[str, Preset, str, tuple[str, ...], PaperRows]]:
-    """Title, preset, reference, methods and the paper's rows of each section of a preset."""
+def _sections(preset: Preset, plant: str) -> list[Levels]:
+    """A section for each reference; a policy that sees it ahead is trained once for all, another for each."""
+
+    def section(title: str, preset: Preset, reference: str, paper: PaperRows, **more: Any) -> Levels:
+        trained_on = preset.track.reference.replace("+", "-") if preset.track else ""
+        stem = "_".join(["tracking", preset.name.rpartition("/")[2], reference, trained_on])
+        return Levels(title, preset, Scenario(plant=plant, reference=reference), stem, paper=paper, **more)
+
     if preset.track is not None and preset.track.observation == "preview":
         unseen = changed(preset, track={"reference": "circle+star"})
         return [
-            *((f"{name}, seen ahead", preset, name, ALL, paper) for name, paper in PAPER.items()),
-            ("figure8, never seen in training", unseen, "figure8", ("base", "full"), ()),
+            *(section(f"{name}, seen ahead", preset, name, paper) for name, paper in PAPER.items()),
+            section("figure8, never seen in training", unseen, "figure8", (), methods=("base", "full")),
         ]
     return [
-        (f"{name}, not seen", changed(preset, track={"reference": name}), name, ALL, paper)
+        section(f"{name}, not seen", changed(preset, track={"reference": name}), name, paper)
         for name, paper in PAPER.items()
     ]

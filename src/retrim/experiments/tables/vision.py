@@ -1,12 +1,11 @@
 """Table III of the paper: hover from keypoints."""
 
-from collections.abc import Sequence
-
+from ...config.presets import Preset
 from ...config.scenario import Scenario
 from ..reporter import Reporter
 from ..run import Run
 from .document import Document
-from .study import PaperRows, level_section, table_presets, train_all
+from .study import Levels, PaperRows, fly_levels, table_presets
 
 PAPER: PaperRows = (  # Table III [m]
     ("base", ("0.133 ± 0.009", "0.404 ± 0.039", "1.383 ± 0.176")),
@@ -29,27 +28,30 @@ def vision(
     run: Run,
     reporter: Reporter,
     *,
-    presets: Sequence[str] = tuple(TITLES),
-    seeds: Sequence[int] = (0,),
-    plant: str = "bem",
+    presets: tuple[str, ...] = tuple(TITLES),
+    seeds: tuple[int, ...] = (0,),
     seconds: float = 30.0,
     starts: int = 8,
+    plant: str = "bem",
 ) -> None:
-    """Make ``vision.md``: hover from seven points on the ground under three disturbances."""
+    """Table III: hover from seven points on the ground under three disturbances.
+
+    Args:
+        run: Folder of vision.md, vision.json and the pictures.
+        reporter: Receives progress and the sections.
+        presets: Presets to train and fly; vision/paper trains for several minutes.
+        seeds: Training seeds.
+        seconds: Length of a flight [s].
+        starts: Flights per disturbance, method and seed.
+        plant: Where the policies fly.
+    """
     loaded = table_presets(presets, "vision", seeds=seeds, starts=starts, seconds=seconds)
-    scenario = Scenario(plant=plant)
     document = Document(run, "vision", "Hover from keypoints (Table III of the paper)", INTRO, seeds, reporter)
-    for preset in loaded:
-        study = train_all(preset, seeds, run, reporter)
-        # An update of the paper's size takes seconds; its preset adapts all weights only.
-        methods: tuple[str, ...] = ("base", "full") if preset.name == "vision/paper" else ("base", "full", "lora")
-        stem = f"vision_{preset.name.rpartition('/')[2]}"
-        made = level_section(
-            study, TITLES.get(preset.name, preset.name), scenario, run, reporter,
-            methods=methods, starts=starts, seconds=seconds, paper=PAPER, stem=stem,
-        )  # fmt: skip
-        if made is not None:
-            document.add(*made)
-        if run.interrupted:
-            break
-    document.write()
+    fly_levels(document, [_section(preset, Scenario(plant=plant)) for preset in loaded], starts=starts, seconds=seconds)
+
+
+def _section(preset: Preset, scenario: Scenario) -> Levels:
+    # An update of the paper's size takes seconds; its preset adapts all weights only.
+    methods = ("base", "full") if preset.name == "vision/paper" else ("base", "full", "lora")
+    stem = f"vision_{preset.name.rpartition('/')[2]}"
+    return Levels(TITLES.get(preset.name, preset.name), preset, scenario, stem, methods, PAPER)
