@@ -1,6 +1,5 @@
 """Differential flatness: from a path in space to the velocity, command and heading of a point mass that follows it."""
 
-import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -16,56 +15,63 @@ NO_THRUST = 1e-3  # [m/s^2]: a smaller thrust has no direction, and the attitude
 UP = np.array([0.0, 0.0, STANDARD_GRAVITY])
 
 
-def flat_row(path: Path3, t: float, last: float) -> np.ndarray:
-    """Differentiate a path at one instant, by central differences inside [0, ``last``].
+def flat_rows(path: Path3, times: np.ndarray, last: float) -> np.ndarray:
+    """Differentiate a path at many instants, by central differences inside [0, ``last``].
 
     Where the velocity jumps, and where the attitude is undefined (free fall, or a nose that would point along the
     thrust), the command is that of hover.
 
     Args:
         path: Position, world [m], and heading [rad] if wanted, by time [s].
-        t: When [s].
+        times: When [s], shape (n,).
         last: End of what may be evaluated [s]; infinite for a path that repeats.
 
     Returns:
-        Eleven numbers: position [m] and velocity [m/s] in the world frame, collective thrust [m/s^2], body rates
-        [rad/s] in the body frame, heading [rad].
+        Eleven numbers for each instant, shape (n, 11): position [m] and velocity [m/s] in the world frame, collective
+        thrust [m/s^2], body rates [rad/s] in the body frame, heading [rad].
 
     Raises:
         ValueError: The path does not give 3 or 4 finite numbers.
     """
     h = STEP
+    here = _points(path, times)
+    middle = np.minimum(np.maximum(times, 2.0 * h), last - h)
+    around = [_points(path, middle + k * h) for k in range(-2, 3)]
+    near = [_points(path, middle + k * h) for k in (0.1, -0.1)]
+    v = (around[3] - around[1])[:, :3] / (2.0 * h)
+    accelerations = [(around[k + 1] - 2.0 * around[k] + around[k - 1])[:, :3] / h**2 for k in (1, 2, 3)]
+    closer = (near[0] - 2.0 * around[2] + near[1])[:, :3] / (0.1 * h) ** 2
+    # A jump does not look the same from nearer.
+    jumps = np.max([np.linalg.norm(a - closer, axis=1) for a in accelerations], axis=0) > JUMP
+    frames = [_attitudes(a, point[:, 3]) for a, point in zip(accelerations, around[1:4], strict=True)]
+    (R_before, before), (R, now), (R_after, after) = frames
+    turn = np.swapaxes(R, 1, 2) @ (R_after - R_before) / (2.0 * h)
+    thrust = np.linalg.norm(accelerations[1] + UP, axis=1)
+    flown = np.stack([thrust, turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]], axis=1)
+    hover = np.array([STANDARD_GRAVITY, 0.0, 0.0, 0.0])
+    u = np.where((before & now & after & ~jumps)[:, None], flown, hover)
+    return np.concatenate([here[:, :3], v, u, here[:, 3:]], axis=1)
 
-    def at(t: float) -> np.ndarray:
+
+def _points(path: Path3, times: np.ndarray) -> np.ndarray:
+    """Evaluate a path: x, y, z, heading for each instant."""
+    rows = np.zeros((len(times), 4))
+    for row, t in zip(rows, times.tolist(), strict=True):
         point = np.asarray(path(t), dtype=float)
-        if point.shape not in ((3,), (4,)) or not np.all(np.isfinite(point)):
+        if point.shape not in ((3,), (4,)) or not np.isfinite(point).all():
             raise ValueError(f"Reference: at {t:g} s the path gives {point}, not 3 or 4 finite numbers")
-        return np.append(point, 0.0)[:4]
-
-    middle = min(max(t, 2.0 * h), last - h)
-    points = [at(middle + k * h) for k in range(-2, 3)]
-    v = (points[3] - points[1])[:3] / (2.0 * h)
-    accelerations = [(points[k + 1] - 2.0 * points[k] + points[k - 1])[:3] / h**2 for k in (1, 2, 3)]
-    here = at(t)
-    hover = np.concatenate([here[:3], v, [STANDARD_GRAVITY, 0.0, 0.0, 0.0], here[3:]])
-    closer = (at(middle + 0.1 * h) - 2.0 * points[2] + at(middle - 0.1 * h))[:3] / (0.1 * h) ** 2
-    if max(np.linalg.norm(a - closer) for a in accelerations) > JUMP:  # a jump does not look the same from nearer
-        return hover
-    R_before, R, R_after = (_attitude(a, point[3]) for a, point in zip(accelerations, points[1:4], strict=True))
-    if R_before is None or R is None or R_after is None:
-        return hover
-    turn = R.T @ (R_after - R_before) / (2.0 * h)
-    thrust = np.linalg.norm(accelerations[1] + UP)
-    return np.concatenate([here[:3], v, [thrust, turn[2, 1], turn[0, 2], turn[1, 0]], here[3:]])
+        row[: len(point)] = point
+    return rows
 
 
-def _attitude(a: np.ndarray, heading: float) -> np.ndarray | None:
-    """Return body axes as columns: z along the thrust that the acceleration ``a`` needs, x towards the heading."""
-    if np.linalg.norm(a + UP) < NO_THRUST:
-        return None
-    z = (a + UP) / np.linalg.norm(a + UP)
-    y = np.cross(z, [math.cos(heading), math.sin(heading), 0.0])
-    if np.linalg.norm(y) < NO_THRUST:
-        return None
-    y = y / np.linalg.norm(y)
-    return np.stack([np.cross(y, z), y, z], axis=1)
+def _attitudes(a: np.ndarray, heading: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return body axes as columns: z along the thrust that each acceleration needs, x towards the heading.
+
+    The second array says where they are defined.
+    """
+    thrust = np.linalg.norm(a + UP, axis=1)
+    z = (a + UP) / np.maximum(thrust, NO_THRUST)[:, None]
+    y = np.cross(z, np.stack([np.cos(heading), np.sin(heading), np.zeros_like(heading)], axis=1))
+    sideways = np.linalg.norm(y, axis=1)
+    y = y / np.maximum(sideways, NO_THRUST)[:, None]
+    return np.stack([np.cross(y, z), y, z], axis=2), (thrust >= NO_THRUST) & (sideways >= NO_THRUST)

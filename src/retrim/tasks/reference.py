@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from ..physics.state import STANDARD_GRAVITY
 from ..physics.vehicle import Vehicle
 from .feasibility import unflyable
-from .flatness import STEP, Path3, flat_row
+from .flatness import STEP, Path3, flat_rows
 
 POINTS = 1024  # of a table
 
@@ -69,7 +69,7 @@ class Reference(eqx.Module):
             raise ValueError(f"Reference: seconds = {seconds}, lap = {lap}, points = {points} cannot be")
         times = np.linspace(0.0, seconds, points)
         last = seconds - STEP if lap is None else math.inf
-        rows = np.array([flat_row(path, float(t), last) for t in times])
+        rows = flat_rows(path, times, last)
         ends = (seconds, seconds) if lap is None else (lap, seconds)
         joins = [(0.0, seconds)] if lap is None else [(0.0, lap), (lap, seconds), (lap, seconds)]
         return cls(jnp.asarray(rows), jnp.array(times[1]), jnp.array(ends), jnp.array(joins))
