@@ -15,7 +15,7 @@ from retrim.experiments import Run
 from retrim.experiments.reporter import Silent
 from retrim.experiments.tables.document import Document, TableSection
 from retrim.experiments.tables.reversing import METHODS, _errors, _moments, _section
-from retrim.experiments.tables.study import Study, level_section, train_all
+from retrim.experiments.tables.study import Levels, fly_levels, train_all
 
 pytestmark = pytest.mark.usefixtures("as_a_user")
 
@@ -53,15 +53,11 @@ def test_a_section_of_tracking_has_cross_track_and_the_papers_rows(tmp_path):
         pretrain=TINY,
         adapt={**SOON, "num_updates": 2, "num_envs": 2},
     )
-    run = Run("test", tmp_path)
-    study = train_all(preset, [0], run, Silent())
-    assert list(study.policies) == [0]
-    paper = (("base", ("1", "2", "3")),)
     scenario = Scenario(plant="simple", reference="circle")
-    made = level_section(
-        study, "circle", scenario, run, Silent(), methods=("base", "lora"), starts=1, seconds=1.0, paper=paper, stem="x"
-    )
-    section, found = made
+    circle = Levels("circle", preset, scenario, "x", ("base", "lora"), (("base", ("1", "2", "3")),))
+    document = Document(Run("test", tmp_path), "table", "Title", "Intro.", [0], Silent())
+    fly_levels(document, [circle], starts=1, seconds=1.0)
+    (section,), found = document.sections, results(tmp_path, "table.json")["rows"]
     assert [(row["disturbance"], row["method"], row["reference"]) for row in found] == [
         (level, method, "circle") for level in LEVELS for method in ("base", "lora")
     ]
@@ -76,11 +72,10 @@ def test_a_section_of_tracking_has_cross_track_and_the_papers_rows(tmp_path):
 def test_an_interrupted_table_flies_nothing_more(tmp_path):
     run = Run("test", tmp_path)
     run.stop.set()
-    preset = tiny_preset()
-    study = train_all(preset, [0, 1], run, Silent())
-    assert study.policies == {}
-    assert level_section(Study(preset, {}, ()), "", Scenario(), run, Silent(), starts=1, seconds=1.0) is None
-    Document(run, "table", "Title", "Intro.", [0], Silent()).write()
+    assert train_all(tiny_preset(), [0, 1], run, Silent()).policies == {}
+    document = Document(run, "table", "Title", "Intro.", [0], Silent())
+    fly_levels(document, [Levels("", tiny_preset(), Scenario(), "x")] * 2, starts=1, seconds=1.0)
+    assert document.sections == []
     assert "Interrupted: incomplete." in (tmp_path / "table.md").read_text()
     assert results(tmp_path, "table.json")["interrupted"]
 

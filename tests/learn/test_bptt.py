@@ -9,12 +9,23 @@ import pytest
 from jax import random
 
 from helpers import GOAL, hover_env, hover_task
+from retrim import learn
 from retrim.control import Policy
-from retrim.learn import Env, PolicyState, bptt, policy_gradient, policy_loss, pretrain, rollout
+from retrim.learn import Env, PolicyState, pretrain
 from retrim.learn.pretrain import random_starts
 from retrim.learn.residuals import EnsembleResidual
 from retrim.physics import Hybrid, LinearDragQuadrotor, PointMass, State, StraightThrough, small
 from retrim.tasks import Start
+
+# As programs: eagerly, each call compiles its scan again.
+bptt, policy_gradient, policy_loss, rollout = map(
+    eqx.filter_jit, (learn.bptt, learn.policy_gradient, learn.policy_loss, learn.rollout)
+)
+
+
+@eqx.filter_jit
+def starts(task, key, n):
+    return jax.vmap(task.reset)(random.split(key, n))
 
 
 def awake(key, size, hidden=(8, 8)):
@@ -47,13 +58,13 @@ def models(key):
 def test_perturbations_equal_plain_gradient(which, delay, key):
     env = hover_env(models(key)[which], horizon=6, history=2, delay_ticks=delay)
     policy = awake(key, env.task.observation.size)
-    x0 = jax.vmap(env.task.reset)(random.split(key, 3))
+    x0 = starts(env.task, key, 3)
     value, gradient = policy_gradient(policy, env, x0)
 
     def plain(layers):
         return policy_loss(eqx.tree_at(lambda p: p.layers, policy, layers), env, x0)
 
-    expected_value, expected = jax.value_and_grad(plain)(policy.layers)
+    expected_value, expected = jax.jit(jax.value_and_grad(plain))(policy.layers)
     assert value == pytest.approx(float(expected_value), rel=1e-14)
     for found, wanted in zip(jax.tree.leaves(gradient), jax.tree.leaves(expected), strict=True):
         scale = max(float(jnp.abs(wanted).max()), 1e-12)
@@ -64,7 +75,7 @@ def test_perturbations_equal_plain_gradient(which, delay, key):
 def test_gradient_against_finite_differences(key):
     """Residual off, horizon 3: along random directions in weight space."""
     env, policy = hover_env(horizon=3), awake(key, 15)
-    x0 = jax.vmap(env.task.reset)(random.split(key, 2))
+    x0 = starts(env.task, key, 2)
     _, gradient = policy_gradient(policy, env, x0)
     loss = jax.jit(lambda layers: policy_loss(eqx.tree_at(lambda p: p.layers, policy, layers), env, x0))
     for k in random.split(key, 4):
@@ -138,7 +149,7 @@ def test_training_lowers_the_loss_and_leaves_limits_alone(key):
     history = list(run)
     assert jnp.concatenate([losses for _, losses in history]).shape == (40,)
     trained = history[-1][0].policy
-    x0 = jax.vmap(env.task.reset)(random.split(random.key(9), 32))
+    x0 = starts(env.task, random.key(9), 32)
     before, after = (float(policy_loss(p, env, x0)) for p in (policy, trained))
     assert after < 0.5 * before
     jax.tree.map(np.testing.assert_array_equal, (trained.u_min, trained.u_max), (policy.u_min, policy.u_max))

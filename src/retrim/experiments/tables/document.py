@@ -46,12 +46,13 @@ class Document:
     reporter: Reporter
     more: dict[str, Any] = field(default_factory=dict)
     """Further values for the JSON file."""
-    _sections: list[TableSection] = field(default_factory=list)
+    sections: list[TableSection] = field(default_factory=list)
+    """What was added."""
     _rows: list[dict[str, Any]] = field(default_factory=list)
 
     def add(self, section: TableSection, rows: Sequence[dict[str, Any]] = ()) -> None:
         """Add a section and the rows of results behind it; write both files."""
-        self._sections.append(section)
+        self.sections.append(section)
         self._rows += rows
         self.reporter.say("\n".join(line for line in section.markdown() if not line.startswith("![")))
         self.write()
@@ -61,7 +62,7 @@ class Document:
         seeds = ", ".join(map(str, self.seeds))
         head = [f"# {self.title}", "", self.intro, ""]
         head += [f"Commit {commit()}; {describe_hardware()}; training seeds {seeds}.", ""]
-        body = [line for section in self._sections for line in section.markdown()]
+        body = [line for section in self.sections for line in section.markdown()]
         foot = self.run.watch.sentence() + (" Interrupted: incomplete." if self.run.interrupted else "")
         self.run.write_results(self._rows, seeds=self.seeds, name=self.name, **self.more)
         return self.run.write_text(f"{self.name}.md", "\n".join([*head, *body, foot, ""]))

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from ...config.loading import load_for
+from ...config.loading import dump, load_for
 from ...config.methods import find_method
 from ...config.presets import Preset
 from ...config.scenario import Scenario
@@ -116,11 +116,12 @@ def fly_levels(document: Document, sections: Sequence[Levels], *, starts: int, s
         starts: Flights per disturbance, method and seed.
         seconds: Length of a flight; the task's own by default.
     """
-    run, reporter, studies = document.run, document.reporter, dict[Preset, Study]()
+    run, reporter, studies = document.run, document.reporter, dict[str, Study]()
     for section in sections:
-        if section.preset not in studies:
-            studies[section.preset] = train_all(section.preset, document.seeds, run, reporter)
-        made = _level_section(studies[section.preset], section, run, reporter, starts=starts, seconds=seconds)
+        key = dump(section.preset)
+        if key not in studies:
+            studies[key] = train_all(section.preset, document.seeds, run, reporter)
+        made = _level_section(studies[key], section, run, reporter, starts=starts, seconds=seconds)
         if made is not None:
             document.add(*made)
         if run.interrupted:
