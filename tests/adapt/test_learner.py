@@ -13,6 +13,7 @@ from jax import random
 from helpers import replaced, tiny_preset
 from retrim.adapt import OnlineLearner, RollingBuffer, Verdict
 from retrim.adapt import learner as module
+from retrim.adapt.optimisers import CarriedAdam, FreshAdam
 from retrim.config import Setup
 from retrim.physics import Command, PointMass, State
 
@@ -88,10 +89,9 @@ def test_a_window_without_a_whole_row_is_dropped(setup, key):
     jax.tree.map(np.testing.assert_array_equal, kept, state.residual)
 
 
-def test_the_rate_falls_along_a_cosine(setup):
+def test_the_rate_falls_along_a_cosine():
     """Adam's first step is the rate along each coordinate; under constant gradients so is each later one."""
-    learner = replaced(setup.learner, num_updates=10, policy_rate=jnp.array(0.01), max_grad_norm=jnp.array(jnp.inf))
-    optimiser = learner._optimiser()
+    optimiser = FreshAdam(jnp.array(0.01), jnp.array(jnp.inf)).transformation(10)
     params = jnp.zeros(3)
     memory, steps = optimiser.init(params), []
     for _ in range(10):
@@ -101,11 +101,12 @@ def test_the_rate_falls_along_a_cosine(setup):
     assert steps[-1] < 0.03 * steps[0]
 
 
-def test_a_gradient_is_clipped_by_its_norm(setup):
+@pytest.mark.parametrize("kind", [FreshAdam, CarriedAdam])
+def test_a_gradient_is_clipped_by_its_norm(kind):
     """A huge gradient after small ones moves Adam no farther than one at the limit."""
 
     def moved(huge):
-        optimiser = replaced(setup.learner, max_grad_norm=jnp.array(0.5))._optimiser()
+        optimiser = kind(jnp.array(1e-3), jnp.array(0.5)).transformation(3)
         params = jnp.zeros(4)
         memory = optimiser.init(params)
         for gradient in (0.01, 0.01, huge):
@@ -114,6 +115,27 @@ def test_a_gradient_is_clipped_by_its_norm(setup):
 
     np.testing.assert_allclose(moved(1e6), moved(0.25))  # four of 0.25 have the norm 0.5
     assert not np.allclose(moved(0.1), moved(0.25))
+
+
+@pytest.mark.usefixtures("optax_promotion")
+def test_a_carried_adam_has_a_constant_rate_and_goes_on():
+    """Two short updates are one long one."""
+    optimiser, params = CarriedAdam(jnp.array(0.01), jnp.array(jnp.inf)), jnp.ones(3)
+    gradients = jnp.sin(jnp.arange(12.0)).reshape(4, 3)
+
+    def after(*updates):
+        x, memory = params, optimiser.transformation(len(updates[0])).init(params)
+        for update in updates:
+            adam = optimiser.transformation(len(update))
+            for gradient in update:
+                change, memory = adam.update(gradient, memory, x)
+                x = x + change
+        return x
+
+    np.testing.assert_array_equal(after(gradients[:2], gradients[2:]), after(gradients))
+    one = optimiser.transformation(1)
+    change, _ = one.update(jnp.array([3.0, -0.2, 0.01]), one.init(params), params)
+    np.testing.assert_allclose(change, [-0.01, 0.01, -0.01], rtol=1e-5)
 
 
 def test_each_update_starts_a_fresh_optimiser(setup, window, key):

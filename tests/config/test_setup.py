@@ -124,8 +124,8 @@ def test_the_learner_has_the_presets_numbers(built):
     assert learner.plant_delay_ticks == preset.plant_delay_ticks
     assert learner.num_updates == a.num_updates
     assert learner.num_envs == a.num_envs
-    assert float(learner.policy_rate) == a.learning_rate
-    assert float(learner.max_grad_norm) == (math.inf if a.max_grad_norm is None else a.max_grad_norm)
+    assert float(learner.optimiser.rate) == a.learning_rate
+    assert float(learner.optimiser.max_grad_norm) == (math.inf if a.max_grad_norm is None else a.max_grad_norm)
     assert (a.max_grad_norm is None) == (
         preset.name in ("hover/paper", "hover/released", "track/paper", "vision/paper")
     )

@@ -105,7 +105,7 @@ class QueueLearner(Learner):
 def queued(setup, policy, *learners, every_s=0.1, window=12):
     state = setup.learner.init(policy, random.key(2))
     scheduled = tuple(Scheduled(learner, every_s) for learner in learners)
-    return AdaptivePilot(setup.flown.observation_in_flight, state, scheduled, dt=setup.preset.dt, window=window)
+    return AdaptivePilot(setup.controller, state, scheduled, dt=setup.preset.dt, window=window)
 
 
 def biased(state, by):
@@ -366,8 +366,7 @@ def test_missed_ticks_keep_the_schedule_and_do_not_poison_the_fit(trained):
         state = setup.learner.init(policy, random.key(2))
         worker = Recorded(setup.learner, state)
         learner = LockstepLearner(worker, 0.1, 0.02)
-        observation = setup.flown.observation_in_flight
-        pilot = AdaptivePilot(observation, state, [Scheduled(learner, 0.6)], dt=0.02, window=100)
+        pilot = AdaptivePilot(setup.controller, state, [Scheduled(learner, 0.6)], dt=0.02, window=100)
         log = fly(Odd(stalls=stalls), pilot, setup.flight_starts(1)[0], ticks=160)
         assert log.missed_ticks == 2 * sum(s < len(log.t) - 1 for s in stalls)
         return log, [update.rms_error for update in worker.updates]

@@ -5,7 +5,6 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optax
 from jax import random
 from jaxtyping import Array, Bool, Float, Key
 
@@ -13,13 +12,14 @@ from ..control.lora import LoraPolicy
 from ..control.policy import Policy
 from ..learn.bptt import PolicyState, bptt
 from ..learn.env import Env
-from ..learn.pretrain import random_starts
 from ..learn.residuals.model import FittedResidual, ResidualModel
 from ..learn.residuals.targets import residual_targets
 from ..learn.window import Window
 from ..physics.state import where
-from ..tasks.task import Start
 from .gate import Verdict, all_finite, judge
+from .optimisers import AbstractPolicyOptimiser
+from .starts import AbstractStarts, TaskStarts, drawn
+from .views import AbstractView, WorldView
 
 
 class LearnerState(eqx.Module):
@@ -45,17 +45,18 @@ class OnlineLearner(eqx.Module):
     env: Env
     """Task of the flight, nominal model and its delay; the model knows nothing of the plant."""
     residual_model: ResidualModel
-    policy_rate: Float[Array, ""]
-    """Adam's learning rate at the start of an update; it falls to zero along a cosine. Each update starts a fresh
-    Adam."""
-    max_grad_norm: Float[Array, ""]
-    """Largest norm of a policy gradient; infinity for none."""
+    optimiser: AbstractPolicyOptimiser
+    """What re-trains the policy."""
     plant_delay_ticks: int = eqx.field(static=True)
     """Declared command delay of the plant [ticks], to pair accelerations with the commands that caused them."""
     num_updates: int = eqx.field(static=True)
     """Optimiser steps of one policy update."""
     num_envs: int = eqx.field(static=True)
     """Starts per optimiser step."""
+    starts: AbstractStarts = TaskStarts()
+    """Where they lie."""
+    view: AbstractView = WorldView()
+    """Coordinates in which the policy is trained, and flown."""
 
     def __check_init__(self) -> None:
         """Raise ``ValueError`` for sizes that cannot work."""
@@ -67,7 +68,7 @@ class OnlineLearner(eqx.Module):
 
     def init(self, policy: Policy | LoraPolicy, key: Key[Array, ""]) -> LearnerState:
         """Return the state before the first fit, with a residual that predicts zero; the key is consumed."""
-        fresh = PolicyState(policy, self._optimiser().init(policy.params))
+        fresh = PolicyState(policy, self.optimiser.transformation(self.num_updates).init(policy.params))
         return LearnerState(fresh, _fresh_residual(self.residual_model, key))
 
     @eqx.filter_jit
@@ -104,36 +105,19 @@ class OnlineLearner(eqx.Module):
         Returns:
             The trained policy, and the gate's verdict on it.
         """
-        corrected = self.env.with_residual(FittedResidual(self.residual_model, residual))
+        corrected, seen = self.view(self.env, FittedResidual(self.residual_model, residual), window)
         k_train, k_gate, k_window = random.split(key, 3)
-        x0 = random_starts(self.env.task, k_train, self.num_updates, self.num_envs)
-        optimiser = self._optimiser()
-        fresh = PolicyState(state.policy, optimiser.init(state.policy.params))
-        trained, _ = bptt(fresh, corrected, x0, optimiser=optimiser)
+        x0 = self.starts(self.env.task, seen, k_train, self.num_updates, self.num_envs)
+        begun = self.optimiser.begin(state, self.num_updates)
+        trained, _ = bptt(begun, corrected, x0, optimiser=self.optimiser.transformation(self.num_updates))
         held_out = jax.tree.map(
             lambda a, b: jnp.concatenate([a, b]),
             jax.vmap(self.env.task.reset)(random.split(k_gate, 4)),
-            _drawn(window, k_window, 4),
+            drawn(seen, k_window, (4,)),
         )
         return trained, judge(trained.policy.merged(), state.policy.merged(), corrected, held_out)
-
-    def _optimiser(self) -> optax.GradientTransformation:
-        schedule = optax.cosine_decay_schedule(1.0, self.num_updates)
-        return optax.chain(
-            optax.clip_by_global_norm(self.max_grad_norm),
-            optax.scale_by_adam(),
-            optax.scale_by_schedule(lambda step: -self.policy_rate * schedule(step)),
-        )
 
 
 @eqx.filter_jit
 def _fresh_residual(model: ResidualModel, key: Key[Array, ""]) -> Any:
     return model.init(key)
-
-
-def _drawn(window: Window, key: Key[Array, ""], n: int) -> Start:
-    """Draw ``n`` states, with their times, from the valid part of the window."""
-    weight = window.valid.astype(window.x.p.dtype)
-    row = random.choice(key, window.valid.shape[0], (n,), p=weight / jnp.sum(weight))
-    drawn: Start = jax.vmap(Start)(window.t[row], jax.tree.map(lambda leaf: leaf[row], window.x))
-    return drawn

@@ -9,16 +9,12 @@ from jaxtyping import Array, Key
 
 from ..adapt.learner import LearnerState
 from ..control.controller import PolicyController
-from ..control.gravity_frame import GravityFrame
 from ..control.integral import IntegralAction
 from ..control.lora import LoraPolicy
 from ..control.policy import Policy
 from ..errors import ConfigError
-from ..estimation.disturbance_observer import DisturbanceObserver
-from ..physics.dynamics import PointMass
 from ..runtime.pilot import ControllerPilot, Pilot
 from ..tasks.keypoints import Keypoints
-from ..tasks.observation import StateObs
 from .registry import Registry
 
 if TYPE_CHECKING:
@@ -90,13 +86,7 @@ def _integral(request: MethodRequest) -> Pilot:
 
 
 def _gravity_frame(request: MethodRequest) -> Pilot:
-    setup = request.setup
-    if not isinstance(setup.env.task.observation, StateObs) or setup.preset.track is not None:
-        raise ConfigError("method 'base-do' turns the frame about a hover goal; it needs a policy that sees its state")
-    observer = DisturbanceObserver(
-        PointMass(setup.preset.dt), jnp.array(0.2), jnp.array(6.0), delay_ticks=setup.preset.plant_delay_ticks
-    )
-    return ControllerPilot(GravityFrame(request.controller(), observer, setup.flown.home()))
+    return ControllerPilot(request.setup.in_gravity_frame(request.controller()))
 
 
 def _full(request: MethodRequest) -> Pilot:

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from ..errors import ConfigError
 from ..learn.residuals.ensemble import EnsembleModel
 from ..learn.residuals.model import ResidualModel
+from ..learn.residuals.regression import RegressionModel
 from ..physics.vehicle import Vehicle
 from .presets import Preset
 from .registry import Registry
@@ -50,4 +51,9 @@ def _ensemble(request: ResidualRequest) -> ResidualModel:
     )
 
 
+def _regression(request: ResidualRequest) -> ResidualModel:
+    return RegressionModel.of(request.preset.dt, memory=request.preset.adapt.memory)
+
+
 register_residual("ensemble", _ensemble)
+register_residual("regression", _regression)

@@ -16,6 +16,8 @@ from jaxtyping import Array, Float, Key
 
 from ..adapt.learner import LearnerState, OnlineLearner
 from ..adapt.workers import PolicyWorker, ResidualWorker
+from ..control.controller import AbstractController, PolicyController
+from ..control.gravity_frame import GravityFrame
 from ..control.lora import LoraPolicy
 from ..control.policy import Policy
 from ..errors import ConfigError
@@ -34,6 +36,7 @@ from ..tasks.hover import TILT, Hover
 from ..tasks.keypoints import Keypoints
 from ..tasks.reference import Reference
 from ..tasks.task import AbstractTask
+from .learners import check_frame, gravity_frame, make_learner
 from .loading import parse
 from .presets import Preset
 from .residuals import ResidualRequest, make_residual
@@ -99,7 +102,7 @@ class Setup:
                 nominal = Lagged(nominal, jnp.array(preset.actuator_tau))
             env = Env(nominal, task, preset.delay_ticks)
             model = residual_model or make_residual(ResidualRequest(preset, vehicle))
-            learner = _learner(preset, model, Env(nominal, flown, preset.delay_ticks))
+            learner = make_learner(preset, model, Env(nominal, flown, preset.delay_ticks))
         except (TypeError, ValueError) as error:
             raise (
                 error if isinstance(error, ConfigError) else ConfigError(f"preset {preset.name!r}: {error}")
@@ -175,6 +178,20 @@ class Setup:
             pilot.dt = self.preset.dt
         return pilot
 
+    def controller(self, policy: Policy) -> AbstractController[Any]:
+        """Return the controller of a policy that adapts: behind its observation, in the preset's frame."""
+        plain = PolicyController(self.flown.observation_in_flight, policy)
+        return self.in_gravity_frame(plain) if self.preset.adapt.frame == "gravity" else plain
+
+    def in_gravity_frame(self, controller: AbstractController[Any]) -> GravityFrame:
+        """Return a controller for hover, flown in the gravity that a disturbance observer feels.
+
+        Raises:
+            ConfigError: The task tracks a reference, or the policy does not see its state.
+        """
+        check_frame(self.preset, self.env.task)
+        return gravity_frame(controller, self.preset, self.flown.home())
+
     def low_rank(self, policy: Policy | LoraPolicy, key: Key[Array, ""]) -> LoraPolicy:
         """Return ``policy`` with a fresh low-rank delta (ranks 4, 10, 1 and scale 4, as in the paper).
 
@@ -203,7 +220,7 @@ class Setup:
         fit = LockstepLearner(ResidualWorker(self.learner, state), a.fit_latency if fixed else None, dt)
         update = LockstepLearner(PolicyWorker(self.learner, state, k_learn), a.update_latency if fixed else None, dt)
         return AdaptivePilot(
-            self.flown.observation_in_flight,
+            self.controller,
             state,
             (Scheduled(fit, a.fit_every), Scheduled(update, a.update_every)),
             dt=dt,
@@ -246,16 +263,3 @@ def setup_for(preset: str, reference: str | None = None, fleet: str = "") -> Set
 @jax.jit
 def _low_rank(policy: Policy, key: Key[Array, ""]) -> LoraPolicy:
     return LoraPolicy.of(policy, key=key)
-
-
-def _learner(preset: Preset, model: ResidualModel, env: Env) -> OnlineLearner:
-    a = preset.adapt
-    return OnlineLearner(
-        env,
-        model,
-        policy_rate=jnp.array(a.learning_rate),
-        max_grad_norm=jnp.array(a.max_grad_norm or math.inf),
-        plant_delay_ticks=preset.plant_delay_ticks,
-        num_updates=a.num_updates,
-        num_envs=a.num_envs,
-    )

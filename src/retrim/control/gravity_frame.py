@@ -42,8 +42,7 @@ class GravityFrame(AbstractController[GravityFrameState]):
         """Return the inner controller's command in the estimated gravity, with corrected thrust."""
         observed = self.observer(memory.observer, x)
         Q, extra = tilted(observed.d_hat)
-        turned = State(self.pivot + so3.act(Q, x.p - self.pivot), so3.mul(Q, x.R), so3.act(Q, x.v))
-        u, inner = self.inner(memory.inner, t, turned)
+        u, inner = self.inner(memory.inner, t, turned(Q, self.pivot, x))
         u = Command(u.c + extra, u.omega)
         return u, GravityFrameState(self.observer.issued(observed, u), inner)
 
@@ -73,3 +72,8 @@ def tilted(d_hat: Float[Array, "3"]) -> tuple[Float[Array, "3 3"], Float[Array, 
         ]
     )
     return Q, strength - STANDARD_GRAVITY
+
+
+def turned(Q: Float[Array, "3 3"], pivot: Float[Array, "3"], x: State) -> State:
+    """Return the state ``x`` turned by ``Q`` about ``pivot``, world [m]."""
+    return State(pivot + so3.act(Q, x.p - pivot), so3.mul(Q, x.R), so3.act(Q, x.v))

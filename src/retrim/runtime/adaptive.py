@@ -1,15 +1,15 @@
 """The adaptive pilot: flies a policy, feeds learners, and applies their updates."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 from ..adapt.buffer import RollingBuffer
 from ..adapt.learner import LearnerState
 from ..adapt.updates import PolicyUpdate, ResidualUpdate, Update
-from ..control.controller import PolicyController
+from ..control.controller import AbstractController
+from ..control.policy import Policy
 from ..physics.state import Command
 from ..plants.plant import Measurement
-from ..tasks.observation import AbstractObservation
 from .events import Event
 from .learner import Learner
 from .pilot import ControllerPilot, Pilot
@@ -28,7 +28,7 @@ class AdaptivePilot(Pilot):
 
     def __init__(
         self,
-        observation: AbstractObservation[Any],
+        controller: Callable[[Policy], AbstractController[Any]],
         state: LearnerState,
         learners: Sequence[Scheduled],
         *,
@@ -38,18 +38,18 @@ class AdaptivePilot(Pilot):
         """Build a pilot.
 
         Args:
-            observation: What the policy sees in flight.
+            controller: It puts a policy behind its observation; the memory of one goes on in the next.
             state: Policy and residual at the start.
             learners: They are offered windows in this order.
             dt: Control tick [s].
             window: Ticks of flight that learners see.
         """
-        self._observation = observation
+        self._controller = controller
         self.dt: float = dt
         self._learners = tuple(learners)
         self._periods = [max(1, round(each.every_s / dt)) for each in self._learners]
         self._buffer = RollingBuffer(window)
-        self._pilot = ControllerPilot(PolicyController(observation, state.policy.policy.merged()))
+        self._pilot = ControllerPilot(controller(state.policy.policy.merged()))
         self._ticks_offered = [0] * len(self._learners)
         self._start = 0.0
         self._new_events: list[Event] = []
@@ -109,6 +109,6 @@ class AdaptivePilot(Pilot):
             self.state = LearnerState(self.state.policy, update.state)
         elif isinstance(update, PolicyUpdate):
             self.state = LearnerState(update.state, self.state.residual)
-            self._pilot.controller = PolicyController(self._observation, update.state.policy.merged())
+            self._pilot.controller = self._controller(update.state.policy.merged())
         for learner, _ in self._learners:
             learner.receive(update)

@@ -6,5 +6,7 @@ from .ensemble import EnsembleState as EnsembleState
 from .ensemble import fit_ensemble as fit_ensemble
 from .model import FittedResidual as FittedResidual
 from .model import ResidualModel as ResidualModel
+from .regression import RegressionModel as RegressionModel
+from .regression import RegressionState as RegressionState
 from .targets import Targets as Targets
 from .targets import residual_targets as residual_targets

@@ -1,0 +1,70 @@
+"""Where the roll-outs of an update start."""
+
+import abc
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import random
+from jaxtyping import Array, Float, Key
+
+from ..learn.pretrain import random_starts
+from ..learn.window import Window
+from ..physics.state import State
+from ..tasks.task import AbstractTask, Start
+
+
+class AbstractStarts(eqx.Module):
+    """Draws the starts of an update."""
+
+    @abc.abstractmethod
+    def __call__(self, task: AbstractTask, window: Window, key: Key[Array, ""], updates: int, envs: int) -> Start:
+        """Return starts with two leading axes, updates x environments; the key is consumed."""
+
+
+class TaskStarts(AbstractStarts):
+    """Those of pretraining (the paper)."""
+
+    def __call__(self, task: AbstractTask, window: Window, key: Key[Array, ""], updates: int, envs: int) -> Start:
+        """Draw from the task."""
+        return random_starts(task, key, updates, envs)
+
+
+class FlownStarts(AbstractStarts):
+    """Most from where the vehicle has just been, the rest from the task, so that nothing is forgotten.
+
+    Far starts with few environments make noisy gradients, and the policy that they train jitters by centimetres.
+    """
+
+    spread: Float[Array, ""]
+    """Standard deviation that is added to position [m] and velocity [m/s]."""
+    from_task: int = eqx.field(static=True, default=2)
+    """Environments of each step that start where the task says."""
+
+    def __call__(self, task: AbstractTask, window: Window, key: Key[Array, ""], updates: int, envs: int) -> Start:
+        """Draw from the window, and from the task."""
+        k_task, k_rows, k_p, k_v = random.split(key, 4)
+        far = min(self.from_task, envs)
+        shape = (updates, envs - far)
+        dtype = window.x.p.dtype
+        dp, dv = (self.spread * random.normal(k, (*shape, 3), dtype) for k in (k_p, k_v))
+        near = jax.vmap(jax.vmap(_shifted))(drawn(window, k_rows, shape), dp, dv)
+        both: Start = jax.tree.map(
+            lambda a, b: jnp.concatenate([a, b], axis=1), random_starts(task, k_task, updates, far), near
+        )
+        return both
+
+
+def drawn(window: Window, key: Key[Array, ""], shape: tuple[int, ...]) -> Start:
+    """Draw states, with their times, from the valid part of the window; the key is consumed."""
+    weight = window.valid.astype(window.x.p.dtype)
+    row = random.choice(key, window.valid.shape[0], shape, p=weight / jnp.sum(weight))
+    make: Callable[..., Start] = Start
+    for _ in shape:
+        make = jax.vmap(make)
+    return make(window.t[row], jax.tree.map(lambda leaf: leaf[row], window.x))
+
+
+def _shifted(start: Start, dp: Float[Array, "3"], dv: Float[Array, "3"]) -> Start:
+    return Start(start.t, State(start.x.p + dp, start.x.R, start.x.v + dv))

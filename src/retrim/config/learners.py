@@ -1,0 +1,74 @@
+"""The learner of a preset, and the frame that its policy is flown in."""
+
+import math
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..adapt.learner import OnlineLearner
+from ..adapt.optimisers import CarriedAdam, FreshAdam
+from ..adapt.starts import FlownStarts, TaskStarts
+from ..adapt.views import GravityView, WorldView
+from ..control.controller import AbstractController
+from ..control.gravity_frame import GravityFrame
+from ..errors import ConfigError
+from ..estimation.disturbance_observer import DisturbanceObserver
+from ..learn.env import Env
+from ..learn.residuals.model import ResidualModel
+from ..physics.dynamics import PointMass
+from ..tasks.hover import AbstractHover
+from ..tasks.observation import StateObs
+from ..tasks.task import AbstractTask
+from .presets import Preset
+
+OBSERVER_TAU = 0.2  # [s]
+TILT_LIMIT = 6.0  # [m/s^2], largest disturbance that turns a frame: gravity keeps a downward part
+
+
+def make_learner(preset: Preset, model: ResidualModel, env: Env) -> OnlineLearner:
+    """Return the learner of a preset.
+
+    Args:
+        preset: Its table [adapt] says how to learn.
+        model: Residual model.
+        env: Environment of the flight.
+
+    Raises:
+        ConfigError: The preset turns the frame of a task that cannot be turned.
+    """
+    a = preset.adapt
+    if a.frame == "gravity":
+        check_frame(preset, env.task)
+    adam = CarriedAdam if a.optimiser == "carried" else FreshAdam
+    return OnlineLearner(
+        env,
+        model,
+        adam(jnp.array(a.learning_rate), jnp.array(a.max_grad_norm or math.inf)),
+        plant_delay_ticks=preset.plant_delay_ticks,
+        num_updates=a.num_updates,
+        num_envs=a.num_envs,
+        starts=TaskStarts() if a.task_starts is None else FlownStarts(jnp.array(a.start_noise), a.task_starts),
+        view=GravityView(env.task.home(), jnp.array(TILT_LIMIT)) if a.frame == "gravity" else WorldView(),
+    )
+
+
+def check_frame(preset: Preset, task: AbstractTask) -> None:
+    """Refuse a frame that turns about a goal for a task without one, or for a policy that does not see its state.
+
+    Raises:
+        ConfigError: It names the task.
+    """
+    if not isinstance(task, AbstractHover) or not isinstance(task.observation, StateObs):
+        raise ConfigError(
+            "a disturbance observer turns the frame about a hover goal, for a policy that sees its state; task "
+            f"{preset.task!r} has no such goal, or hides the state"
+        )
+
+
+def gravity_frame(controller: AbstractController[Any], preset: Preset, goal: Float[Array, "3"]) -> GravityFrame:
+    """Return a controller for hover, flown in the gravity that a disturbance observer feels."""
+    observer = DisturbanceObserver(
+        PointMass(preset.dt), jnp.array(OBSERVER_TAU), jnp.array(TILT_LIMIT), delay_ticks=preset.plant_delay_ticks
+    )
+    return GravityFrame(controller, observer, goal)

@@ -1,0 +1,128 @@
+"""A closed-form residual: Bayesian linear regression on physical features, with exponential forgetting."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, Key
+
+from ...physics import so3
+from ...physics.state import STANDARD_GRAVITY, Command, State
+from .targets import Targets
+
+SIZE = 10
+"""Parameters: constant push (3), thrust gain (1), linear drag (3), quadratic drag (3)."""
+BLOCK = 8
+"""Rows that are compared at once in the search for a change."""
+SURPRISE = 21.1
+"""Of a chi-squared variable of three degrees of freedom, passed once in 10,000."""
+
+
+class RegressionState(eqx.Module):
+    """Posterior of the parameters: a normal distribution."""
+
+    mean: Float[Array, "10"]
+    covariance: Float[Array, "10 10"]
+
+
+class RegressionModel(eqx.Module):
+    """The residual as ten physical numbers, as a :class:`retrim.learn.ResidualModel`.
+
+    a_res = d + R (k_c (c - g) e3 - k_1 v_b - k_2 |v_b| v_b), with v_b the velocity in the body frame and the products
+    per axis. The thrust gain k_c acts on what exceeds hover thrust: at hover it cannot be told from a push along z,
+    which d is. A fit is exact, takes microseconds, and depends on the window alone, never on the fit before it.
+    """
+
+    prior: Float[Array, "10"]
+    """Standard deviations before any flight: [m/s^2] x 3, [-], [1/s] x 3, [1/m] x 3."""
+    noise: Float[Array, ""]
+    """Standard deviation of one row of targets [m/s^2]."""
+    memory: Float[Array, ""]
+    """A row counts for 1/e of the newest after this long [s]."""
+    dt: float = eqx.field(static=True)
+    """Control tick [s]."""
+
+    @classmethod
+    def of(cls, dt: float, *, memory: float = 0.5, noise: float = 0.5) -> "RegressionModel":
+        """Return the model with priors that fit small and medium quadrotors.
+
+        Args:
+            dt: Control tick [s].
+            memory: Time constant of forgetting [s].
+            noise: Standard deviation of one row of targets [m/s^2]: of the sensors, and of what no feature explains.
+        """
+        prior = jnp.array([5.0, 5.0, 5.0, 0.05, 0.3, 0.3, 0.3, 0.03, 0.03, 0.03])
+        return cls(prior, jnp.array(noise), jnp.array(memory), dt)
+
+    def init(self, key: Key[Array, ""]) -> RegressionState:
+        """Return the prior, which predicts zero; the key is not needed."""
+        del key
+        return RegressionState(jnp.zeros_like(self.prior), jnp.diag(self.prior**2))
+
+    def fit(self, state: RegressionState, rows: Targets) -> tuple[RegressionState, Float[Array, ""]]:
+        """Return the posterior given ``rows``, the newest last; also the weighted error [m/s^2].
+
+        The precision is diag(1 / prior^2) + sum_i w_i Phi_i^T Phi_i / noise^2. w_i falls exponentially with age, and is
+        zero for what lies before a change: blocks of rows are compared with what the newest one predicts for them, and
+        from the first that it does not explain (99.99 %) nothing older counts.
+        """
+        del state  # the window says all: what is older has been forgotten
+        n = rows.valid.shape[0]
+        age = jnp.arange(n - 1, -1, -1)
+        features = jax.vmap(features_of)(rows.x, rows.u)
+        valid = rows.valid.astype(rows.a_res.dtype)
+        recent = self._posterior(features, rows.a_res, jnp.where(age < BLOCK, valid, 0.0))
+        newer = self._unchanged(recent, features, rows.a_res, valid, age // BLOCK)
+        weight = jnp.exp(-self.dt * age.astype(valid.dtype) / self.memory) * valid * newer
+        posterior = self._posterior(features, rows.a_res, weight)
+        error = jnp.sum((rows.a_res - features @ posterior.mean) ** 2, axis=1)
+        rms = jnp.sqrt(jnp.sum(weight * error) / jnp.maximum(jnp.sum(weight), 1e-6))
+        return posterior, rms
+
+    def _posterior(
+        self, features: Float[Array, "n 3 10"], target: Float[Array, "n 3"], weight: Float[Array, " n"]
+    ) -> RegressionState:
+        scaled = features * self.prior[None, None]  # parameters of order one: well conditioned in single precision
+        eye = jnp.eye(SIZE, dtype=scaled.dtype)
+        precision = eye + jnp.einsum("n,nik,nil->kl", weight, scaled, scaled) / self.noise**2
+        factor = jax.scipy.linalg.cho_factor(precision)
+        mean = jax.scipy.linalg.cho_solve(factor, jnp.einsum("n,nik,ni->k", weight, scaled, target) / self.noise**2)
+        covariance = jax.scipy.linalg.cho_solve(factor, eye)
+        return RegressionState(self.prior * mean, self.prior[:, None] * covariance * self.prior[None])
+
+    def _unchanged(
+        self,
+        recent: RegressionState,
+        features: Float[Array, "n 3 10"],
+        target: Float[Array, "n 3"],
+        valid: Float[Array, " n"],
+        block: Int[Array, " n"],
+    ) -> Float[Array, " n"]:
+        """One for rows since the last change, zero before; ``block`` counts blocks of rows from the newest."""
+        blocks = -(-target.shape[0] // BLOCK)
+        count = jax.ops.segment_sum(valid, block, blocks)
+        per = jnp.maximum(count, 1.0)
+        missed = jax.ops.segment_sum(valid[:, None] * (target - features @ recent.mean), block, blocks) / per[:, None]
+        mean = jax.ops.segment_sum(valid[:, None, None] * features, block, blocks) / per[:, None, None]
+        of_row = (self.noise**2 / per)[:, None, None] * jnp.eye(3, dtype=target.dtype)[None]
+        expected = jnp.einsum("bik,kl,bjl->bij", mean, recent.covariance, mean) + of_row
+        surprise = jnp.einsum("bi,bij,bj->b", missed, jnp.linalg.inv(expected), missed)
+        explained = (surprise < SURPRISE) | (count == 0)
+        since: Float[Array, " b"] = jnp.cumprod(explained.astype(target.dtype))
+        return since[block]
+
+    def predict(self, state: RegressionState, x: State, u: Command) -> Float[Array, "3"]:
+        """Return the mean prediction, world frame [m/s^2]."""
+        return features_of(x, u) @ state.mean
+
+    def spread(self, state: RegressionState, x: State, u: Command) -> Float[Array, "3"]:
+        """Return the standard deviation of the prediction, without that of a single row [m/s^2]."""
+        features = features_of(x, u)
+        return jnp.sqrt(jnp.sum((features @ state.covariance) * features, axis=1))
+
+
+def features_of(x: State, u: Command) -> Float[Array, "3 10"]:
+    """Return the features Phi, world frame: the residual is Phi times the ten parameters."""
+    v_b = so3.act(x.R.T, x.v)
+    push = jnp.eye(3, dtype=x.p.dtype)
+    gain = x.R[:, 2:] * (u.c - STANDARD_GRAVITY)
+    return jnp.concatenate([push, gain, -x.R * v_b[None], -x.R * (jnp.abs(v_b) * v_b)[None]], axis=1)

@@ -1,0 +1,51 @@
+"""Where updates start: in the flown region, and where the task says."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import random
+
+from helpers import hover_task, random_state
+from retrim.adapt.starts import FlownStarts, TaskStarts
+from retrim.learn import Window
+from retrim.learn.pretrain import random_starts
+
+
+@pytest.fixture
+def window(key):
+    """Twenty ticks far from the goal; the first five, farther still, are invalid."""
+    x = jax.vmap(random_state)(random.split(key, 20))
+    p = 7.0 + 0.01 * jnp.arange(20.0)[:, None] + jnp.zeros((1, 3))
+    u = jnp.zeros((20, 3))
+    made = Window.of(0.02 * jnp.arange(20.0), p.at[:5].set(100.0), x.R, x.v, jnp.full(20, 9.81), u)
+    return Window(made.t, made.x, made.u, jnp.arange(20) >= 5)
+
+
+def test_the_papers_starts_are_those_of_training(window, key):
+    found = TaskStarts()(hover_task(), window, key, 3, 4)
+    jax.tree.map(np.testing.assert_array_equal, found, random_starts(hover_task(), key, 3, 4))
+
+
+@pytest.mark.parametrize("from_task", [0, 2, 4, 9])
+def test_flown_starts_lie_where_the_vehicle_was(window, key, from_task):
+    task = hover_task()
+    found = FlownStarts(jnp.array(0.0), from_task)(task, window, key, 5, 4)
+    assert found.x.R.shape == (5, 4, 3, 3)
+    far = min(from_task, 4)
+    p = np.asarray(found.x.p)
+    assert (np.abs(p[:, :far] - np.array([0.0, 0.0, 1.0])) <= 1.0).all()  # the task's box
+    rows = np.asarray(window.x.p)
+    for each in p[:, far:].reshape(-1, 3):
+        row = np.flatnonzero((rows == each).all(axis=1))
+        assert len(row) == 1
+        assert row[0] >= 5
+
+
+def test_their_noise_has_the_stated_size(window, key):
+    exact, noisy = (FlownStarts(jnp.array(s), 0)(hover_task(), window, key, 50, 40) for s in (0.0, 0.1))
+    for name in ("p", "v"):
+        moved = np.asarray(getattr(noisy.x, name)) - np.asarray(getattr(exact.x, name))
+        assert moved.std() == pytest.approx(0.1, rel=0.05)
+    np.testing.assert_array_equal(noisy.x.R, exact.x.R)
+    np.testing.assert_array_equal(noisy.t, exact.t)

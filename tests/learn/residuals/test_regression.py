@@ -1,0 +1,127 @@
+"""The closed-form residual: its posterior, what it forgets, and what it identifies."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import random
+
+from helpers import random_command, random_field_flight, random_state, replaced
+from retrim.learn import residual_targets
+from retrim.learn.residuals import RegressionModel, Targets
+from retrim.learn.residuals.regression import BLOCK, features_of
+from retrim.physics import PointMass, so3
+
+MODEL = RegressionModel.of(0.02, memory=0.5, noise=0.5)
+ENDLESS = replaced(MODEL, memory=jnp.array(1e9))
+
+
+def rows_of(parameters, key, n=96, noise=0.0, valid=None):
+    """Random states and commands, and what ``parameters`` (n x 10, or 10) make of them."""
+    k_x, k_u, k_noise = random.split(key, 3)
+    x = jax.vmap(random_state)(random.split(k_x, n))
+    u = jax.vmap(random_command)(random.split(k_u, n))
+    parameters = jnp.broadcast_to(jnp.asarray(parameters), (n, 10))
+    a_res = jnp.einsum("nik,nk->ni", jax.vmap(features_of)(x, u), parameters)
+    a_res = a_res + noise * random.normal(k_noise, a_res.shape)
+    return Targets(x, u, a_res, jnp.ones(n, dtype=bool) if valid is None else valid)
+
+
+def push(*d):
+    return jnp.concatenate([jnp.array(d), jnp.zeros(7)])
+
+
+def fitted(model, rows):
+    return eqx.filter_jit(model.fit)(model.init(random.key(0)), rows)
+
+
+def test_without_data_it_is_the_prior(key):
+    rows = rows_of(push(1.0, 2.0, 3.0), key, valid=jnp.zeros(96, dtype=bool))
+    state, _ = fitted(MODEL, rows)
+    jax.tree.map(np.testing.assert_allclose, state, MODEL.init(key))
+    x, u = random_state(key), random_command(key)
+    np.testing.assert_array_equal(MODEL.predict(state, x, u), 0.0)
+
+
+def test_the_posterior_is_the_one_of_the_textbook(key):
+    """Kalman's recursion, row by row in NumPy, ends where the closed form is."""
+    rows = rows_of(0.3 * random.normal(key, (10,)) * MODEL.prior, key, n=40, noise=0.3)
+    mean, covariance = np.zeros(10), np.diag(np.asarray(MODEL.prior) ** 2)
+    for phi, a in zip(np.asarray(jax.vmap(features_of)(rows.x, rows.u)), np.asarray(rows.a_res), strict=True):
+        gain = covariance @ phi.T @ np.linalg.inv(phi @ covariance @ phi.T + 0.25 * np.eye(3))
+        mean, covariance = mean + gain @ (a - phi @ mean), covariance - gain @ phi @ covariance
+    state, _ = fitted(ENDLESS, rows)
+    np.testing.assert_allclose(state.mean, mean, rtol=1e-8, atol=1e-12)
+    np.testing.assert_allclose(state.covariance, covariance, rtol=1e-7, atol=1e-12)
+
+
+def test_old_rows_count_for_less(key):
+    """A slow drift that no test calls a change: a short memory follows it more closely than a long one."""
+    drift = jnp.linspace(0.0, 0.4, 96)[:, None] * push(1.0, 0.0, 0.0)[None]
+    rows = rows_of(drift, key)
+    short, long = (float(fitted(replaced(MODEL, memory=jnp.array(m)), rows)[0].mean[0]) for m in (0.1, 1e9))
+    assert 0.33 < short < 0.4
+    assert 0.15 < long < 0.25
+
+
+@pytest.mark.parametrize("since", [BLOCK, 2 * BLOCK, 5 * BLOCK])
+def test_a_change_is_forgotten_at_once(key, since):
+    """Since a step of 2 m/s^2 on each axis: what lay before it has no say."""
+    n = 96
+    before = (jnp.arange(n) < n - since)[:, None]
+    rows = rows_of(jnp.where(before, push(-1.0, -1.0, -1.0), push(1.0, 1.0, 1.0)), key, noise=0.1)
+    state, _ = fitted(MODEL, rows)
+    np.testing.assert_allclose(state.mean[:3], 1.0, atol=0.2)
+
+
+def test_noise_is_no_change(key):
+    """Of a thousand windows of pure noise of the stated size, nearly all are used as a whole."""
+    model = ENDLESS
+
+    def precision(key):
+        return model.fit(model.init(key), rows_of(jnp.zeros(10), key, noise=0.5))[0].covariance[0, 0]
+
+    found = np.asarray(jax.jit(jax.vmap(precision))(random.split(key, 1000)))
+    whole = np.asarray(fitted(model, rows_of(jnp.zeros(10), key))[0].covariance[0, 0])
+    assert (found < 1.5 * whole).mean() > 0.98
+
+
+@pytest.mark.parametrize(
+    ("field", "parameter", "value", "tolerance"),
+    [
+        (lambda x, u: jnp.array([0.5, -1.0, 2.0]), slice(0, 3), [0.5, -1.0, 2.0], 0.02),
+        (lambda x, u: 0.2 * (u.c - 9.81) * x.R[:, 2], 3, 0.2, 0.03),
+        (lambda x, u: -0.4 * x.v, slice(4, 7), 0.4, 0.1),
+    ],
+    ids=["push", "thrust gain", "drag"],
+)
+def test_known_worlds_are_identified(key, field, parameter, value, tolerance):
+    """From states and commands of a flight, with the delay of the plant; priors made wide, since the data are many."""
+    model = replaced(ENDLESS, prior=10.0 * MODEL.prior, noise=jnp.array(0.05))
+    window = random_field_flight(field, key, n=100, delay_ticks=1)
+    rows = jax.jit(lambda w: residual_targets(w, PointMass(0.02), delay_ticks=1))(window)
+    state, rms = fitted(model, rows)
+    np.testing.assert_allclose(state.mean[parameter], value, atol=tolerance)
+    assert float(rms) < 0.05
+
+
+def test_it_turns_with_the_world(key):
+    """Turned rows give the turned prediction: features are physical, not of the axes."""
+    isotropic = replaced(MODEL, prior=MODEL.prior)
+    Q = so3.exp(random.normal(key, (3,)))
+    rows = rows_of(0.5 * random.normal(key, (10,)) * MODEL.prior, key, noise=0.2)
+    x = jax.vmap(lambda x: type(x)(so3.act(Q, x.p), so3.mul(Q, x.R), so3.act(Q, x.v)))(rows.x)
+    turned = Targets(x, rows.u, rows.a_res @ Q.T, rows.valid)
+    here, there = fitted(isotropic, rows)[0], fitted(isotropic, turned)[0]
+    one = jax.tree.map(lambda leaf: leaf[3], rows.x), jax.tree.map(lambda leaf: leaf[3], rows.u)
+    other = jax.tree.map(lambda leaf: leaf[3], x), one[1]
+    np.testing.assert_allclose(MODEL.predict(there, *other), so3.act(Q, MODEL.predict(here, *one)), atol=1e-9)
+
+
+def test_the_spread_shrinks_with_data(key):
+    x, u = random_state(key), random_command(key)
+    wide = MODEL.spread(MODEL.init(key), x, u)
+    narrow = MODEL.spread(fitted(MODEL, rows_of(jnp.zeros(10), key))[0], x, u)
+    assert (np.asarray(narrow) < 0.2 * np.asarray(wide)).all()
+    assert (np.asarray(narrow) > 0.0).all()
