@@ -36,7 +36,7 @@ def test_pretrain_writes_policy_and_results(folder):
     assert not found["interrupted"]
     assert len(found["losses"]) == 150
     (row,) = found["rows"]
-    assert (row["task"], row["preset"], row["updates"], row["envs"]) == ("hover", "hover/fast", 150, 16)
+    assert (row["task"], row["preset"], row["updates"], row["envs"]) == ("hover", "hover/retrim", 150, 16)
     assert row["loss"] == found["losses"][-1] < found["losses"][0]
     assert 0 < row["nominal_error_m"] < 0.5
     policy, preset = load_policy(folder / "p")
@@ -65,7 +65,7 @@ def test_fly_writes_rows_events_logs_and_pictures(folder):
 
 def test_what_was_learnt_is_kept_and_goes_on(folder):
     state, preset = load_learnt(folder / "f" / "learnt.safetensors")
-    assert preset.name == "hover/fast"
+    assert preset.name == "hover/retrim"
     adapted, _ = load_policy(folder / "f" / "adapted.safetensors")
     np.testing.assert_array_equal(adapted.layers[0].weight, state.policy.policy.layers[0].weight)
     words = "--resume", "f/learnt.safetensors", "--disturbance", "small", "--seconds", "3"
@@ -103,8 +103,8 @@ def test_demo_at_reduced_size(folder, monkeypatch):
     from retrim.config import presets
     from retrim.config.loading import overlaid
 
-    small = overlaid(presets.PRESETS["hover/fast"], folder / "small.toml")
-    monkeypatch.setitem(presets.PRESETS, "hover/fast", small)
+    small = overlaid(presets.PRESETS["hover/retrim"], folder / "small.toml")
+    monkeypatch.setitem(presets.PRESETS, "hover/retrim", small)
     out = retrim("demo", "--seconds", "3", "--starts", "1", "--out", "d", cwd=folder)
     assert "adapted, all weights" in out
     assert [(r["disturbance"], r["method"]) for r in results(folder / "d")["rows"]] == [

@@ -50,14 +50,14 @@ def test_between_training_and_its_score_keeps_the_policy_with_results(folder):
     assert "Traceback" not in out
     found = results(folder / "between")
     assert len(found["losses"]) == found["rows"][0]["updates"] == 150
-    assert load_policy(folder / "between")[1].name == "hover/fast"
+    assert load_policy(folder / "between")[1].name == "hover/retrim"
 
 
 def test_between_training_and_flights_the_demo_keeps_the_policy_with_results(folder):
     # What trains for minutes is cut as soon as its policy is there; the flights are never begun.
     small = (
         "from retrim.config import presets, loading\nfrom pathlib import Path\n"
-        "presets.PRESETS['hover/fast'] = loading.overlaid(presets.PRESETS['hover/fast'], Path('small.toml'))"
+        "presets.PRESETS['hover/retrim'] = loading.overlaid(presets.PRESETS['hover/retrim'], Path('small.toml'))"
     )
     words = "demo", "--starts", "1", "--seconds", "3", "--out", "demo"
     code, out = interrupted(words, folder, after=b"hover error in its own model", setup=small)

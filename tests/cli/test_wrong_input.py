@@ -97,7 +97,7 @@ WRONG = [
     (("reproduce", "reversing", "--seconds", "20"), "flights of 20 s: a push that reverses needs at least 30 s"),
     # names
     (("pretrain", "dance"), "no task 'dance'; there are hover, vision, track"),
-    (("pretrain", "hover", "--preset", "nope"), "no preset 'nope'; there are hover/fast"),
+    (("pretrain", "hover", "--preset", "nope"), "no preset 'nope'; there are hover/retrim"),
     (("pretrain", "track", "--preset", "hover/fast"), "preset 'hover/fast' is for hover, not for track"),
     (("pretrain", "hover", "--vehicle", "nope"), "no vehicle 'nope'; there are small, large, kingfisher"),
     (("pretrain", "hover", "--residual", "nope"), "no residual 'nope'; there are ensemble"),
@@ -165,7 +165,7 @@ WRONG = [
     (("sweep", "size.toml"), "'abc' is not a number"),
     (
         ("sweep", "method.toml"),
-        "a disturbance observer turns the frame about a hover goal, for a policy that sees its state; task 'track'",
+        "a disturbance observer turns the frame about a hover goal, for a policy that sees its state; task 'vision'",
     ),
     (("sweep", "ranks.toml"), "LoRA: 3 ranks (4, 10, 1) for 2 layers"),
     (("sweep", "overlay.toml"), "nonsense: unknown key"),

@@ -78,10 +78,40 @@ def test_several_mistakes_are_all_named():
 
 DEFAULTS = {
     "pretrain": (300, 100, 150, 5e-3, 0.999, None, (512, 512), math.pi),
-    "adapt": (100, "ensemble", 3.0, 100, 1e-2, 1e-3, 5.0, 30, 10, 1e-3, None, 0.2, 1.0),
+    "adapt": (
+        *(100, "ensemble", 0.5, 3.0, 100, 1e-2, 1e-3, 5.0, 30, 10, 1e-3, None, "fresh", None, 0.1, "world"),
+        *(0.2, 1.0),
+    ),
     "rest": ("small", 0.02, (0.0, 0.0, 1.0), 5.0, 0, 0, 1, None),
 }
 OURS = {
+    "hover/retrim": {
+        "reward": "l2",
+        "command_history": 2,
+        "delay_ticks": 1,
+        "pretrain": {
+            "num_updates": 300,
+            "num_envs": 16,
+            "learning_rate": 3e-3,
+            "adam_b2": 0.95,
+            "max_grad_norm": 1.0,
+            "hidden_sizes": (128, 128),
+            "max_start_yaw": 0.1 * math.pi,
+        },
+        "adapt": {
+            "residual": "regression",
+            "fit_every": 0.2,
+            "update_every": 0.5,
+            "num_updates": 5,
+            "learning_rate": 1e-4,
+            "max_grad_norm": 1.0,
+            "optimiser": "carried",
+            "task_starts": 2,
+            "frame": "gravity",
+            "fit_latency": 0.02,
+            "update_latency": 0.1,
+        },
+    },
     "hover/fast": {
         "command_history": 2,
         "delay_ticks": 1,

@@ -12,8 +12,13 @@ from jax import random
 
 from helpers import tiny_preset
 from retrim import ConfigError
+from retrim.adapt.optimisers import CarriedAdam, FreshAdam
+from retrim.adapt.starts import TaskStarts
+from retrim.adapt.views import WorldView
 from retrim.config import PRESETS, Scenario, Setup, changed, load, setup
 from retrim.config.vehicles import make_vehicle
+from retrim.control.controller import PolicyController
+from retrim.control.gravity_frame import GravityFrame
 from retrim.learn import policy_loss
 from retrim.physics.actuators import Lagged
 from retrim.physics.dynamics import PointMass
@@ -71,7 +76,7 @@ def test_the_task_has_the_presets_numbers(built):
         else:
             np.testing.assert_array_equal(task.goal, preset.goal)
             assert float(task.heading) == pytest.approx(preset.pretrain.max_start_yaw)
-    sharp = {"track/preview", "vision/ideal", "vision/occluded"}
+    sharp = {"hover/retrim", "track/preview", "vision/ideal", "vision/occluded"}
     assert (preset.reward == "l2") == (preset.name in sharp)
 
 
@@ -129,13 +134,25 @@ def test_the_learner_has_the_presets_numbers(built):
     assert (a.max_grad_norm is None) == (
         preset.name in ("hover/paper", "hover/released", "track/paper", "vision/paper")
     )
+    assert isinstance(learner.optimiser, CarriedAdam if a.optimiser == "carried" else FreshAdam)
+    if a.task_starts is None:
+        assert isinstance(learner.starts, TaskStarts)
+    else:
+        assert (learner.starts.from_task, float(learner.starts.spread)) == (a.task_starts, a.start_noise)
+    if a.frame == "gravity":
+        np.testing.assert_array_equal(learner.view.pivot, preset.goal)
+    else:
+        assert isinstance(learner.view, WorldView)
+    assert learner.env.task is made.flown
     model = learner.residual_model
+    if a.residual == "regression":
+        assert (float(model.memory), model.dt) == (a.memory, preset.dt)
+        return
     np.testing.assert_array_equal(model.origin, preset.goal)
     np.testing.assert_array_equal(model.omega_max, made.vehicle.omega_max)
     assert float(model.learning_rate) == a.fit_learning_rate == 1e-2
     assert float(model.spectral_weight) == a.spectral_weight == 1e-3
     assert model.steps == a.fit_steps
-    assert learner.env.task is made.flown
 
 
 @pytest.mark.parametrize("latency", ["fixed", "measured"])
@@ -149,9 +166,9 @@ def test_the_pilot_has_the_presets_schedule(built, latency, monkeypatch):
             super().__init__(worker, latency_s, dt)
 
     class Pilot(setup.AdaptivePilot):
-        def __init__(self, observation, state, scheduled, *, dt, window):
-            pilots.append((observation, [each.every_s for each in scheduled], dt, window))
-            super().__init__(observation, state, scheduled, dt=dt, window=window)
+        def __init__(self, controller, state, scheduled, *, dt, window):
+            pilots.append((controller, [each.every_s for each in scheduled], dt, window))
+            super().__init__(controller, state, scheduled, dt=dt, window=window)
 
     monkeypatch.setattr(setup, "LockstepLearner", Learner)
     monkeypatch.setattr(setup, "AdaptivePilot", Pilot)
@@ -161,7 +178,15 @@ def test_the_pilot_has_the_presets_schedule(built, latency, monkeypatch):
         ("residual", a.fit_latency if fixed else None, preset.dt),
         ("policy", a.update_latency if fixed else None, preset.dt),
     ]
-    assert pilots == [(made.flown.observation_in_flight, [a.fit_every, a.update_every], preset.dt, a.window)]
+    ((controller, *numbers),) = pilots
+    assert numbers == [[a.fit_every, a.update_every], preset.dt, a.window]
+    flown = controller(made.new_policy(random.key(0)))
+    if a.frame == "gravity":
+        assert isinstance(flown, GravityFrame)
+        assert flown.observer.delay_ticks == preset.plant_delay_ticks
+        flown = flown.inner
+    assert isinstance(flown, PolicyController)
+    assert flown.observation is made.flown.observation_in_flight
 
 
 def test_methods(built):

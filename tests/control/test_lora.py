@@ -9,9 +9,9 @@ import pytest
 from jax import random
 
 from helpers import hover_env, tiny_preset
-from retrim.adapt import learner as learner_module
 from retrim.adapt.buffer import RollingBuffer
 from retrim.adapt.gate import judge
+from retrim.adapt.starts import drawn
 from retrim.config import Setup
 from retrim.control import LoraPolicy, Policy
 from retrim.control.lora import LowRankFactors
@@ -204,7 +204,7 @@ def test_starts_are_drawn_from_what_was_flown(key):
     buffer = RollingBuffer(5)
     for i in range(3):
         buffer.push(0.02 * (i + 1), State.at(jnp.array([float(i + 1), 0.0, 1.0])), Command.hover())
-    found = learner_module._drawn(buffer.window(), key, 60)
+    found = drawn(buffer.window(), key, (60,))
     np.testing.assert_allclose(found.t, 0.02 * found.x.p[:, 0])
     assert set(np.asarray(found.x.p[:, 0]).tolist()) == {1.0, 2.0, 3.0}
     assert found.x.R.shape == (60, 3, 3)

@@ -38,7 +38,7 @@ def pretrain(
 
     Args:
         task: What the policy learns: hover, track, vision, or module:name of a task of your own.
-        preset: Preset to train with, as hover/fast or hover/paper; by default the task's own.
+        preset: Preset to train with, as hover/retrim or hover/paper; by default the task's own.
         vehicle: Vehicle to train for: small, large, kingfisher, a vehicle file, as my_quad.toml, or module:name.
         reference: What to track: circle, figure8, star, a CSV file, module:name, or a family, as circle+star.
         residual: Residual model of later adaptation: ensemble, or module:name.

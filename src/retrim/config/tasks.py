@@ -183,6 +183,6 @@ def _track(request: TaskRequest) -> AbstractTask:
     )
 
 
-register_task("hover", TaskEntry(_hover, "hover/fast"))
+register_task("hover", TaskEntry(_hover, "hover/retrim"))
 register_task("vision", TaskEntry(_vision, "vision/ideal"))
 register_task("track", TaskEntry(_track, "track/preview", has_reference=True))

@@ -38,7 +38,7 @@ STRICT = ConfigDict(extra="forbid")
 class Sweep:
     """The content of a sweep file."""
 
-    presets: tuple[str, ...] = Field(default=("hover/fast",), min_length=1)
+    presets: tuple[str, ...] = Field(default=("hover/retrim",), min_length=1)
     """Presets to train a policy with, for each seed."""
     seeds: tuple[int, ...] = Field(default=(0,), min_length=1)
     """Training seeds; each also seeds starts, disturbances and learners of its flights."""

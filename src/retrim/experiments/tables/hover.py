@@ -16,7 +16,7 @@ def hover(
     run: Run,
     reporter: Reporter,
     *,
-    presets: tuple[str, ...] = ("hover/fast", "hover/released", "hover/paper"),
+    presets: tuple[str, ...] = ("hover/retrim", "hover/fast", "hover/released", "hover/paper"),
     seeds: tuple[int, ...] = (0, 1, 2),
     seconds: float = 30.0,
     starts: int = 8,

@@ -54,7 +54,7 @@ def plants(
     run: Run,
     reporter: Reporter,
     *,
-    preset: str = "hover/fast",
+    preset: str = "hover/retrim",
     plant: tuple[str, ...] = ("bem", "simple", "rotorpy", "mujoco", "crazyflow"),
     seeds: tuple[int, ...] = (0,),
     seconds: float = 30.0,

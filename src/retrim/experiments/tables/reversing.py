@@ -35,7 +35,7 @@ def reversing(
     run: Run,
     reporter: Reporter,
     *,
-    preset: str = "hover/fast",
+    preset: str = "hover/retrim",
     plant: str = "bem",
     seeds: tuple[int, ...] = (0,),
     seconds: float = 60.0,
