@@ -14,7 +14,7 @@ from typing import Any
 from pydantic import TypeAdapter
 
 import retrim
-from retrim.config.presets import PRESETS
+from retrim.config.named_presets import PRESETS
 
 KEYS = re.compile(r"<!-- keys: (?P<module>[\w.]+):(?P<name>\w+) -->")
 ROLE = re.compile(r":(?:class|func|meth|mod|data|attr):<code>~?(?P<target>[\w.]+)</code>")

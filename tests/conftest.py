@@ -44,7 +44,7 @@ def key():
 @pytest.fixture(scope="module")
 def as_a_user():
     """Single precision and JAX's own rules of promotion, also in threads, as where no test is set up."""
-    from retrim.config.setup import setup_for
+    from retrim.experiments.jobs import setup_for
 
     def configure(values):
         for name, value in values.items():

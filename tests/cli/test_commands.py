@@ -100,7 +100,7 @@ def test_the_default_folder_is_a_new_one_under_runs(folder):
 
 
 def test_demo_at_reduced_size(folder, monkeypatch):
-    from retrim.config import presets
+    from retrim.config import named_presets as presets
     from retrim.config.loading import overlaid
 
     small = overlaid(presets.PRESETS["hover/retrim"], folder / "small.toml")

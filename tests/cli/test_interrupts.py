@@ -56,7 +56,7 @@ def test_between_training_and_its_score_keeps_the_policy_with_results(folder):
 def test_between_training_and_flights_the_demo_keeps_the_policy_with_results(folder):
     # What trains for minutes is cut as soon as its policy is there; the flights are never begun.
     small = (
-        "from retrim.config import presets, loading\nfrom pathlib import Path\n"
+        "from retrim.config import named_presets as presets, loading\nfrom pathlib import Path\n"
         "presets.PRESETS['hover/retrim'] = loading.overlaid(presets.PRESETS['hover/retrim'], Path('small.toml'))"
     )
     words = "demo", "--starts", "1", "--seconds", "3", "--out", "demo"

@@ -1,6 +1,5 @@
 """From a preset's numbers to objects: every number arrives where it acts, for every preset."""
 
-import dataclasses
 import itertools
 import math
 
@@ -311,11 +310,3 @@ def test_a_hundred_hertz_trains_flies_and_adapts():
     np.testing.assert_allclose([e.t for e in log.events if e.kind in ("policy", "rejected")], [1.05])
     before, after = np.linalg.norm(log.p[[0, -1]] - np.array(preset.goal), axis=1)
     assert after < 0.7 * before
-
-
-def test_a_set_up_is_built_once_per_process():
-    from retrim.config.loading import dump
-
-    text = dump(dataclasses.replace(tiny_preset(), name="once"))
-    assert setup.setup_for(text) is setup.setup_for(text)
-    assert setup.setup_for(text).preset.name == "once"

@@ -12,7 +12,7 @@ import pytest
 
 from retrim.cli.main import COMMANDS
 from retrim.config.loading import overlaid
-from retrim.config.presets import PRESETS
+from retrim.config.named_presets import PRESETS
 from retrim.config.vehicle_file import VehicleSpec, read_vehicle
 from retrim.experiments.sweep import Sweep, read_sweep
 

@@ -1,5 +1,6 @@
 """Fleets: the same rows on any executor, progress, and what an interruption keeps."""
 
+import dataclasses
 import multiprocessing
 import signal
 import threading
@@ -11,6 +12,8 @@ import pytest
 
 from helpers import tiny_preset
 from retrim import ConfigError, Fleet, Scenario, Setup, enable_compile_cache, load
+from retrim.config.loading import dump
+from retrim.experiments.jobs import setup_for
 
 pytestmark = pytest.mark.usefixtures("as_a_user")
 
@@ -136,3 +139,10 @@ def test_a_fleet_that_cannot_fly_is_refused(fleet, change, message):
     scenarios, seed = change.pop("scenarios", SCENARIOS), change.pop("seed", 0)
     with pytest.raises(ConfigError, match=message):
         Fleet(load("hover/fast"), {seed: policy}, scenarios, **change)
+
+
+def test_a_process_builds_a_set_up_once_for_a_fleet():
+    text = dump(dataclasses.replace(tiny_preset(), name="once"))
+    assert setup_for(text, None, "a") is setup_for(text, None, "a")
+    assert setup_for(text, None, "a") is not setup_for(text, None, "b")
+    assert setup_for(text).preset.name == "once"

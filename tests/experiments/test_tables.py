@@ -9,7 +9,7 @@ from commands import results, retrim
 from helpers import tiny_preset
 from made_up import DT, flight, log
 from retrim import Scenario, changed, load
-from retrim.config import presets
+from retrim.config import named_presets as presets
 from retrim.config.presets import Adapt
 from retrim.experiments import Run
 from retrim.experiments.reporter import Silent

@@ -15,15 +15,20 @@ Ordered = Callable[[threading.Event], int]
 OUT = "    out: Folder of what is made; a new one under runs/ by default."
 
 
-def _command(make: Callable[..., None]) -> Callable[..., Ordered]:
-    """A command with the keyword-only options of ``make``, and ``out``."""
+def command_of(make: Callable[..., None], called: str = "reproduce") -> Callable[..., Ordered]:
+    """Return a command with the keyword-only options of ``make``, and ``out``.
+
+    Args:
+        make: It makes a document of its own name from a run and a reporter.
+        called: Name of the command, for the folder of its runs.
+    """
     name, signature = make.__name__, inspect.signature(make)
     options = [each for each in signature.parameters.values() if each.kind is Parameter.KEYWORD_ONLY]
     out = Parameter("out", Parameter.KEYWORD_ONLY, default=None, annotation=Path | None)
 
     def command(*, out: Path | None = None, **chosen: Any) -> Ordered:
         def ordered(stop: threading.Event) -> int:
-            run = started(Run("reproduce", out, stop=stop))
+            run = started(Run(called, out, stop=stop))
             make(run, RichReporter(), **chosen)
             show_paths([run.folder / f"{name}.md"])
             return run.exit_code
@@ -38,6 +43,6 @@ def _command(make: Callable[..., None]) -> Callable[..., Ordered]:
 
 
 COMMANDS: dict[str, Callable[..., Ordered]] = {
-    make.__name__: _command(make)
+    make.__name__: command_of(make)
     for make in (tables.hover, tables.reversing, tables.tracking, tables.vision, tables.plants, tables.model)
 }

@@ -8,10 +8,10 @@ from .loading import overlaid as overlaid
 from .methods import MethodEntry as MethodEntry
 from .methods import MethodRequest as MethodRequest
 from .methods import register_method as register_method
+from .named_presets import PRESETS as PRESETS
 from .plants import PlantEntry as PlantEntry
 from .plants import PlantRequest as PlantRequest
 from .plants import register_plant as register_plant
-from .presets import PRESETS as PRESETS
 from .presets import Preset as Preset
 from .residuals import ResidualRequest as ResidualRequest
 from .residuals import register_residual as register_residual

@@ -7,7 +7,7 @@ from jax import random
 from jaxtyping import Array, Key
 
 from ..errors import ConfigError
-from ..physics.disturbance import Constant, Disturbance, RandomWalk, Reversing, Together
+from ..physics.disturbance import Constant, Disturbance, RandomWalk, Reversing, Step, Together
 from ..physics.faults import BatterySag, Payload, WeakRotor
 from ..physics.wind import Dryden, Fan, SteadyWind
 from .registry import Registry
@@ -81,6 +81,7 @@ _BUILT_IN: dict[str, DisturbanceFactory] = {
     "small": _push(0.5),  # the paper's levels, m/s^2 per axis (Sec. IV-B)
     "large": _push(2.0),
     "push": _push(None),
+    "step": lambda key, size: Step(jnp.full(3, _bounded(size, 2.0, -10.0, 10.0, "m/s^2")), jnp.array(8.0)),
     "reversing": lambda key, size: Reversing(  # Sec. IV-B.3
         jnp.full(3, _bounded(size, 0.5, -10.0, 10.0, "m/s^2")), jnp.array(15.0)
     ),

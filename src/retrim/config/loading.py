@@ -7,7 +7,8 @@ from typing import Any
 from pydantic import TypeAdapter
 
 from ..errors import ConfigError
-from .presets import BUILT_IN_TASKS, PRESETS, Preset
+from .named_presets import PRESETS
+from .presets import BUILT_IN_TASKS, Preset
 from .validation import read_toml, suggestion, validated
 from .vehicle_file import read_vehicle
 

@@ -1,17 +1,15 @@
-"""Every number of an experiment, once: named presets as plain, validated values.
+"""Every number of an experiment, once, as plain, validated values; :mod:`.named_presets` has those with a name.
 
 A preset is a tree of frozen dataclasses. A TOML file and then command-line flags may overlay it; an unknown name or an
 impossible value is an error that gives its path.
 """
 
-import dataclasses
 import math
 from typing import Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field, FiniteFloat, Strict, model_validator
 from pydantic.dataclasses import dataclass
 
-from ..tasks.hover import TILT
 from .vehicle_file import VehicleSpec
 
 STRICT = ConfigDict(extra="forbid")
@@ -160,93 +158,3 @@ class Preset:
         if self.adapt.window < self.plant_delay_ticks + 12:
             raise ValueError(f"adapt.window = {self.adapt.window} is too short for plant_delay_ticks")
         return self
-
-
-TRACK = Preset(
-    name="track/preview",
-    task="track",
-    reward="l2",
-    command_history=2,
-    delay_ticks=1,
-    actuator_tau=0.033,
-    track=Track(reference="circle+figure8+star", observation="preview"),
-    pretrain=Pretrain(num_updates=600, num_envs=32, horizon=100, learning_rate=3e-3, max_grad_norm=1.0),
-    adapt=Adapt(window=250, max_grad_norm=1.0),
-)
-
-VISION = Preset(
-    name="vision/ideal",
-    task="vision",
-    reward="l2",
-    delay_ticks=1,
-    vision=Vision(pixel_noise=0.5, whiten_pixels=True, encoder_steps=3000),
-    pretrain=Pretrain(
-        num_updates=300, num_envs=16, learning_rate=3e-3, adam_b2=0.95, max_grad_norm=1.0, hidden_sizes=(256, 256),
-        max_start_yaw=TILT,
-    ),
-    adapt=Adapt(max_grad_norm=1.0),
-)  # fmt: skip
-
-FAST = Preset(
-    name="hover/fast",
-    command_history=2,
-    delay_ticks=1,
-    pretrain=Pretrain(num_updates=150, num_envs=16, adam_b2=0.95, max_grad_norm=1.0, max_start_yaw=TILT),
-    adapt=Adapt(max_grad_norm=1.0),
-)
-
-RETRIM = dataclasses.replace(
-    FAST,
-    name="hover/retrim",
-    reward="l2",
-    pretrain=dataclasses.replace(FAST.pretrain, num_updates=300, learning_rate=3e-3, hidden_sizes=(128, 128)),
-    adapt=Adapt(
-        residual="regression", fit_every=0.2, update_every=0.5, num_updates=5, learning_rate=1e-4, max_grad_norm=1.0,
-        optimiser="carried", task_starts=2, frame="gravity", fit_latency=0.02, update_latency=0.1,
-    ),
-)  # fmt: skip
-
-PRESETS: dict[str, Preset] = {
-    # Ours: the frame of the gravity that is felt answers in a second, short bursts of learning take what it leaves.
-    "hover/retrim": RETRIM,
-    # The paper's loop with one tick of delay, the last two commands, and a small budget that reaches the same error.
-    "hover/fast": FAST,
-    # The delay and the observation of the authors' code: 2 ticks, the last three commands, 200 x 200 x 150.
-    "hover/released": Preset(
-        name="hover/released", command_history=3, delay_ticks=2, pretrain=Pretrain(num_updates=200, num_envs=200)
-    ),
-    # As printed: o = [p, R, v], no delay in the model, 300 x 100 x 150.
-    "hover/paper": Preset(),
-    # hover/fast at 100 Hz: the same times, twice the ticks.
-    "hover/100hz": dataclasses.replace(
-        FAST,
-        name="hover/100hz",
-        dt=0.01,
-        command_history=4,
-        delay_ticks=2,
-        plant_delay_ticks=2,
-        pretrain=dataclasses.replace(FAST.pretrain, horizon=300),
-        adapt=dataclasses.replace(FAST.adapt, window=200),
-    ),
-    # Ours: the reference seen ahead, a sharp reward, one tick of delay and actuator lag in the model.
-    "track/preview": TRACK,
-    # Tracking as printed: the policy sees p, R, v and never its reference. Five seconds of flight are remembered.
-    "track/paper": Preset(name="track/paper", task="track", track=Track(start_spread=0.3), adapt=Adapt(window=250)),
-    # Seven points on the ground, five frames, three commands, no state; every point is observed, as in the paper.
-    "vision/ideal": VISION,
-    # The same, but points outside the image are not observed; pixels are noisy and some points are missed.
-    "vision/occluded": dataclasses.replace(
-        VISION,
-        name="vision/occluded",
-        vision=Vision(occlusion=True, pixel_noise=1.0, dropout=0.05, whiten_pixels=True, encoder_steps=3000),
-    ),
-    # The paper's sizes: raw pixels, 500 x 300, updates of 50 steps x 30 environments.
-    "vision/paper": Preset(
-        name="vision/paper",
-        task="vision",
-        delay_ticks=1,
-        vision=Vision(encoder_steps=3000),
-        pretrain=Pretrain(num_updates=500, num_envs=300, learning_rate=1e-3, max_start_yaw=TILT),
-        adapt=Adapt(num_updates=50, num_envs=30, update_latency=5.0),
-    ),
-}

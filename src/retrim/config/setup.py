@@ -1,6 +1,5 @@
 """From a preset's numbers to objects, built once."""
 
-import functools
 import math
 from collections import deque
 from collections.abc import Iterator
@@ -37,7 +36,6 @@ from ..tasks.keypoints import Keypoints
 from ..tasks.reference import Reference
 from ..tasks.task import AbstractTask
 from .learners import check_frame, gravity_frame, make_learner
-from .loading import parse
 from .presets import Preset
 from .residuals import ResidualRequest, make_residual
 from .tasks import TaskRequest, find_task, make_reference
@@ -245,19 +243,6 @@ class Setup:
         """
         followed = getattr(self.flown, "reference", None)
         return followed.infeasibility(vehicle or self.vehicle) if isinstance(followed, Reference) else None
-
-
-@functools.lru_cache(maxsize=16)
-def setup_for(preset: str, reference: str | None = None, fleet: str = "") -> Setup:
-    """Return a set-up, built once per process and fleet, for executors with other processes.
-
-    Args:
-        preset: As JSON.
-        reference: What is flown, by name.
-        fleet: Tells fleets apart: between two of them a file of a reference may have changed.
-    """
-    del fleet
-    return Setup.of(parse(preset, source="preset"), reference)
 
 
 @jax.jit

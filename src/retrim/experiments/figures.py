@@ -6,11 +6,9 @@ from functools import partial
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..config.disturbances import disturbance
 from ..config.scenario import Scenario
 from ..config.setup import Setup
 from ..physics.effects import ExternalEffects
@@ -19,6 +17,7 @@ from ..tasks.keypoints import Keypoints
 from ..tasks.track import AbstractTrack
 from ..viz import plots
 from .flights import Flight
+from .recovery import timeline
 
 
 def picture(
@@ -67,15 +66,11 @@ def picture(
 
 def spans(name: str, home: Array, seconds: float) -> list[plots.Span]:
     """Return when something disturbs the flight, and what; one span for all that changes all the time."""
-    times = np.linspace(0.0, seconds, round(10 * seconds), endpoint=False)
-    acting, x = disturbance(name), State.at(home)
-    found = jax.vmap(lambda t: acting(t, x))(jnp.asarray(times, dtype=x.p.dtype))
-    values = np.concatenate([np.asarray(leaf).reshape(len(times), -1) for leaf in jax.tree.leaves(found)], axis=1)
-    edges = [0, *(np.flatnonzero(np.any(np.diff(values, axis=0) != 0, axis=1)) + 1), len(times)]
-    if len(edges) > 12:
+    times, found, changes = timeline(name, home, seconds)
+    if len(changes) > 10:
         return [plots.Span(0.0, seconds, name, strong=False)]
     marked = []
-    for first, after in itertools.pairwise(edges):
+    for first, after in itertools.pairwise([0, *changes, len(times)]):
         end = float(times[after]) if after < len(times) else seconds
         here: ExternalEffects = jax.tree.map(lambda leaf, i=first: np.asarray(leaf)[i], found)
         if label := _label(here):

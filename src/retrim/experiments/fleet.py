@@ -14,15 +14,14 @@ from ..adapt.learner import LearnerState
 from ..config.loading import dump
 from ..config.presets import Preset
 from ..config.scenario import Scenario
-from ..config.setup import Latency, Setup, setup_for
-from ..control.lora import LoraPolicy
+from ..config.setup import Latency, Setup
 from ..control.policy import Policy
 from ..errors import ConfigError
-from ..physics.state import State
 from ..plants.plant import Measurement
 from ..runtime.flight import FlightStopped
 from .flights import Flight, FlightSpec, fly_one
 from .interrupts import interrupts_only_set
+from .jobs import Job, fly_job
 from .limits import check_flights, check_seeds
 from .metrics import Rows, rows
 from .provenance import cores
@@ -157,7 +156,9 @@ class Fleet:
         futures: dict[FlightSpec, Future[Flight]] = {}
         try:
             for spec in specs:
-                futures[spec] = self._submit(executor, spec, stop) if shared else executor.submit(_job, self._job(spec))
+                futures[spec] = (
+                    self._submit(executor, spec, stop) if shared else executor.submit(fly_job, self._job(spec))
+                )
             for done, future in enumerate(as_completed(futures.values()), start=1):
                 future.result()
                 if progress is not None:
@@ -193,28 +194,7 @@ class Fleet:
             stop=stop,
         )
 
-    def _job(self, spec: FlightSpec) -> "Job":
+    def _job(self, spec: FlightSpec) -> Job:
         x0 = self._starts[spec.scenario.reference, spec.seed][spec.start]
         policy, preset = self.policies[spec.seed], dump(self.preset)
         return Job(self._id, preset, policy, spec, x0, self.seconds, self._latency, self._state)
-
-
-@dataclass(frozen=True)
-class Job:
-    """Everything that one flight needs, in a form that can be sent to another process."""
-
-    fleet: str
-    """Which fleet it belongs to."""
-    preset: str
-    policy: Policy | LoraPolicy
-    spec: FlightSpec
-    x0: State
-    seconds: float
-    latency: Latency
-    state: LearnerState | None
-
-
-def _job(job: Job) -> Flight:
-    """Fly a job, in another process."""
-    setup: Setup = setup_for(job.preset, job.spec.scenario.reference, job.fleet)
-    return fly_one(setup, job.policy, job.spec, job.x0, job.seconds, latency=job.latency, state=job.state)

@@ -56,6 +56,18 @@ class Constant(eqx.Module):
         return ExternalEffects.of(x.p.dtype, push=self.a)
 
 
+class Step(eqx.Module):
+    """An acceleration that sets in at a time and stays."""
+
+    a: Float[Array, "3"]
+    since: Float[Array, ""]
+    """[s]"""
+
+    def __call__(self, t: Float[Array, ""], x: State) -> ExternalEffects:
+        """Return no push before ``since``, ``a`` [m/s^2] from then on."""
+        return ExternalEffects.of(x.p.dtype, push=jnp.where(t >= self.since, self.a, jnp.zeros_like(self.a)))
+
+
 class Reversing(eqx.Module):
     """``+a`` and ``-a`` by turns, reversed every ``period`` seconds (paper, Sec. IV-B.3: every 15 s)."""
 

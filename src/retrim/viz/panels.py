@@ -64,6 +64,34 @@ def panel_figure(title: str, panels: Sequence[Panel], *, across: int = 3) -> Fig
     return figure
 
 
+def heat_map(titles: Sequence[str], rows: Sequence[str], columns: Sequence[str], values: np.ndarray) -> Figure:
+    """Draw tables of figures as colours, one beside the other; dark is large, each on its own logarithmic scale.
+
+    Args:
+        titles: One for each table.
+        rows: Labels.
+        columns: Labels.
+        values: Tables x rows x columns, not negative; infinity is written as such, NaN is left white.
+    """
+    with plt.rc_context({"font.size": 9, "svg.fonttype": "none"}):
+        size = (2.6 + len(titles) * (0.6 + 0.75 * len(columns)), 1.2 + 0.3 * len(rows))
+        figure, grid = plt.subplots(1, len(titles), figsize=size, layout="constrained", squeeze=False, sharey=True)
+        for axes, title, table in zip(grid.flat, titles, values, strict=True):
+            finite = table[np.isfinite(table)]
+            top = max(finite.max(initial=1e-3), 1e-3)
+            shade = np.log10(np.clip(np.where(np.isinf(table), top, table), 1e-3 * top, top))
+            axes.imshow(shade, cmap="Blues", aspect="auto", vmin=np.log10(1e-3 * top), vmax=np.log10(top) + 0.5)
+            for i, j in np.ndindex(table.shape):
+                if not np.isnan(table[i, j]):
+                    text = "∞" if np.isinf(table[i, j]) else f"{table[i, j]:.3g}"
+                    dark = shade[i, j] > np.log10(top) - 0.5
+                    axes.text(j, i, text, ha="center", va="center", color="white" if dark else INK, fontsize=8)
+            axes.set_xticks(range(len(columns)), columns, rotation=30, ha="right")
+            axes.set_yticks(range(len(rows)), rows)
+            axes.set_title(title, fontsize=10, color=INK)
+    return figure
+
+
 def bars(title: str, groups: dict[str, dict[str, list[float]]]) -> Figure:
     """Draw one group of bars per label and one bar per method: the mean, and a dot for each flight.
 

@@ -36,7 +36,7 @@ class TableSection:
 
 @dataclass
 class Document:
-    """``<name>.md`` and ``<name>.json`` in the folder of a run. Every section is written when it is added."""
+    """``<name>.md`` and a JSON file in the folder of a run. Every section is written when it is added."""
 
     run: Run
     name: str
@@ -46,6 +46,8 @@ class Document:
     reporter: Reporter
     more: dict[str, Any] = field(default_factory=dict)
     """Further values for the JSON file."""
+    data: str | None = None
+    """Name of the JSON file; that of the document by default."""
     sections: list[TableSection] = field(default_factory=list)
     """What was added."""
     _rows: list[dict[str, Any]] = field(default_factory=list)
@@ -64,5 +66,5 @@ class Document:
         head += [f"Commit {commit()}; {describe_hardware()}; training seeds {seeds}.", ""]
         body = [line for section in self.sections for line in section.markdown()]
         foot = self.run.watch.sentence() + (" Interrupted: incomplete." if self.run.interrupted else "")
-        self.run.write_results(self._rows, seeds=self.seeds, name=self.name, **self.more)
+        self.run.write_results(self._rows, seeds=self.seeds, name=self.data or self.name, **self.more)
         return self.run.write_text(f"{self.name}.md", "\n".join([*head, *body, foot, ""]))

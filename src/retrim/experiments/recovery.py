@@ -1,0 +1,68 @@
+"""When a disturbance changes, and how soon a flight has recovered from it."""
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ..config.disturbances import disturbance
+from ..physics.effects import ExternalEffects
+from ..physics.state import State
+
+STEP = 0.1  # [s], between samples of a disturbance
+FEW = 10  # a disturbance with more changes in a flight changes all the time
+
+
+def timeline(name: str, home: Array, seconds: float) -> tuple[np.ndarray, ExternalEffects, list[int]]:
+    """Sample what a disturbance does at a place.
+
+    Args:
+        name: Disturbance.
+        home: Where, world [m].
+        seconds: For how long.
+
+    Returns:
+        Times [s], the effects at each (leading axis), and the samples at which they differ from the one before.
+    """
+    times = np.linspace(0.0, seconds, round(seconds / STEP), endpoint=False)
+    acting, x = disturbance(name), State.at(home)
+    found: ExternalEffects = jax.vmap(lambda t: acting(t, x))(jnp.asarray(times, dtype=x.p.dtype))
+    values = np.concatenate([np.asarray(leaf).reshape(len(times), -1) for leaf in jax.tree.leaves(found)], axis=1)
+    changes = np.flatnonzero(np.any(np.diff(values, axis=0) != 0, axis=1)) + 1
+    return times, found, changes.tolist()
+
+
+def change_times(name: str, home: Array, seconds: float) -> list[float]:
+    """Return when a disturbance changes in flight [s]; nothing for one that does all the time, or never."""
+    times, _, changes = timeline(name, home, seconds)
+    return [float(times[i]) for i in changes] if len(changes) <= FEW else []
+
+
+def recoveries(
+    t: np.ndarray, error: np.ndarray, changes: Sequence[float], limit: float, *, terminated: bool = False
+) -> list[float]:
+    """Return how long after each change the error stays below ``limit`` until the next [s].
+
+    Args:
+        t: Times of a flight [s].
+        error: Its error at each [m].
+        changes: When the world changed [s].
+        limit: [m]
+        terminated: The flight was; it has not recovered.
+
+    Returns:
+        One time for each change, infinite where the limit is exceeded at the end; without changes, one time from the
+        start of the flight.
+    """
+    starts = list(changes) or [0.0]
+    found = list[float]()
+    for start, end in zip(starts, [*starts[1:], np.inf], strict=True):
+        rows = (t >= start - 1e-6) & (t < end - 1e-6)
+        outside = error[rows] >= limit
+        if terminated or not len(outside) or outside[-1]:
+            found.append(float("inf"))
+        else:
+            found.append(float(t[rows][np.flatnonzero(outside)[-1] + 1] - start) if outside.any() else 0.0)
+    return found

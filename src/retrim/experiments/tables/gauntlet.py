@@ -1,0 +1,202 @@
+"""The gauntlet: one hover policy under everything that changes."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ...config.methods import find_method
+from ...config.scenario import Scenario
+from ...config.setup import Setup
+from ...errors import ConfigError, PlantError
+from ...viz import plots
+from ...viz.panels import Curve, Panel, heat_map, panel_figure
+from ..flights import Flight
+from ..recovery import change_times, recoveries
+from ..reporter import Reporter
+from ..run import Run
+from .document import Document, TableSection
+from .study import fly_all, table_presets, train_all
+
+METRICS = ("steady", "late", "peak", "recovery_5cm", "recovery_2cm")
+UNITS = ("[m]", "[m]", "[m]", "[s]", "[s]")
+LATE = 5.0  # [s]: what happens before is the flight to the goal
+INTRO = """\
+Made by `retrim gauntlet`. Hover, small quadrotor on plant `bem` unless the row says otherwise. steady: mean error over
+the last 2 s; late: mean error after 5 s; peak: largest error after 5 s; recovery: time after a change of the world
+until the error stays below 5 or 2 cm (without a change: from the start, 1 m away). Means over flights, and the worst in
+brackets; a flight that crashed, or did not recover, is infinite (∞). Learning is charged to flight time by the preset's
+fixed latencies."""
+
+
+def conditions() -> dict[str, Scenario]:
+    """Return what is flown, by name; a function, since scenarios are checked when they are made."""
+    return {
+        "none": Scenario(),
+        "small": Scenario("small"),
+        "large": Scenario("large"),
+        "step": Scenario("step"),
+        "reversing": Scenario("reversing"),
+        "gusts": Scenario("gusts"),
+        "fan": Scenario("fan"),
+        "walk": Scenario("walk"),
+        "pickup": Scenario("pickup"),
+        "battery": Scenario("battery"),
+        "weak-rotor": Scenario("weak-rotor"),
+        "all": Scenario("wind+payload+battery+weak-rotor"),
+        "thrust+20": Scenario("step", thrust_error=0.2),
+        "thrust-20": Scenario("step", thrust_error=-0.2),
+        "none/mocap": Scenario(sensors="mocap"),
+        "none/rough": Scenario(sensors="rough"),
+        "step/rough": Scenario("step", sensors="rough"),
+        "gusts/rough": Scenario("gusts", sensors="rough"),
+        "step/large-quadrotor": Scenario("step", vehicle="large"),
+        "step/kingfisher": Scenario("step", vehicle="kingfisher"),
+        "wind/simple": Scenario("wind", plant="simple"),
+        "wind/rotorpy": Scenario("wind", plant="rotorpy"),
+        "wind/mujoco": Scenario("wind", plant="mujoco"),
+        "wind/crazyflow": Scenario("wind", plant="crazyflow"),
+    }
+
+
+def gauntlet(
+    run: Run,
+    reporter: Reporter,
+    *,
+    preset: str = "hover/retrim",
+    only: tuple[str, ...] = (),
+    methods: tuple[str, ...] = ("base", "base-i", "base-do", "full"),
+    seeds: tuple[int, ...] = (0,),
+    seconds: float = 30.0,
+    starts: int = 4,
+) -> None:
+    """Hover under everything that changes: recovery, steady and worst error of every method, as one heat map.
+
+    Args:
+        run: Folder of gauntlet.md, results.json and the pictures.
+        reporter: Receives progress and the table.
+        preset: A preset for hover, to train with.
+        only: Conditions to fly; all by default. One whose plant is not installed is left out, with a line.
+        methods: How the policies fly.
+        seeds: Training seeds; each also seeds the starts, the gusts and the learners of its flights.
+        seconds: Length of a flight [s].
+        starts: Flights per condition, method and seed.
+    """
+    (loaded,) = table_presets([preset], "hover", seeds=seeds, starts=starts, seconds=seconds)
+    known = conditions()
+    if unknown := [name for name in only if name not in known]:
+        raise ConfigError(f"no condition {unknown[0]!r}; there are {', '.join(known)}")
+    for method in methods:
+        find_method(method)
+    document = Document(run, "gauntlet", "The gauntlet", INTRO, seeds, reporter, data="results")
+    study = train_all(loaded, seeds, run, reporter)
+    home, flown, left_out = Setup.of(loaded).flown.home(), dict[str, list[Flight]](), list[str]()
+    found = list[dict[str, Any]]()
+    for name in only or known:
+        if run.interrupted:
+            break
+        try:
+            reporter.say(f"condition {name}")
+            flights = fly_all(
+                study, [known[name]], run, reporter, methods=methods, starts=starts, seconds=seconds
+            ).flown
+        except PlantError as error:
+            left_out.append(f"{name}: {error}")
+            continue
+        if flights:
+            flown[name] = flights
+            found += rows_of(name, flights, change_times(known[name].disturbance, home, seconds))
+            run.write_results(found, seeds=seeds)  # a kill loses one condition
+    if found:
+        document.add(_section(found, methods, flown, run, study.about(), left_out), found)
+    document.write()
+
+
+def rows_of(name: str, flights: Sequence[Flight], changes: Sequence[float]) -> list[dict[str, Any]]:
+    """Return a row for each method and metric of a condition.
+
+    Args:
+        name: The condition.
+        flights: Its flights.
+        changes: When its world changed [s].
+    """
+    found = list[dict[str, Any]]()
+    for method in dict.fromkeys(flight.spec.method for flight in flights):
+        group = [flight for flight in flights if flight.spec.method == method]
+        values = {
+            "steady": [np.inf if f.log.terminated else f.steady for f in group],
+            "late": [np.inf if f.log.terminated else float(f.error[f.log.t > LATE].mean()) for f in group],
+            "peak": [f.peak for f in group],
+            "recovery_5cm": [each for f in group for each in _recoveries(f, changes, 0.05)],
+            "recovery_2cm": [each for f in group for each in _recoveries(f, changes, 0.02)],
+        }
+        scenario = group[0].spec.scenario
+        for metric in METRICS:
+            mean, worst = float(np.mean(values[metric])), float(np.max(values[metric]))
+            found.append(
+                {
+                    "scenario": name,
+                    "method": method,
+                    "metric": metric,
+                    "value": mean if np.isfinite(mean) else None,
+                    "worst": worst if np.isfinite(worst) else None,
+                    "n": len(group),
+                    "crashes": sum(f.log.terminated for f in group),
+                    "disturbance": scenario.disturbance,
+                    "plant": scenario.plant,
+                    "vehicle": group[0].vehicle,
+                    "sensors": scenario.sensors,
+                    "thrust_error": scenario.thrust_error,
+                }
+            )
+    return found
+
+
+def _recoveries(flight: Flight, changes: Sequence[float], limit: float) -> list[float]:
+    return recoveries(flight.log.t, flight.error, changes, limit, terminated=flight.log.terminated)
+
+
+def _section(
+    found: Sequence[dict[str, Any]],
+    methods: Sequence[str],
+    flown: dict[str, list[Flight]],
+    run: Run,
+    about: str,
+    left_out: Sequence[str],
+) -> TableSection:
+    by = {(row["scenario"], row["method"], row["metric"]): row for row in found}
+    lines, names = list[tuple[str, ...]](), list(flown)
+    for name in names:
+        for method in methods:
+            rows = [by[name, method, metric] for metric in METRICS if (name, method, metric) in by]
+            if rows:
+                crashed = f"{rows[0]['crashes']} of {rows[0]['n']}"
+                lines.append((name, find_method(method).label, *map(_cell, rows), crashed))
+    columns = tuple(f"{metric} {unit}" for metric, unit in zip(METRICS, UNITS, strict=True))
+    shown = ("late", "peak", "recovery_2cm")
+    values = [[[_value(by.get((name, m, metric))) for m in methods] for name in names] for metric in shown]
+    drawn = plots.save(heat_map(shown, names, methods, np.array(values)), run.folder, "gauntlet")
+    plots.save(_best_and_worst(flown), run.folder, "gauntlet_flights")
+    notes = "".join(f" Left out: {line}" for line in left_out)
+    return TableSection(("condition", "method", *columns, "crashed"), tuple(lines), "", about + notes, drawn[0])
+
+
+def _value(row: dict[str, Any] | None) -> float:
+    return np.nan if row is None else np.inf if row["value"] is None else row["value"]
+
+
+def _cell(row: dict[str, Any]) -> str:
+    value, worst = ("∞" if row[key] is None else f"{row[key]:.3f}" for key in ("value", "worst"))
+    return f"{value} ({worst})"
+
+
+def _best_and_worst(flown: dict[str, list[Flight]]) -> Any:
+    """Time lines of the flights with the smallest and the largest peak of the last method, beside the base policy's."""
+    last = [(name, f) for name, flights in flown.items() for f in flights if f.spec.method == flights[-1].spec.method]
+    ranked = sorted(last, key=lambda pair: pair[1].peak)
+    panels = []
+    for title, (name, flight) in (("best", ranked[0]), ("worst", ranked[-1])):
+        same = [f for f in flown[name] if (f.spec.start, f.spec.seed) == (flight.spec.start, flight.spec.seed)]
+        curves = [Curve(f.log.t, 1000 * f.error, f.spec.method) for f in same]
+        panels.append(Panel(f"{title}: {name}, start {flight.spec.start}", "time [s]", "error [mm]", curves))
+    return panel_figure("The best and the worst flight", panels, across=2)
