@@ -15,6 +15,9 @@ from retrim.adapt import OnlineLearner, RollingBuffer, Verdict
 from retrim.adapt import learner as module
 from retrim.adapt.optimisers import CarriedAdam, FreshAdam
 from retrim.config import Setup
+from retrim.learn import PolicyState, bptt
+from retrim.learn.pretrain import random_starts
+from retrim.learn.residuals import FittedResidual
 from retrim.physics import Command, PointMass, State
 
 pytestmark = pytest.mark.usefixtures("optax_promotion")
@@ -136,6 +139,29 @@ def test_a_carried_adam_has_a_constant_rate_and_goes_on():
     one = optimiser.transformation(1)
     change, _ = one.update(jnp.array([3.0, -0.2, 0.01]), one.init(params), params)
     np.testing.assert_allclose(change, [-0.01, 0.01, -0.01], rtol=1e-5)
+
+
+def test_the_papers_update_is_untouched_by_the_levers(setup, window, key):
+    """Written out by hand: task starts, a fresh Adam along a cosine, the world as it is."""
+    learner = setup.learner
+    state = learner.init(setup.new_policy(key), key)
+    trained, _ = learner.update_policy(state.policy, state.residual, window, random.key(8))
+
+    @eqx.filter_jit
+    def by_hand(policy, residual):
+        schedule = optax.cosine_decay_schedule(1.0, learner.num_updates)
+        adam = optax.chain(
+            optax.clip_by_global_norm(setup.preset.adapt.max_grad_norm),
+            optax.scale_by_adam(),
+            optax.scale_by_schedule(lambda step: -setup.preset.adapt.learning_rate * schedule(step)),
+        )
+        x0 = random_starts(setup.flown, random.split(random.key(8), 3)[0], learner.num_updates, learner.num_envs)
+        env = setup.env.with_residual(FittedResidual(learner.residual_model, residual))
+        return bptt(PolicyState(policy, adam.init(policy.params)), env, x0, optimiser=adam)[0]
+
+    expected = by_hand(state.policy.policy, state.residual)
+    for found, wanted in zip(trained.policy.layers, expected.policy.layers, strict=True):
+        np.testing.assert_allclose(found.weight, wanted.weight, rtol=1e-9, atol=1e-12)
 
 
 def test_each_update_starts_a_fresh_optimiser(setup, window, key):

@@ -50,8 +50,8 @@ def fly(
         resume: Instead of a policy: a learnt.safetensors of an earlier flight (policy, residual, optimiser states),
             to go on from.
         delta: A low-rank delta.safetensors of an earlier flight, to put on the policy.
-        disturbance: What disturbs the flight: none, small, large, push, reversing, walk, wind, gusts, fan, payload,
-            pickup, battery, weak-rotor, with a size, as wind=6 [m/s] or payload=0.2 [kg], several at once, as
+        disturbance: What disturbs the flight: none, small, large, push, step, reversing, walk, wind, gusts, fan,
+            payload, pickup, battery, weak-rotor, with a size, as wind=6 [m/s] or payload=0.2 [kg], several at once, as
             wind+payload=0.1, or module:name.
         plant: bem: blade-element rotors; simple: rotors with linear drag; rotorpy, mujoco, crazyflow: independent
             simulators, each an extra to install; or module:name.
@@ -65,7 +65,7 @@ def fly(
         sensors: What the policy is shown of the state: ideal, mocap (0.3 mm, 3 mm/s, 1 mrad), rough (1 mm, 10 mm/s,
             3 mrad, 10 ms late, 5 % of the samples lost), or module:name.
         thrust_error: By how much more than commanded the rotors give, as a share (bem and simple).
-        residual: Residual model: ensemble, or module:name.
+        residual: Residual model: ensemble, regression, or module:name.
         config: TOML file that overlays the policy's own preset, for example with a table [adapt].
         latency: fixed: learning costs the preset's flight time, so that a run repeats bit for bit; measured: what the
             clock says.
