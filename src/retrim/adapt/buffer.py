@@ -1,6 +1,7 @@
 """Rolling buffer of the last seconds of flight."""
 
 from collections import deque
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +17,9 @@ class RollingBuffer:
     def __init__(self, size: int) -> None:
         if size < 2:
             raise ValueError(f"RollingBuffer: size = {size} must be at least 2, for one difference of velocity")
-        self._rows: deque[tuple[float, State, Command]] = deque(maxlen=size)
+        # Leaves in NumPy: a tick is converted once, and not for every window that it is part of.
+        self._rows: deque[tuple[float, list[np.ndarray]]] = deque(maxlen=size)
+        self._structure: Any = None
         self._size = size
 
     def __len__(self) -> int:
@@ -24,12 +27,14 @@ class RollingBuffer:
 
     def push(self, t: float, x: State, u: Command) -> None:
         """Append the measured state at the tick of time ``t`` [s] and the command issued at it."""
-        self._rows.append((t, x, u))
+        leaves, self._structure = jax.tree.flatten((x, u))
+        self._rows.append((t, [np.asarray(leaf) for leaf in leaves]))
 
     def accepted(self, u: Command) -> None:
         """Replace the last command by the one that the plant accepted."""
-        t, x, _ = self._rows.pop()
-        self._rows.append((t, x, u))
+        late = [np.asarray(leaf) for leaf in jax.tree.leaves(u)]
+        _, leaves = self._rows[-1]
+        leaves[-len(late) :] = late
 
     def clear(self) -> None:
         """Forget everything."""
@@ -45,7 +50,7 @@ class RollingBuffer:
             raise ValueError("RollingBuffer: no tick was pushed yet")
         missing = self._size - len(self._rows)
         rows = [self._rows[0]] * missing + list(self._rows)
-        pairs = [(x, u) for _, x, u in rows]
-        x, u = jax.tree.map(lambda *leaves: jnp.asarray(np.stack([np.asarray(leaf) for leaf in leaves])), *pairs)
-        t = jnp.asarray(np.array([t for t, _, _ in rows]), dtype=x.p.dtype)
+        columns = zip(*(leaves for _, leaves in rows), strict=True)
+        x, u = jax.tree.unflatten(self._structure, [jnp.asarray(np.stack(column)) for column in columns])
+        t = jnp.asarray(np.array([t for t, _ in rows]), dtype=x.p.dtype)
         return Window(t, x, u, jnp.arange(self._size) >= missing)
