@@ -94,8 +94,12 @@ def _errors(axes: Axes, base: list[Track], adapted: list[Track], spans: list[Spa
             bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 2},
         )  # fmt: skip
     swaps = sorted({round(t, 2) for track in adapted for t in track.swaps})
+    few = len(swaps) <= 12  # many would hide the flights: they are marked along the axis of time
     for i, t in enumerate(swaps):
-        axes.axvline(t, color=UPDATE, linestyle="--", linewidth=1.2, label=None if i else "new policy takes over")
+        axes.axvline(
+            t, ymax=1.0 if few else 0.03, color=UPDATE, linestyle="--" if few else "-", linewidth=1.2,
+            label=None if i else "new policy takes over",
+        )  # fmt: skip
     for tracks, color, name in ((base, BASE, "base policy"), (adapted, ADAPTED, "adapted in flight")):
         for i, track in enumerate(tracks):
             label = f"{name}: single flights" if len(tracks) > 1 and i == 0 else None
