@@ -30,6 +30,9 @@ def effects(name, t=0.0, seed=0):
         ("small", 3.0, 0.5),
         ("large", 3.0, 2.0),
         ("push", 0.0, 1.0),
+        ("step", 7.9, 0.0),
+        ("step", 8.0, 2.0),
+        ("step=-1", 29.0, -1.0),
         ("push=-3", 0.0, -3.0),
         ("reversing", 14.9, 0.5),
         ("reversing", 15.1, -0.5),
@@ -119,6 +122,7 @@ def test_what_is_random_follows_from_the_seed():
 
 BOUNDS = {
     "push": (-10.0, 10.0),
+    "step": (-10.0, 10.0),
     "reversing": (-10.0, 10.0),
     "walk": (0.0, 10.0),
     "wind": (0.0, 20.0),
