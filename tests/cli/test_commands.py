@@ -12,7 +12,7 @@ from retrim import load_learnt, load_policy
 
 pytestmark = pytest.mark.usefixtures("as_a_user")
 
-COMMANDS = ("pretrain", "fly", "demo", "sweep", "bench", "reproduce", "doctor")
+COMMANDS = ("pretrain", "fly", "demo", "sweep", "gauntlet", "bench", "reproduce", "doctor")
 
 
 @pytest.fixture(scope="module")

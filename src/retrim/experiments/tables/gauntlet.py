@@ -175,7 +175,8 @@ def _section(
     columns = tuple(f"{metric} {unit}" for metric, unit in zip(METRICS, UNITS, strict=True))
     shown = ("late", "peak", "recovery_2cm")
     values = [[[_value(by.get((name, m, metric))) for m in methods] for name in names] for metric in shown]
-    drawn = plots.save(heat_map(shown, names, methods, np.array(values)), run.folder, "gauntlet")
+    titles = [f"{metric} {dict(zip(METRICS, UNITS, strict=True))[metric]}" for metric in shown]
+    drawn = plots.save(heat_map(titles, names, methods, np.array(values)), run.folder, "gauntlet")
     plots.save(_best_and_worst(flown), run.folder, "gauntlet_flights")
     notes = "".join(f" Left out: {line}" for line in left_out)
     return TableSection(("condition", "method", *columns, "crashed"), tuple(lines), "", about + notes, drawn[0])
