@@ -75,14 +75,7 @@ def test_round_trip_is_exact(tmp_path, setup):
         assert preset == setup.preset
 
 
-SIZES = {
-    "hover/retrim": 23,
-    "hover/fast": 23,
-    "hover/released": 27,
-    "hover/paper": 15,
-    "hover/100hz": 31,
-    "track/preview": 43,
-}
+SIZES = {"hover/fast": 23, "hover/released": 27, "hover/paper": 15, "hover/100hz": 31, "track/preview": 43}
 SIZES |= {"hover/retrim": 23, "track/paper": 15, "vision/ideal": 89, "vision/occluded": 89, "vision/paper": 89}
 
 
