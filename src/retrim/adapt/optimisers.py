@@ -1,10 +1,8 @@
 """The optimiser of an update: what it remembers of the last one, and how its rate falls."""
 
 import abc
-from typing import Any
 
 import equinox as eqx
-import jax
 import optax
 from jaxtyping import Array, Float
 
@@ -62,22 +60,10 @@ class CarriedAdam(AbstractPolicyOptimiser):
 
     def transformation(self, num_updates: int) -> optax.GradientTransformation:
         """Return Adam; the number of steps does not matter."""
-        return optax.chain(
-            optax.clip_by_global_norm(self.max_grad_norm), optax.scale_by_adam(), optax.scale(-1.0), self._scaled()
-        )
+        clip = optax.clip_by_global_norm(self.max_grad_norm)
+        return optax.chain(clip, optax.scale_by_adam(), optax.scale_by_learning_rate(self.rate))
 
     def begin(self, state: PolicyState, num_updates: int) -> PolicyState:
         """Keep the second moments; the first start at zero."""
-        memory = jax.tree.map(_directionless, state.optimiser, is_leaf=_is_adam)
-        return PolicyState(state.policy, memory)
-
-    def _scaled(self) -> optax.GradientTransformation:
-        return optax.stateless(lambda updates, params: optax.tree.scale(self.rate, updates))
-
-
-def _is_adam(leaf: Any) -> bool:
-    return isinstance(leaf, optax.ScaleByAdamState)
-
-
-def _directionless(leaf: Any) -> Any:
-    return leaf._replace(mu=optax.tree.zeros_like(leaf.mu)) if _is_adam(leaf) else leaf
+        still = optax.tree.zeros_like(optax.tree.get(state.optimiser, "mu"))
+        return PolicyState(state.policy, optax.tree.set(state.optimiser, mu=still))
