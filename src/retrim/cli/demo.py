@@ -58,7 +58,7 @@ def _demo(
     preset = load_for("hover", name)
     scenario, setup, reporter = Scenario("large", plant=plant), Setup.of(preset), RichReporter()
     run = started(Run("demo", out, stop=stop))
-    console.print(f"[bold]{len(LEVELS) * 2 * starts} flights of {seconds:g} s[/]; two to three minutes on two cores")
+    console.print(f"[bold]{len(LEVELS) * 2 * starts} flights of {seconds:g} s[/]; two to four minutes on two cores")
     console.print(f"preset [bold]{preset.name}[/]: {WHY.get(preset.name, 'your choice')}")
     console.print(
         f"{scenario.vehicle_name(preset.vehicle)} quadrotor on plant [bold]{plant}[/]: {scenario.entry.about}"
