@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .dynamics import AbstractDynamics
+from .dynamics import AbstractDynamics, AbstractWrapper
 from .state import Command, State
 
 X = TypeVar("X")
@@ -59,34 +59,12 @@ class Lagged(AbstractDynamics[LagState[X]]):
         return LagState(self.base.step(s.inner, mean, a_ext), end)
 
 
-class Trimmed(AbstractDynamics[X]):
+class Trimmed(AbstractWrapper[X]):
     """A model that adds a constant to the thrust of every command, as a controller around a policy does in flight."""
 
     base: AbstractDynamics[X]
     extra: Float[Array, ""]
     """Mass-normalised thrust [m/s^2]."""
-
-    @property
-    def dt(self) -> float:
-        """Control tick of the base model [s]."""
-        return self.base.dt
-
-    @property
-    def settling_ticks(self) -> int | Float[Array, ""]:
-        """Settling time of the base model [ticks]."""
-        return self.base.settling_ticks
-
-    def init(self, x: State) -> X:
-        """Lift to the state of the base model."""
-        return self.base.init(x)
-
-    def state(self, s: X) -> State:
-        """Return the vehicle's state."""
-        return self.base.state(s)
-
-    def with_state(self, s: X, x: State) -> X:
-        """Replace (p, R, v); hidden state stays."""
-        return self.base.with_state(s, x)
 
     def step(self, s: X, u: Command, a_ext: Float[Array, "3"]) -> X:
         """Advance the base model by one tick under more thrust."""

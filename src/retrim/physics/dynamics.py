@@ -114,16 +114,10 @@ class Residual(Protocol):
         ...
 
 
-class Hybrid(AbstractDynamics[X]):
-    """Any model plus a residual, evaluated once and held over the tick (paper, Sec. III-E).
+class AbstractWrapper(AbstractDynamics[X]):
+    """A model around another one, with its state; subclasses differ in :meth:`step`."""
 
-    With ``backprop=False`` no gradient flows through the residual: neither to its weights nor, through its inputs,
-    to state and command. That is the paper's back-propagation "through the analytical model only".
-    """
-
-    base: AbstractDynamics[X]
-    residual: Residual
-    backprop: bool = eqx.field(static=True, default=False)
+    base: eqx.AbstractVar[AbstractDynamics[X]]
 
     @property
     def dt(self) -> float:
@@ -146,6 +140,18 @@ class Hybrid(AbstractDynamics[X]):
     def with_state(self, s: X, x: State) -> X:
         """Replace (p, R, v); hidden state stays."""
         return self.base.with_state(s, x)
+
+
+class Hybrid(AbstractWrapper[X]):
+    """Any model plus a residual, evaluated once and held over the tick (paper, Sec. III-E).
+
+    With ``backprop=False`` no gradient flows through the residual: neither to its weights nor, through its inputs,
+    to state and command. That is the paper's back-propagation "through the analytical model only".
+    """
+
+    base: AbstractDynamics[X]
+    residual: Residual
+    backprop: bool = eqx.field(static=True, default=False)
 
     def step(self, s: X, u: Command, a_ext: Float[Array, "3"]) -> X:
         """Advance the base model by one tick with the residual added to ``a_ext``."""

@@ -18,8 +18,7 @@ from ..run import Run
 from .document import Document, TableSection
 from .study import fly_all, table_presets, train_all
 
-METRICS = ("steady", "late", "peak", "recovery_5cm", "recovery_2cm")
-UNITS = ("[m]", "[m]", "[m]", "[s]", "[s]")
+METRICS = {"steady": "[m]", "late": "[m]", "peak": "[m]", "recovery_5cm": "[s]", "recovery_2cm": "[s]"}
 LATE = 5.0  # [s]: what happens before is the flight to the goal
 INTRO = """\
 Made by `retrim gauntlet`. Hover, small quadrotor on plant `bem` unless the row says otherwise. steady: mean error over
@@ -172,10 +171,10 @@ def _section(
             if rows:
                 crashed = f"{rows[0]['crashes']} of {rows[0]['n']}"
                 lines.append((name, find_method(method).label, *map(_cell, rows), crashed))
-    columns = tuple(f"{metric} {unit}" for metric, unit in zip(METRICS, UNITS, strict=True))
+    columns = tuple(f"{metric} {unit}" for metric, unit in METRICS.items())
     shown = ("late", "peak", "recovery_2cm")
     values = [[[_value(by.get((name, m, metric))) for m in methods] for name in names] for metric in shown]
-    titles = [f"{metric} {dict(zip(METRICS, UNITS, strict=True))[metric]}" for metric in shown]
+    titles = [f"{metric} {METRICS[metric]}" for metric in shown]
     drawn = plots.save(heat_map(titles, names, methods, np.array(values)), run.folder, "gauntlet")
     plots.save(_best_and_worst(flown), run.folder, "gauntlet_flights")
     notes = "".join(f" Left out: {line}" for line in left_out)
