@@ -15,6 +15,7 @@ from retrim.adapt.optimisers import CarriedAdam, FreshAdam
 from retrim.adapt.starts import TaskStarts
 from retrim.adapt.views import WorldView
 from retrim.config import PRESETS, Scenario, Setup, changed, load, setup
+from retrim.config.learners import check_frame
 from retrim.config.vehicles import make_vehicle
 from retrim.control.controller import PolicyController
 from retrim.control.gravity_frame import GravityFrame
@@ -279,6 +280,23 @@ def test_flight_starts_follow_from_seed_and_home_alone():
     assert np.all(np.abs(p - one.preset.goal) <= 1.0)
     assert np.all(p.std(axis=0) > 0.4)
     assert 0.05 < np.stack([x.v for x in starts]).std() < 0.2
+
+
+def test_a_frame_turns_about_a_fixed_goal_only():
+    """A goal that moves, a reference and keypoints are refused."""
+
+    class Moving(Hover):
+        def target(self, t):
+            return self.goal + t
+
+    fixed = Setup.of(tiny_preset())
+    f = fixed.flown
+    check_frame(fixed.preset, f)
+    with pytest.raises(ConfigError, match="about a fixed hover goal"):
+        check_frame(fixed.preset, Moving(f.goal, f.observation, f.box, f.heading, f.dt, f.horizon))
+    for name in ("track/preview", "vision/ideal"):
+        with pytest.raises(ConfigError, match="about a fixed hover goal"):
+            Setup.of(changed(load(name), adapt={"frame": "gravity"}))
 
 
 # ---- at 100 Hz

@@ -63,8 +63,8 @@ class GravityView(AbstractView):
 class TurnedResidual(eqx.Module):
     """A residual in the frame of g + ``d``, less what that frame answers by itself.
 
-    Eq. (1) with this residual and |g + d| - |g| more thrust (:class:`retrim.physics.Trimmed`), in the turned frame, is
-    Eq. (1) with the original one in the world frame, exactly.
+    Eq. (1) with this residual and |g + d| - |g| more thrust (``Trimmed``), in the turned frame, is Eq. (1) with the
+    original one in the world frame, exactly.
     """
 
     residual: Residual

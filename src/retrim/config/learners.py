@@ -54,14 +54,15 @@ def make_learner(preset: Preset, model: ResidualModel, env: Env) -> OnlineLearne
 
 
 def check_frame(preset: Preset, task: AbstractTask) -> None:
-    """Refuse a frame that turns about a goal for a task without one, or for a policy that does not see its state.
+    """Refuse a frame that turns about a goal for a task without a fixed one, or a policy that does not see its state.
 
     Raises:
         ConfigError: It names the task.
     """
-    if not isinstance(task, AbstractHover) or not isinstance(task.observation, StateObs):
+    fixed = isinstance(task, AbstractHover) and type(task).target is AbstractHover.target
+    if not fixed or not isinstance(task.observation, StateObs):
         raise ConfigError(
-            "a disturbance observer turns the frame about a hover goal, for a policy that sees its state; task "
+            "a disturbance observer turns the frame about a fixed hover goal, for a policy that sees its state; task "
             f"{preset.task!r} has no such goal, or hides the state"
         )
 

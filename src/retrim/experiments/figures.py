@@ -17,7 +17,7 @@ from ..tasks.keypoints import Keypoints
 from ..tasks.track import AbstractTrack
 from ..viz import plots
 from .flights import Flight
-from .recovery import timeline
+from .recovery import FEW, timeline
 
 
 def picture(
@@ -67,7 +67,7 @@ def picture(
 def spans(name: str, home: Array, seconds: float) -> list[plots.Span]:
     """Return when something disturbs the flight, and what; one span for all that changes all the time."""
     times, found, changes = timeline(name, home, seconds)
-    if len(changes) > 10:
+    if len(changes) > FEW:
         return [plots.Span(0.0, seconds, name, strong=False)]
     marked = []
     for first, after in itertools.pairwise([0, *changes, len(times)]):

@@ -29,7 +29,7 @@ class RegressionModel(eqx.Module):
 
     a_res = d + R (k_c (c - g) e3 - k_1 v_b - k_2 |v_b| v_b), with v_b the velocity in the body frame and the products
     per axis. The thrust gain k_c acts on what exceeds hover thrust: at hover it cannot be told from a push along z,
-    which d is. A fit is exact, takes microseconds, and depends on the window alone, never on the fit before it.
+    which d is. A fit is exact, takes less than a millisecond, and depends on the window alone, not on earlier fits.
     """
 
     prior: Float[Array, "10"]
