@@ -212,7 +212,7 @@ def test_the_vehicle_of_training_flies_unless_the_scenario_has_another():
         (Scenario(plant="simple"), "kingfisher", 0.752),
     ):
         assert scenario.vehicle_name("kingfisher") == name
-        assert float(scenario.make("kingfisher")._model.vehicle.mass) == pytest.approx(mass)
+        assert float(scenario.make("kingfisher").simulation.model.vehicle.mass) == pytest.approx(mass)
     assert Scenario(plant="rotorpy").vehicle_name("small") == "hummingbird"
     assert Scenario(plant="crazyflow").vehicle_name("small") == "cf21B_500"
 

@@ -76,7 +76,7 @@ def test_a_preset_keeps_the_content_of_its_vehicle_file(vehicle_file, tmp_path):
     setup = Setup.of(preset)
     assert float(setup.vehicle.mass) == 1.2
     np.testing.assert_array_equal(setup.env.task.observation.omega_max, [8.0, 8.0, 4.0])
-    assert float(Scenario().make(preset.vehicle)._model.vehicle.mass) == 1.2
+    assert float(Scenario().make(preset.vehicle).simulation.model.vehicle.mass) == 1.2
 
 
 def test_a_scenario_keeps_the_content_of_its_vehicle_file(vehicle_file):
@@ -84,7 +84,7 @@ def test_a_scenario_keeps_the_content_of_its_vehicle_file(vehicle_file):
     scenario = Scenario(vehicle=str(path))
     path.unlink()
     assert scenario.vehicle_name("small") == "seven_inch"
-    assert float(scenario.make("small")._model.vehicle.mass) == 1.2
+    assert float(scenario.make("small").simulation.model.vehicle.mass) == 1.2
 
 
 IMPOSSIBLE = [

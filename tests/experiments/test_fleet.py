@@ -41,7 +41,8 @@ def compiled(fleet):
 
     fleet.warm_up()
     jax.monitoring.register_event_duration_secs_listener(note)
-    flights = fleet.run()
+    with ThreadPoolExecutor(2) as pool:
+        flights = fleet.run(pool)
     jax.monitoring.unregister_event_duration_listener(note)
     return flights, found
 
@@ -83,10 +84,44 @@ def test_one_thread_and_two_processes_fly_the_same(fleet, flights):
         assert (there.learnt is None) == (here.learnt is None)
 
 
+def test_lots_fly_the_same_to_rounding_and_land_once(fleet, flights, monkeypatch):
+    """Two flights of a scenario and a method are one program; a third one is left for itself."""
+    from retrim.experiments import fleet as module
+
+    monkeypatch.setattr(module, "LOT", 2)
+    monkeypatch.setattr(module, "lanes", lambda: 1)
+    assert [len(lot.specs) for lot in fleet.lots(fleet.specs)] == [2, 2, 2, 2]
+    assert [len(lot.specs) for lot in fleet.lots(fleet.specs[:3])] == [2, 1]
+    assert [lot.compiles for lot in fleet.lots(fleet.specs)] == [True] * 4  # other disturbances: other programs
+    landed, told = [], []
+    together = fleet.run(landed=landed.append, progress=lambda done, n: told.append(done))
+    assert [flight.spec for flight in together.flown] == fleet.specs
+    assert sorted(flight.spec.start for part in landed for flight in part) == [0] * 8
+    assert told == [2, 4, 6, 8]
+    for flight, other in zip(together.flown, flights.flown, strict=True):
+        np.testing.assert_allclose(flight.log.p, other.log.p, atol=2e-4)
+        assert [(e.t, e.kind) for e in flight.events] == [(e.t, e.kind) for e in other.events]
+        assert (flight.learnt is None) == (other.learnt is None)
+
+
+def test_a_lot_ends_each_flight_where_it_is_terminated(fleet):
+    """A vehicle that is pushed to the ground is cut off at the same tick as when it flies alone."""
+    scenario = Scenario("push=-8", plant="simple")
+    down = Fleet(fleet.preset, fleet.policies, [scenario], methods=("base",), starts=2, seconds=2.0)
+    with ThreadPoolExecutor(1) as pool:
+        alone = down.run(pool).flown
+    together = down.run().flown
+    assert any(flight.log.terminated for flight in alone)
+    for flight, other in zip(together, alone, strict=True):
+        assert flight.log.terminated == other.log.terminated
+        assert len(flight.log.t) == len(other.log.t) == len(flight.error) == len(flight.log.u)
+
+
 def test_progress_counts_the_flights_that_are_over(fleet):
     told = []
     part = fleet.specs[:3]
-    flown = fleet.run(only=part, progress=lambda done, n: told.append((done, n)))
+    with ThreadPoolExecutor(1) as pool:
+        flown = fleet.run(pool, only=part, progress=lambda done, n: told.append((done, n)))
     assert told == [(1, 3), (2, 3), (3, 3)]
     assert [flight.spec for flight in flown.flown] == part
 
@@ -117,8 +152,8 @@ def test_a_plant_that_fails_ends_the_fleet(fleet, monkeypatch):
         raise PlantError(f"no plant for {spec.method}")
 
     monkeypatch.setattr(module, "fly_one", broken)
-    with pytest.raises(PlantError, match="no plant for"):
-        fleet.run()
+    with ThreadPoolExecutor(1) as pool, pytest.raises(PlantError, match="no plant for"):
+        fleet.run(pool)
 
 
 @pytest.mark.parametrize(

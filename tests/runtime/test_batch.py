@@ -8,9 +8,11 @@ from jax import random
 
 from helpers import hover_task
 from retrim.control import Policy, PolicyController
-from retrim.physics import Constant, LinearDragQuadrotor, State, small
+from retrim.control.controller import AbstractController
+from retrim.physics import Command, Constant, LinearDragQuadrotor, State, small
 from retrim.plants import SensorModel, SimPlant
 from retrim.runtime import ControllerPilot, batch_flight, fly
+from retrim.runtime.batch import one, stacked
 
 
 @pytest.fixture(scope="module")
@@ -22,26 +24,52 @@ def parts():
     return model, push, PolicyController(task.observation, policy), State.at(jnp.array([0.2, 0.1, 1.3]))
 
 
-@pytest.mark.parametrize("delay_s", [0.0, 0.02, 0.025])
-def test_same_as_flying_the_plant(parts, delay_s):
+def assert_same(flown, log):
+    for states, recorded in ((flown.true, log.true), (flown.measured, log.measured)):
+        for name in ("p", "R", "v"):
+            np.testing.assert_allclose(getattr(states, name), getattr(recorded, name)[1:], atol=1e-12)
+    np.testing.assert_allclose(jax.vmap(lambda u: u.vector())(flown.accepted), log.u[1:], atol=1e-10)
+
+
+SENSORS = SensorModel.of(position=0.01, velocity=0.01, attitude=0.01, latency=20, dropout=0.2)
+
+
+@pytest.mark.parametrize(("delay_s", "sensors"), [(0.0, None), (0.02, None), (0.025, SENSORS)])
+def test_same_as_flying_the_plant(parts, delay_s, sensors):
     model, push, controller, x0 = parts
-    log = fly(SimPlant(model, push, delay_s=delay_s), ControllerPilot(controller), x0, ticks=15)
-    states, commands = jax.jit(lambda x0: batch_flight(model, push, controller, x0, ticks=15, delay_s=delay_s))(x0)
-    np.testing.assert_allclose(states.p, log.p[1:], atol=1e-12)
-    np.testing.assert_allclose(states.R, log.R[1:], atol=1e-12)
-    np.testing.assert_allclose(jax.vmap(lambda u: u.vector())(commands), log.u[1:], atol=1e-10)
+    plant = SimPlant(model, push, delay_s=delay_s, sensors=sensors, seed=4)
+    log = fly(plant, ControllerPilot(controller), x0, ticks=15)
+    assert_same(jax.jit(lambda x0: batch_flight(plant.simulation, controller, x0, ticks=15))(x0), log)
 
 
-def test_maps_over_starts_and_sees_through_sensors(parts):
+class Greedy(AbstractController[Command]):
+    """Wants ever more thrust, from what it was granted."""
+
+    def init(self, x):
+        return Command.hover(x.p.dtype)
+
+    def __call__(self, memory, t, x):
+        u = Command(1.5 * memory.c, memory.omega + 40.0)
+        return u, u
+
+    def accepted(self, memory, u):
+        return u
+
+
+def test_limits_are_those_of_the_plant_and_are_remembered(parts):
+    model, push, _, x0 = parts
+    plant = SimPlant(model, push)
+    log = fly(plant, ControllerPilot(Greedy()), x0, ticks=8)
+    flown = jax.jit(lambda x0: batch_flight(plant.simulation, Greedy(), x0, ticks=8))(x0)
+    assert_same(flown, log)
+    assert float(flown.issued.c[-1]) == pytest.approx(1.5 * float(flown.accepted.c[-1]))  # no windup
+
+
+def test_maps_over_vehicles_that_see_other_noise(parts):
     model, push, controller, x0 = parts
-    sensors = SensorModel.of(position=0.01, latency=20)
-    starts = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), x0)
-
-    def fly_from(x, key):
-        return batch_flight(model, push, controller, x, ticks=5, sensors=sensors, key=key)[1]
-
-    commands = jax.jit(jax.vmap(fly_from))(starts, random.split(random.key(1)))
-    assert commands.c.shape == (2, 5)
-    assert not np.array_equal(commands.c[0], commands.c[1])  # other noise
-    with pytest.raises(ValueError, match="need a key"):
-        batch_flight(model, push, controller, x0, ticks=5, sensors=sensors)
+    plants = [SimPlant(model, push, sensors=SENSORS, seed=seed) for seed in (0, 1)]
+    together = stacked([plant.simulation for plant in plants])
+    flown = jax.jit(jax.vmap(lambda s: batch_flight(s, controller, x0, ticks=5)))(together)
+    assert flown.accepted.c.shape == (2, 5)
+    assert not np.array_equal(flown.accepted.c[0], flown.accepted.c[1])
+    assert_same(one(flown, 1), fly(plants[1], ControllerPilot(controller), x0, ticks=5))

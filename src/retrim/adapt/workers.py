@@ -4,7 +4,7 @@ A worker's state advances only when its own update comes back to it as published
 the way (a new flight, a lost message) never becomes the base of the next one.
 """
 
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 from jax import random
@@ -12,7 +12,8 @@ from jaxtyping import Array, Key
 
 from ..learn.bptt import PolicyState
 from ..learn.window import Window
-from .learner import LearnerState, OnlineLearner
+from .gate import Verdict
+from .learner import FitReport, LearnerState, OnlineLearner
 from .updates import Layer, PolicyUpdate, Rejection, ResidualUpdate, Update
 
 
@@ -31,21 +32,33 @@ class Worker(Protocol):
         ...
 
 
+def residual_update(computed_from: float, state: Any, report: FitReport) -> ResidualUpdate | Rejection:
+    """Return the message of a fit that has ended."""
+    if not report.accepted:
+        reason = "the residual's fit is not finite, or no tick of the window can be used"
+        return Rejection(computed_from, "residual", reason)
+    return ResidualUpdate(computed_from, float(report.rms_error), state)
+
+
+def policy_update(computed_from: float, state: PolicyState, verdict: Verdict) -> PolicyUpdate | Rejection:
+    """Return the message of an update of the policy that has ended."""
+    if not verdict.admitted:
+        return Rejection(computed_from, "policy", verdict.reason())
+    return PolicyUpdate(computed_from, float(verdict.candidate), float(verdict.incumbent), state)
+
+
 class ResidualWorker:
     """Fits the residual model, from where its last published fit ended."""
 
     layer: Layer = "residual"
 
     def __init__(self, learner: OnlineLearner, state: LearnerState) -> None:
-        self._learner, self._residual = learner, state.residual
+        self.learner, self._residual = learner, state.residual
 
     def learn(self, window: Window) -> ResidualUpdate | Rejection:
         """Fit to ``window``."""
-        fitted, report = jax.block_until_ready(self._learner.fit_residual(self._residual, window))
-        t = float(window.t[-1])
-        if not report.accepted:
-            return Rejection(t, self.layer, "the residual's fit is not finite, or no tick of the window can be used")
-        return ResidualUpdate(t, float(report.rms_error), fitted)
+        fitted, report = jax.block_until_ready(self.learner.fit_residual(self._residual, window))
+        return residual_update(float(window.t[-1]), fitted, report)
 
     def receive(self, update: Update) -> None:
         """Go on from a published fit."""
@@ -59,18 +72,15 @@ class PolicyWorker:
     layer: Layer = "policy"
 
     def __init__(self, learner: OnlineLearner, state: LearnerState, key: Key[Array, ""]) -> None:
-        self._learner, self._key = learner, key
+        self.learner, self.key = learner, key
         self._policy: PolicyState = state.policy
         self._residual = state.residual
 
     def learn(self, window: Window) -> PolicyUpdate | Rejection:
         """Re-train; the window gives starts for the gate."""
-        self._key, key = random.split(self._key)
-        trained, verdict = jax.block_until_ready(self._learner.update_policy(self._policy, self._residual, window, key))
-        t = float(window.t[-1])
-        if not verdict.admitted:
-            return Rejection(t, self.layer, verdict.reason())
-        return PolicyUpdate(t, float(verdict.candidate), float(verdict.incumbent), trained)
+        self.key, key = random.split(self.key)
+        trained, verdict = jax.block_until_ready(self.learner.update_policy(self._policy, self._residual, window, key))
+        return policy_update(float(window.t[-1]), trained, verdict)
 
     def receive(self, update: Update) -> None:
         """Go on from a published policy, in the model of a published residual."""

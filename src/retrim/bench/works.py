@@ -10,7 +10,6 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 from jax import lax, random
 from jaxtyping import Array, Key
 
@@ -29,7 +28,8 @@ from ..learn.window import Window
 from ..physics.bem import BemQuadrotor
 from ..physics.state import Command, State
 from ..physics.vehicle import small
-from ..runtime.batch import batch_flight
+from ..plants.sim import SimPlant
+from ..runtime.batch import batch_flight, stacked
 from ..runtime.flight import fly
 from .timing import Work, compiled, timed
 from .training import encode_and_pretrain, pretrain
@@ -89,12 +89,14 @@ def _eight() -> dict[str, Any]:
     """Eight flights of 30 s on bem, plant and policy as one program; four on each of two threads."""
     setup = Setup.of(load("hover/fast"))
     controller = PolicyController(setup.flown.observation_in_flight, setup.new_policy(random.key(0)))
-    model, effects, starts = BemQuadrotor.of(small(), 0.02), disturbance("none"), setup.flight_starts(8)
-    halves = [jax.tree.map(lambda *leaves: jnp.stack(leaves), *starts[i : i + 4]) for i in (0, 4)]
+    simulation = SimPlant(BemQuadrotor.of(small(), 0.02), disturbance("none")).simulation
+    starts = setup.flight_starts(8)
+    halves = [stacked(starts[i : i + 4]) for i in (0, 4)]
 
     @jax.jit
     def four(controller: PolicyController, x0s: State) -> State:
-        return lax.map(lambda x0: batch_flight(model, effects, controller, x0, ticks=1500)[0], x0s)  # type: ignore[no-any-return]
+        flown: State = jax.vmap(lambda x0: batch_flight(simulation, controller, x0, ticks=1500).true)(x0s)
+        return flown
 
     program, compile_s = compiled(four, controller, halves[0])
     with ThreadPoolExecutor(2) as pool:

@@ -1,4 +1,4 @@
-"""``retrim demo``: the whole loop in two minutes."""
+"""``retrim demo``: the whole loop in a minute."""
 
 import sys
 import threading
@@ -32,7 +32,7 @@ WHY = {
 def demo(
     preset: str = "hover/retrim",
     plant: str = "simple",
-    seconds: float = 30.0,
+    seconds: float = 20.0,
     starts: int = 8,
     seed: int = 0,
     out: Path | None = None,
@@ -58,7 +58,7 @@ def _demo(
     preset = load_for("hover", name)
     scenario, setup, reporter = Scenario("large", plant=plant), Setup.of(preset), RichReporter()
     run = started(Run("demo", out, stop=stop))
-    console.print(f"[bold]{len(LEVELS) * 2 * starts} flights of {seconds:g} s[/]; two to four minutes on two cores")
+    console.print(f"[bold]{len(LEVELS) * 2 * starts} flights of {seconds:g} s[/]; about a minute on two cores")
     console.print(f"preset [bold]{preset.name}[/]: {WHY.get(preset.name, 'your choice')}")
     console.print(
         f"{scenario.vehicle_name(preset.vehicle)} quadrotor on plant [bold]{plant}[/]: {scenario.entry.about}"

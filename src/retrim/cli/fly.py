@@ -101,7 +101,6 @@ def fly(
 def _fly(fleet: Fleet, setup: Setup, scenario: Scenario, run: Run) -> int:
     with run.interruptible(), RichReporter().progress("flying") as advance:
         advance(0.0, "compiling the programs of a flight (kept in a cache for the next time)")
-        fleet.warm_up()
     with RichReporter().progress("flying") as advance:
         flights = fleet.run(stop=run.stop, progress=lambda done, n: advance(done / n, f"{done} of {n} flights")).flown
     if not flights:

@@ -4,6 +4,7 @@ import abc
 from typing import Any, Generic, TypeVar
 
 import equinox as eqx
+import jax
 from jaxtyping import Array, Float
 
 from ..physics.state import Command, State
@@ -47,7 +48,7 @@ class PolicyController(AbstractController[tuple[Any, Command]]):
 
     def init(self, x: State) -> tuple[Any, Command]:
         """Return the memory of a vehicle that has hovered until now."""
-        return self.observation.init(x), self.policy.u_hover
+        return self.observation.init(x), jax.tree.map(lambda leaf: leaf.astype(x.p.dtype), self.policy.u_hover)
 
     def __call__(
         self, memory: tuple[Any, Command], t: Float[Array, ""], x: State

@@ -5,7 +5,7 @@ from .fleet import Fleet as Fleet
 from .fleet import Flights as Flights
 from .flights import Flight as Flight
 from .flights import FlightSpec as FlightSpec
-from .flights import fly_one as fly_one
+from .flying import fly_one as fly_one
 from .metrics import rows as rows
 from .run import Run as Run
 from .training import nominal_error as nominal_error

@@ -3,11 +3,12 @@
 import dataclasses
 import secrets
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
+import jax
 from jax import random
 
 from ..adapt.learner import LearnerState
@@ -19,13 +20,15 @@ from ..control.policy import Policy
 from ..errors import ConfigError
 from ..plants.plant import Measurement
 from ..runtime.flight import FlightStopped
-from .flights import Flight, FlightSpec, fly_one
+from .flights import Flight, FlightSpec
+from .flying import fly_lot, fly_one, program_of
 from .interrupts import interrupts_only_set
 from .jobs import Job, fly_job
 from .limits import check_flights, check_seeds
 from .metrics import Rows, rows
 from .provenance import cores
 
+LOT = 64  # flights of one program
 Progress = Callable[[int, int], None]
 """Called with the number of flights that are over, and of all flights."""
 
@@ -41,6 +44,16 @@ class Flights:
     def rows(self) -> Rows:
         """Return one row of results per scenario, method and seed."""
         return rows(self.flown)
+
+
+class Lot(NamedTuple):
+    """Flights that are flown at once."""
+
+    specs: list[FlightSpec]
+    compiled: threading.Event | None
+    """Set when the first lot of its program has landed; None for a flight by itself."""
+    compiles: bool = False
+    """It is the first lot of its program."""
 
 
 class Fleet:
@@ -100,10 +113,37 @@ class Fleet:
             for start in range(starts)
         ]
 
-    def warm_up(self) -> None:
-        """Compile every program of the flights before the first take-off, in this process."""
+    def lots(self, specs: Sequence[FlightSpec]) -> list[Lot]:
+        """Return specifications in lots: those that are flown together as one program, each other one by itself.
+
+        The first lot of each program comes first: while it compiles, another program's does.
+        """
+        groups: dict[tuple[Scenario, str], list[FlightSpec]] = {}
+        for spec in specs:
+            groups.setdefault((spec.scenario, spec.method), []).append(spec)
+        first, others = dict[Hashable, Lot](), list[Lot]()
+        for group in groups.values():
+            setup, policy = self.setups[group[0].scenario.reference], self.policies[group[0].seed]
+            program = program_of(setup, policy, group) if self._latency == "fixed" else None
+            size = 1 if program is None else min(LOT, -(-len(group) // lanes()))
+            for i in range(0, len(group), size):
+                part = group[i : i + size]
+                if len(part) == 1:
+                    others.append(Lot(part, None))
+                elif (program, len(part)) in first:
+                    others.append(Lot(part, first[program, len(part)].compiled))
+                else:
+                    first[program, len(part)] = Lot(part, threading.Event(), compiles=True)
+        return [*first.values(), *others]
+
+    def warm_up(self, specs: Sequence[FlightSpec] | None = None) -> None:
+        """Compile the programs of flights that are flown one by one before their take-off, in this process.
+
+        Args:
+            specs: Flights; all of the fleet by default.
+        """
         plants, pilots = set[Scenario](), set[Any]()
-        for spec in self.specs:
+        for spec in self.specs if specs is None else specs:
             scenario, kind = spec.scenario, (spec.scenario.reference, spec.method)
             setup, x0 = self.setups[scenario.reference], self._starts[scenario.reference, spec.seed][0]
             if kind not in pilots:
@@ -120,14 +160,18 @@ class Fleet:
         executor: Executor | None = None,
         *,
         progress: Progress | None = None,
+        landed: Callable[[Sequence[Flight]], None] | None = None,
         stop: threading.Event | None = None,
         only: Sequence[FlightSpec] | None = None,
     ) -> Flights:
         """Fly.
 
         Args:
-            executor: Any executor; by default one thread per core. One with other processes builds its own programs.
-            progress: Called in this thread when a flight is over.
+            executor: Any executor, which then flies one flight at a time; one with other processes builds its own
+                programs. By default flights of a simulated plant are flown in lots, each as one program, and the others
+                one by one, on one thread per core.
+            progress: Called in this thread when flights are over.
+            landed: Receives flights that were flown to their end, in this thread.
             stop: Gives up what is flying. Ctrl-C does the same, and sets it.
             only: Fly these specifications, a part of ``specs``.
 
@@ -140,27 +184,41 @@ class Fleet:
         stop = stop or threading.Event()
         specs = self.specs if only is None else list(only)
         if executor is not None:
-            return self._run(executor, specs, progress, stop, shared=isinstance(executor, ThreadPoolExecutor))
-        with ThreadPoolExecutor(1 if self._latency == "measured" else cores()) as pool:
-            return self._run(pool, specs, progress, stop, shared=True)
+            local = isinstance(executor, ThreadPoolExecutor)
+            lots = [Lot([spec], None) for spec in specs]
+            return self._run(executor, specs, lots, progress, landed, stop, local=local)
+        lots = self.lots(specs)
+        self.warm_up([lot.specs[0] for lot in lots if lot.compiled is None])
+        with ThreadPoolExecutor(1 if self._latency == "measured" else lanes()) as pool:
+            return self._run(pool, specs, lots, progress, landed, stop, local=True)
 
     def _run(
         self,
         executor: Executor,
         specs: Sequence[FlightSpec],
+        lots: Sequence[Lot],
         progress: Progress | None,
+        landed: Callable[[Sequence[Flight]], None] | None,
         stop: threading.Event,
         *,
-        shared: bool,
+        local: bool,
     ) -> Flights:
-        futures: dict[FlightSpec, Future[Flight]] = {}
+        futures: list[Future[list[Flight]]] = []
+        done, flown = 0, dict[FlightSpec, Flight]()
         try:
-            for spec in specs:
-                futures[spec] = (
-                    self._submit(executor, spec, stop) if shared else executor.submit(fly_job, self._job(spec))
+            for lot in lots:
+                futures.append(
+                    executor.submit(self._fly, lot, stop)
+                    if local
+                    else executor.submit(fly_job, self._job(lot.specs[0]))
                 )
-            for done, future in enumerate(as_completed(futures.values()), start=1):
-                future.result()
+            for future in as_completed(futures):
+                flights = future.result()
+                flown |= {flight.spec: flight for flight in flights}
+                if landed is not None:
+                    with interrupts_only_set(stop):
+                        landed(flights)
+                done += len(flights)
                 if progress is not None:
                     progress(done, len(specs))
         except (KeyboardInterrupt, FlightStopped):
@@ -170,31 +228,41 @@ class Fleet:
             raise
         finally:
             with interrupts_only_set(stop):  # a further Ctrl-C must not lose what is done
-                for future in futures.values():
+                for future in futures:
                     future.cancel()
-                if stop.is_set():
-                    for future in futures.values():
-                        if not future.cancelled():
-                            future.exception()
-        over = [futures[spec] for spec in specs if spec in futures]
-        flown = [f.result() for f in over if f.done() and not f.cancelled() and f.exception() is None]
-        return Flights(flown, interrupted=len(flown) < len(specs))
+                late = [future for future in futures if stop.is_set() and not future.cancelled()]
+                kept = [flight for each in late if each.exception() is None for flight in each.result()]
+                new = [flight for flight in kept if flight.spec not in flown]
+                flown |= {flight.spec: flight for flight in new}
+                if landed is not None and new:
+                    landed(new)
+        return Flights([flown[spec] for spec in specs if spec in flown], interrupted=len(flown) < len(specs))
 
-    def _submit(self, executor: Executor, spec: FlightSpec, stop: threading.Event) -> Future[Flight]:
-        """Let a thread of this process fly."""
-        return executor.submit(
-            fly_one,
-            self.setups[spec.scenario.reference],
-            self.policies[spec.seed],
-            spec,
-            self._starts[spec.scenario.reference, spec.seed][spec.start],
-            self.seconds,
-            latency=self._latency,
-            state=self._state,
-            stop=stop,
-        )
+    def _fly(self, lot: Lot, stop: threading.Event) -> list[Flight]:
+        """Fly a lot in this process."""
+        first = lot.specs[0]
+        setup = self.setups[first.scenario.reference]
+        policies = [self.policies[spec.seed] for spec in lot.specs]
+        starts = [self._starts[spec.scenario.reference, spec.seed][spec.start] for spec in lot.specs]
+        seconds, state = self.seconds, self._state
+        if lot.compiled is None:
+            alone = fly_one(
+                setup, policies[0], first, starts[0], seconds, latency=self._latency, state=state, stop=stop
+            )
+            return [alone]
+        try:
+            if not lot.compiles:
+                lot.compiled.wait()
+            return fly_lot(setup, policies, lot.specs, starts, seconds, state=state, stop=stop, cold=lot.compiles)
+        finally:
+            lot.compiled.set()
 
     def _job(self, spec: FlightSpec) -> Job:
         x0 = self._starts[spec.scenario.reference, spec.seed][spec.start]
         policy, preset = self.policies[spec.seed], dump(self.preset)
         return Job(self._id, preset, policy, spec, x0, self.seconds, self._latency, self._state)
+
+
+def lanes() -> int:
+    """Return how many lots fly at once: one for each core, and one on an accelerator, which likes them large."""
+    return cores() if jax.default_backend() == "cpu" else 1

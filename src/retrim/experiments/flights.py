@@ -1,27 +1,16 @@
-"""One flight of a fleet: its specification, how it is flown, and what it leaves."""
+"""One flight of a fleet: its specification, and what it leaves."""
 
 from dataclasses import dataclass
-from typing import Any
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jax import lax, random
+from jax import random
 from jaxtyping import Array, Key
 
 from ..adapt.learner import LearnerState
 from ..config.scenario import Scenario
-from ..config.setup import Latency, Setup
-from ..control.lora import LoraPolicy
-from ..control.policy import Policy
-from ..physics.state import State
-from ..runtime.adaptive import AdaptivePilot
-from ..runtime.events import Event, Observer
-from ..runtime.flight import Log, fly
-from ..tasks.task import AbstractTask
+from ..runtime.events import Event
+from ..runtime.flight import Log
 
-FLOOR = -0.5  # [m]: a vehicle below this is terminated; starts may lie at z = 0, and a transient dips below them
 SETTLED = 0.05  # [m]
 LEARNER_TAG = 2**30 + 2  # folded into a seed: learners share no key with training, starts and disturbances
 
@@ -103,66 +92,3 @@ class Flight:
     def _last(self, error: np.ndarray) -> float:
         late = self.log.t > self.log.t[-1] - self.steady_seconds + 0.5 * self.log.dt  # by time: a tick may be missed
         return float("nan") if self.log.terminated else float(error[late].mean())
-
-
-def fly_one(
-    setup: Setup,
-    policy: Policy | LoraPolicy,
-    spec: FlightSpec,
-    x0: State,
-    seconds: float,
-    *,
-    latency: Latency = "fixed",
-    state: LearnerState | None = None,
-    observers: tuple[Observer, ...] = (),
-    stop: Any = None,
-) -> Flight:
-    """Fly one flight.
-
-    Args:
-        setup: Preset of the policy, on the scenario's reference.
-        policy: What flies.
-        spec: Scenario, method and seeds.
-        x0: State at the start.
-        seconds: Length of the flight.
-        latency: What learning costs in flight time.
-        state: What an earlier flight learnt, to go on from.
-        observers: They follow the flight.
-        stop: A ``threading.Event`` that gives the flight up.
-
-    Raises:
-        PlantError: The plant refused.
-        FlightStopped: ``stop`` was set.
-    """
-    preset, task = setup.preset, setup.flown
-    pilot = setup.pilot(policy, spec.method, spec.key(), latency=latency, state=state)
-    plant = spec.scenario.make(preset.vehicle, dt=preset.dt, seed=spec.plant_seed)
-
-    def terminated(t: float, x: State) -> bool:
-        return bool(_terminated(task, np.float64(t), x))
-
-    log = fly(plant, pilot, x0, ticks=round(seconds / preset.dt), terminated=terminated, observers=observers, stop=stop)
-    error, cross = _errors(task, log.t, log.true.as_state())
-    return Flight(
-        spec,
-        spec.scenario.vehicle_name(preset.vehicle),
-        log,
-        np.asarray(error),
-        task.metric,
-        task.steady_seconds,
-        None if cross is None else np.asarray(cross),
-        pilot.state if isinstance(pilot, AdaptivePilot) else None,
-    )
-
-
-@eqx.filter_jit
-def _terminated(task: AbstractTask, t: Any, x: State) -> Array:
-    return task.terminated(jnp.asarray(t, dtype=x.p.dtype), x) | (x.p[2] < FLOOR)
-
-
-@eqx.filter_jit
-def _errors(task: AbstractTask, t: Any, x: State) -> tuple[Array, Array | None]:
-    times = jnp.asarray(t, dtype=x.p.dtype)
-    error = jax.vmap(task.error)(times, x)
-    first = jax.eval_shape(task.cross_track, jax.tree.map(lambda leaf: leaf[0], x))
-    return error, None if first is None else lax.map(task.cross_track, x)

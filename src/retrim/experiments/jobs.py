@@ -9,7 +9,8 @@ from ..config.setup import Latency, Setup
 from ..control.lora import LoraPolicy
 from ..control.policy import Policy
 from ..physics.state import State
-from .flights import Flight, FlightSpec, fly_one
+from .flights import Flight, FlightSpec
+from .flying import fly_one
 
 
 @dataclass(frozen=True)
@@ -27,10 +28,10 @@ class Job:
     state: LearnerState | None
 
 
-def fly_job(job: Job) -> Flight:
-    """Fly a job, in another process."""
+def fly_job(job: Job) -> list[Flight]:
+    """Fly a job, in another process: a lot of one flight."""
     setup: Setup = setup_for(job.preset, job.spec.scenario.reference, job.fleet)
-    return fly_one(setup, job.policy, job.spec, job.x0, job.seconds, latency=job.latency, state=job.state)
+    return [fly_one(setup, job.policy, job.spec, job.x0, job.seconds, latency=job.latency, state=job.state)]
 
 
 @functools.lru_cache(maxsize=16)

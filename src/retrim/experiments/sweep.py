@@ -22,8 +22,7 @@ from ..io.trained import load_policy, save_policy
 from ..viz.panels import bars
 from ..viz.plots import save
 from .fleet import Fleet
-from .flights import FlightSpec
-from .interrupts import interrupts_only_set
+from .flights import Flight, FlightSpec
 from .limits import check_seeds
 from .metrics import Rows, cell, record, summary
 from .reporter import Reporter
@@ -105,9 +104,6 @@ def run_sweep(sweep: Sweep, run: Run, reporter: Reporter) -> Rows:
     return _report(sweep, [kept.rows[key] for key in keys if key in kept.rows], run, reporter)
 
 
-BATCH = 8  # flights between two writes of the results
-
-
 def _fleet(preset: Preset, policies: Mapping[int, Policy], sweep: Sweep) -> Fleet:
     return Fleet(preset, policies, sweep.scenarios(), methods=sweep.methods, starts=sweep.starts, seconds=sweep.seconds)
 
@@ -118,21 +114,19 @@ def _untrained(preset: Preset, sweep: Sweep) -> dict[int, Policy]:
 
 
 def _fly(fleet: Fleet, kept: "_Kept", run: Run, reporter: Reporter) -> None:
-    """Fly what is missing, and keep each batch."""
+    """Fly what is missing, and keep what has landed."""
     keys = {spec: _key(fleet.preset, spec, fleet.seconds) for spec in fleet.specs}
     missing = [spec for spec, key in keys.items() if key not in kept.rows]
     if not missing or run.interrupted:
         return
+
+    def keep(flown: Sequence[Flight]) -> None:
+        kept.add({keys[flight.spec]: {"preset": fleet.preset.name, **record(flight)} for flight in flown})
+
     with reporter.progress(f"flying {fleet.preset.name}") as advance:
         advance(0.0, "compiling the programs of a flight")
-        fleet.warm_up()
-        for i in range(0, len(missing), BATCH):
-            flown = fleet.run(stop=run.stop, only=missing[i : i + BATCH]).flown
-            with interrupts_only_set(run.stop):
-                kept.add({keys[flight.spec]: {"preset": fleet.preset.name, **record(flight)} for flight in flown})
-            advance(min(1.0, (i + BATCH) / len(missing)), f"{min(i + BATCH, len(missing))} flights")
-            if run.interrupted:
-                break
+        count = lambda done, n: advance(done / n, f"{done} of {n} flights")  # noqa: E731
+        fleet.run(stop=run.stop, only=missing, landed=keep, progress=count)
 
 
 def _trained(preset: Preset, sweep: Sweep, run: Run, reporter: Reporter) -> dict[int, Policy]:

@@ -39,8 +39,7 @@ class Lagged(AbstractDynamics[LagState[X]]):
 
     def init(self, x: State) -> LagState[X]:
         """Lift to the base model's state, with the actuators at hover."""
-        hover = jax.tree.map(lambda leaf: leaf.astype(x.p.dtype), Command.hover())
-        return LagState(self.base.init(x), hover)
+        return LagState(self.base.init(x), Command.hover(x.p.dtype))
 
     def state(self, s: LagState[X]) -> State:
         """Return the vehicle's state."""

@@ -3,7 +3,7 @@
 Frames, here and everywhere: the world frame has z up; the body frame is forward-left-up; ``R`` maps body to world.
 """
 
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -55,9 +55,14 @@ class Command(eqx.Module):
     """Body rates [rad/s]."""
 
     @classmethod
-    def hover(cls) -> "Command":
-        """Return u_hover = [9.81, 0, 0, 0]."""
-        return cls(jnp.array(STANDARD_GRAVITY), jnp.zeros(3))
+    def hover(cls, dtype: Any = None) -> "Command":
+        """Return u_hover = [9.81, 0, 0, 0].
+
+        Args:
+            dtype: Of its arrays. None for JAX's own, and a thrust of weak type; what is carried from tick to tick needs
+                the type of its successors, or the first tick is a program of its own.
+        """
+        return cls(jnp.array(STANDARD_GRAVITY, dtype=dtype), jnp.zeros(3, dtype=dtype))
 
     def vector(self) -> Float[Array, "4"]:
         """Return [c, omega]."""

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax, random
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, ArrayLike, Float, Int, Key
 
 from ..errors import PlantError
 from ..physics.disturbance import Disturbance
@@ -34,58 +34,88 @@ class SimState(eqx.Module):
     """Mean acceleration over the last tick, world [m/s^2]."""
 
 
-def launch(
-    model: AbstractSubstepDynamics[Any], delay_s: float, sensors: SensorModel | None, x0: State, key: Key[Array, ""]
-) -> SimState:
-    """Return the state of a plant that hovers at ``x0``, with hover commands under way and one sample of ``x0``."""
-    slots = -(-round(delay_s / SUBSTEP) // round(model.dt / SUBSTEP)) + 1
-    queue = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (slots, *leaf.shape)), Command.hover())
-    held = 1 if sensors is None else sensors.held
-    sample = x0 if sensors is None else sensors.noisy(x0, random.fold_in(key, FIRST_SAMPLE))
-    samples = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (held, *leaf.shape)), sample)
-    return SimState(model.init(x0), queue, samples, jnp.zeros_like(x0.p[0]), jnp.zeros_like(x0.p))
+class Simulation(eqx.Module):
+    """All of a simulated plant that is a value: a flight is a pure function of it, a start and commands."""
+
+    model: AbstractSubstepDynamics[Any]
+    """The vehicle."""
+    disturbance: Disturbance
+    """External effects, as a function of time since the start of the flight and state."""
+    sensors: SensorModel | None
+    """None: every measurement is exact."""
+    key: Key[Array, ""]
+    """Seed of noise and dropouts, which follow from it and the tick, so that a flight repeats."""
+    delay_s: float = eqx.field(static=True, default=0.02)
+    """Command delay [s], a whole number of milliseconds."""
+
+    def __check_init__(self) -> None:
+        """Raise ``ValueError`` if a time is not a whole number of steps or samples."""
+        if self.delay_s < 0 or abs(self.delay_s / SUBSTEP - round(self.delay_s / SUBSTEP)) > 1e-6:
+            raise ValueError(
+                f"SimPlant: delay_s = {self.delay_s} s must be a whole, non-negative number of milliseconds"
+            )
+        if self.sensors is not None and round(self.model.dt / SUBSTEP) % self.sensors.period:
+            raise ValueError(
+                f"SimPlant: a tick of {self.model.dt} s is no multiple of the {self.sensors.period} ms of SensorModel"
+            )
+
+    def launch(self, x0: State) -> SimState:
+        """Return the state of a plant that hovers at ``x0``, with hover commands under way and one sample of ``x0``."""
+        slots = -(-round(self.delay_s / SUBSTEP) // round(self.model.dt / SUBSTEP)) + 1
+        queue = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (slots, *leaf.shape)), Command.hover(x0.p.dtype))
+        held = 1 if self.sensors is None else self.sensors.held
+        sample = x0 if self.sensors is None else self.sensors.noisy(x0, random.fold_in(self.key, FIRST_SAMPLE))
+        samples = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (held, *leaf.shape)), sample)
+        return SimState(self.model.init(x0), queue, samples, jnp.zeros_like(x0.p[0]), jnp.zeros_like(x0.p))
+
+    def advance(self, s: SimState, u: Command, tick: Int[ArrayLike, ""]) -> SimState:
+        """Return the state one control tick later, in steps of 1 ms; ``u`` acts :attr:`delay_s` after the tick began.
+
+        Args:
+            s: State at the start of the tick.
+            u: Command, within the vehicle's limits.
+            tick: Number of the tick since the start of the flight.
+        """
+        per_tick, late = round(self.model.dt / SUBSTEP), round(self.delay_s / SUBSTEP)
+        queue = jax.tree.map(lambda old, new: jnp.concatenate([old[1:], new[None]]), s.queue, u)
+        slots = queue.c.shape[0]
+        # In the i-th millisecond, the newest command whose delay has passed is this many ticks old:
+        ages = np.array([-(-max(0, late - i) // per_tick) for i in range(per_tick)])
+
+        def millisecond(inner: Any, xs: tuple[Float[Array, ""], Command]) -> tuple[Any, State]:
+            t, acting = xs
+            after = self.model.substep(inner, acting, self.disturbance(t, self.model.state(inner)))
+            return after, self.model.state(after)
+
+        times = s.t + SUBSTEP * jnp.arange(per_tick, dtype=s.t.dtype)
+        acting = jax.tree.map(lambda leaf: leaf[slots - 1 - ages], queue)
+        inner, path = lax.scan(millisecond, s.model, (times, acting))
+        if (sensors := self.sensors) is None:
+            samples = jax.tree.map(lambda leaf: leaf[-1:], path)
+        else:
+            sampled = jax.tree.map(lambda leaf: leaf[sensors.period - 1 :: sensors.period], path)
+            samples = sensors.received(s.samples, sampled, random.fold_in(self.key, tick))
+        a = (self.model.state(inner).v - self.model.state(s.model).v) / self.model.dt
+        return SimState(inner, queue, samples, s.t + self.model.dt, a)
+
+    def measured(self, s: SimState) -> State:
+        """Return the newest sample that has arrived."""
+        return jax.tree.map(lambda leaf: leaf[0], s.samples)  # type: ignore[no-any-return]
+
+    def true(self, s: SimState) -> State:
+        """Return the state of the vehicle."""
+        return self.model.state(s.model)
+
+    def within_limits(self, u: Command) -> Command:
+        """Return ``u`` as the vehicle accepts it."""
+        if self.model.command_limits is None:
+            return u
+        low, high = self.model.command_limits
+        return jax.tree.map(jnp.clip, u, low, high)  # type: ignore[no-any-return]
 
 
-def advance(
-    model: AbstractSubstepDynamics[Any],
-    disturbance: Disturbance,
-    delay_s: float,
-    sensors: SensorModel | None,
-    s: SimState,
-    u: Command,
-    key: Key[Array, ""],
-) -> SimState:
-    """One control tick in steps of 1 ms; a command issued at the start of a tick acts ``delay`` seconds later."""
-    per_tick, late = round(model.dt / SUBSTEP), round(delay_s / SUBSTEP)
-    queue = jax.tree.map(lambda old, new: jnp.concatenate([old[1:], new[None]]), s.queue, u)
-    slots = queue.c.shape[0]
-    # In the i-th millisecond, the newest command whose delay has passed is this many ticks old:
-    ages = np.array([-(-max(0, late - i) // per_tick) for i in range(per_tick)])
-
-    def millisecond(inner: Any, xs: tuple[Float[Array, ""], Command]) -> tuple[Any, State]:
-        t, acting = xs
-        after = model.substep(inner, acting, disturbance(t, model.state(inner)))
-        return after, model.state(after)
-
-    times = s.t + SUBSTEP * jnp.arange(per_tick, dtype=s.t.dtype)
-    acting = jax.tree.map(lambda leaf: leaf[slots - 1 - ages], queue)
-    inner, path = lax.scan(millisecond, s.model, (times, acting))
-    if sensors is None:
-        samples = jax.tree.map(lambda leaf: leaf[-1:], path)
-    else:
-        sampled = jax.tree.map(lambda leaf: leaf[sensors.period - 1 :: sensors.period], path)
-        samples = sensors.received(s.samples, sampled, key)
-    a = (model.state(inner).v - model.state(s.model).v) / model.dt
-    return SimState(inner, queue, samples, s.t + model.dt, a)
-
-
-def measured_state(s: SimState) -> State:
-    """Return the newest sample that has arrived."""
-    return jax.tree.map(lambda leaf: leaf[0], s.samples)  # type: ignore[no-any-return]
-
-
-_launch = eqx.filter_jit(launch)
-_advance = eqx.filter_jit(advance)
+_launch = eqx.filter_jit(Simulation.launch)
+_advance = eqx.filter_jit(Simulation.advance)
 
 
 class SimPlant(Plant):
@@ -112,26 +142,19 @@ class SimPlant(Plant):
         Raises:
             ValueError: The delay is no whole number of milliseconds, or a tick is no whole number of sensor periods.
         """
-        if delay_s < 0 or abs(delay_s / SUBSTEP - round(delay_s / SUBSTEP)) > 1e-6:
-            raise ValueError(f"SimPlant: delay_s = {delay_s} s must be a whole, non-negative number of milliseconds")
-        if sensors is not None and round(model.dt / SUBSTEP) % sensors.period:
-            raise ValueError(
-                f"SimPlant: a tick of {model.dt} s is no multiple of the {sensors.period} ms of SensorModel"
-            )
+        self.simulation = Simulation(model, disturbance, sensors, random.key(seed), delay_s)
         self.dt = model.dt
-        self._model, self._disturbance, self._delay_s, self._sensors = model, disturbance, delay_s, sensors
         limits = model.command_limits
         self._limits = None if limits is None else (as_numpy(limits[0]), as_numpy(limits[1]))
-        self._key = random.key(seed)
         self._state: SimState | None = None
         self._ticks = 0
 
     def reset(self, x0: State | None) -> Measurement:
         """Hover at ``x0``; without one, 1 m above the ground."""
         start = State.at(jnp.array([0.0, 0.0, 1.0])) if x0 is None else x0
-        self._state = _launch(self._model, self._delay_s, self._sensors, start, self._key)
+        self._state = _launch(self.simulation, start)
         self._ticks = 0
-        return self._measurement(start if self._sensors is None else measured_state(self._state), start)
+        return self._measurement()
 
     def step(self, u: Command) -> tuple[Measurement, Command]:
         """Advance the model by one tick; commands beyond the vehicle's limits are clipped."""
@@ -139,22 +162,22 @@ class SimPlant(Plant):
         if self._state is None:
             raise PlantError("SimPlant: not flying; call reset first")
         accepted = u if self._limits is None else limited(u, wanted, *self._limits)
-        key = random.fold_in(self._key, self._ticks) if self._sensors is not None else self._key
-        self._state = _advance(self._model, self._disturbance, self._delay_s, self._sensors, self._state, accepted, key)
+        self._state = _advance(self.simulation, self._state, accepted, np.int32(self._ticks))
         self._ticks += 1
-        truth = self._model.state(self._state.model)
-        return self._measurement(truth if self._sensors is None else measured_state(self._state), truth), accepted
+        return self._measurement(), accepted
 
-    def _measurement(self, x: State, truth: State) -> Measurement:
+    def _measurement(self) -> Measurement:
         assert self._state is not None
-        t, rotors, a = self._ticks * self.dt, self._model.rotor_state(self._state.model), self._state.a
+        model, sensors, state = self.simulation.model, self.simulation.sensors, self._state
+        t, rotors, truth, a = self._ticks * self.dt, model.rotor_state(state.model), model.state(state.model), state.a
         omega = None if rotors is None else rotors.omega
         speeds = None if rotors is None else rotors.motors
-        if self._sensors is None:
-            return Measurement(t, x, omega, a, speeds, truth=truth)
+        if sensors is None:
+            return Measurement(t, truth, omega, a, speeds, truth=truth)
         if omega is not None:
-            omega, a = _inertial(self._sensors, omega, a, random.fold_in(self._key, self._ticks))
-        return Measurement(t, x, omega, a, speeds, age=1e-3 * self._sensors.latency, truth=truth)
+            omega, a = _inertial(sensors, omega, a, random.fold_in(self.simulation.key, self._ticks))
+        x = self.simulation.measured(state)
+        return Measurement(t, x, omega, a, speeds, age=1e-3 * sensors.latency, truth=truth)
 
     def stop(self) -> None:
         """Forget the flight."""

@@ -44,13 +44,14 @@ class AdaptivePilot(Pilot):
             dt: Control tick [s].
             window: Ticks of flight that learners see.
         """
-        self._controller = controller
+        self.controller_of = controller
         self.dt: float = dt
-        self._learners = tuple(learners)
-        self._periods = [max(1, round(each.every_s / dt)) for each in self._learners]
+        self.learners = tuple(learners)
+        self.periods = [max(1, round(each.every_s / dt)) for each in self.learners]
+        self.window = window
         self._buffer = RollingBuffer(window)
         self._pilot = ControllerPilot(controller(state.policy.policy.merged()))
-        self._ticks_offered = [0] * len(self._learners)
+        self._ticks_offered = [0] * len(self.learners)
         self._start = 0.0
         self._new_events: list[Event] = []
         self.state = state
@@ -59,15 +60,15 @@ class AdaptivePilot(Pilot):
     def reset(self, measurement: Measurement) -> None:
         """Start a flight: what was learnt stays; the buffer and what is under way do not."""
         self._buffer.clear()
-        self._start, self._ticks_offered = measurement.t, [0] * len(self._learners)
-        for learner, _ in self._learners:
+        self._start, self._ticks_offered = measurement.t, [0] * len(self.learners)
+        for learner, _ in self.learners:
             learner.reset()
         self._pilot.reset(measurement)
 
     def warm_up(self, measurement: Measurement) -> None:
         """Compile the programs of flight and of every learner; what they learn from one tick is dropped."""
         super().warm_up(measurement)
-        for learner, _ in self._learners:
+        for learner, _ in self.learners:
             learner.submit(self._buffer.window(), 0)
             learner.reset()
 
@@ -78,12 +79,12 @@ class AdaptivePilot(Pilot):
         self._apply(t, tick)
         u = self._pilot.act(measurement)
         self._buffer.push(t, measurement.x, u)
-        due = [i for i, period in enumerate(self._periods) if tick // period > self._ticks_offered[i]]
+        due = [i for i, period in enumerate(self.periods) if tick // period > self._ticks_offered[i]]
         if due:
             window = self._buffer.window()
             for i in due:
-                self._ticks_offered[i] = tick // self._periods[i]
-                self._learners[i].learner.submit(window, tick)
+                self._ticks_offered[i] = tick // self.periods[i]
+                self.learners[i].learner.submit(window, tick)
             self._apply(t, tick)  # skips are known at once
         return u
 
@@ -98,7 +99,7 @@ class AdaptivePilot(Pilot):
         return found
 
     def _apply(self, t: float, tick: int) -> None:
-        for learner, _ in self._learners:
+        for learner, _ in self.learners:
             for update in learner.poll(tick):
                 self._publish(update)
                 self.events.append(Event.of(t, update))
@@ -109,6 +110,6 @@ class AdaptivePilot(Pilot):
             self.state = LearnerState(self.state.policy, update.state)
         elif isinstance(update, PolicyUpdate):
             self.state = LearnerState(update.state, self.state.residual)
-            self._pilot.controller = self._controller(update.state.policy.merged())
-        for learner, _ in self._learners:
+            self._pilot.controller = self.controller_of(update.state.policy.merged())
+        for learner, _ in self.learners:
             learner.receive(update)

@@ -24,19 +24,23 @@ class LockstepLearner(Learner):
             latency_s: Flight time from a window to its update [s]; None: as long as the worker takes by the clock.
             dt: Control tick [s]; latencies are rounded up to whole ticks.
         """
-        self._worker, self._latency_s, self._dt = worker, latency_s, dt
+        self.worker, self.latency_s, self._dt = worker, latency_s, dt
         self._ready: tuple[int, Update] | None = None
         self._skipped: list[Update] = []
 
     def submit(self, window: Window, tick: int) -> None:
         """Learn from ``window`` now; note a skip if the last update is not visible yet."""
         if self._ready is not None:
-            self._skipped.append(Skip(float(window.t[-1]), self._worker.layer))
+            self._skipped.append(Skip(float(window.t[-1]), self.worker.layer))
             return
         began = time.perf_counter()
-        update = self._worker.learn(window)
-        seconds = time.perf_counter() - began if self._latency_s is None else self._latency_s
-        self._ready = (tick + max(1, math.ceil(seconds / self._dt - 1e-6)), update)
+        update = self.worker.learn(window)
+        seconds = time.perf_counter() - began if self.latency_s is None else self.latency_s
+        self._ready = (tick + self.ticks(seconds), update)
+
+    def ticks(self, seconds: float) -> int:
+        """Return after how many ticks the update of a computation that takes ``seconds`` is visible: at least one."""
+        return max(1, math.ceil(seconds / self._dt - 1e-6))
 
     def poll(self, tick: int) -> list[Update]:
         """Return the updates that are visible at this tick."""
@@ -47,7 +51,7 @@ class LockstepLearner(Learner):
 
     def receive(self, update: Update) -> None:
         """Pass a published update on to the worker."""
-        self._worker.receive(update)
+        self.worker.receive(update)
 
     def reset(self) -> None:
         """Drop what is under way."""

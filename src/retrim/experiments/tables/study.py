@@ -88,7 +88,6 @@ def fly_all(
     fleet = Fleet(study.preset, study.policies, scenarios, methods=methods, starts=starts, seconds=seconds)
     with run.interruptible(), reporter.progress("flying") as advance:
         advance(0.0, "compiling the programs of a flight (kept in a cache for the next time)")
-        fleet.warm_up()
         return fleet.run(stop=run.stop, progress=lambda done, n: advance(done / n, f"{done} of {n} flights"))
     return Flights([], interrupted=True)
 

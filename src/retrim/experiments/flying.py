@@ -1,0 +1,172 @@
+"""How the flights of a fleet are flown: one by one, or in lots, each as one program."""
+
+from collections.abc import Callable, Hashable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array
+
+from ..adapt.learner import LearnerState
+from ..config.setup import Latency, Setup
+from ..control.lora import LoraPolicy
+from ..control.policy import Policy
+from ..physics.state import State
+from ..plants.sim import SimPlant
+from ..runtime.adaptive import AdaptivePilot
+from ..runtime.events import Observer
+from ..runtime.flight import Log, States, fly
+from ..runtime.pilot import Pilot
+from ..runtime.together import can_fly_together, fly_together
+from ..tasks.task import AbstractTask
+from .flights import Flight, FlightSpec
+
+FLOOR = -0.5  # [m]: a vehicle below this is terminated; starts may lie at z = 0, and a transient dips below them
+
+
+def fly_one(
+    setup: Setup,
+    policy: Policy | LoraPolicy,
+    spec: FlightSpec,
+    x0: State,
+    seconds: float,
+    *,
+    latency: Latency = "fixed",
+    state: LearnerState | None = None,
+    observers: tuple[Observer, ...] = (),
+    stop: Any = None,
+) -> Flight:
+    """Fly one flight.
+
+    Args:
+        setup: Preset of the policy, on the scenario's reference.
+        policy: What flies.
+        spec: Scenario, method and seeds.
+        x0: State at the start.
+        seconds: Length of the flight.
+        latency: What learning costs in flight time.
+        state: What an earlier flight learnt, to go on from.
+        observers: They follow the flight.
+        stop: A ``threading.Event`` that gives the flight up.
+
+    Raises:
+        PlantError: The plant refused.
+        FlightStopped: ``stop`` was set.
+    """
+    preset, task = setup.preset, setup.flown
+    pilot = setup.pilot(policy, spec.method, spec.key(), latency=latency, state=state)
+    plant = spec.scenario.make(preset.vehicle, dt=preset.dt, seed=spec.plant_seed)
+
+    def terminated(t: float, x: State) -> bool:
+        return bool(_terminated(task, np.float64(t), x))
+
+    log = fly(plant, pilot, x0, ticks=round(seconds / preset.dt), terminated=terminated, observers=observers, stop=stop)
+    return _scored(setup, spec, log, pilot)
+
+
+def program_of(setup: Setup, policy: Policy | LoraPolicy, specs: Sequence[FlightSpec]) -> Hashable:
+    """Return what tells the program of a batch apart, for flights that differ in start and seed only.
+
+    It is judged by the first two of them.
+
+    Returns:
+        None if they cannot be flown as one program.
+
+    Raises:
+        PlantError: The package of the plant is not installed.
+    """
+    if len(specs) < 2:
+        return None
+    plants = [spec.scenario.make(setup.preset.vehicle, dt=setup.preset.dt) for spec in specs[:2]]
+    if not can_fly_together(plants, [setup.pilot(policy, spec.method, spec.key()) for spec in specs[:2]]):
+        return None
+    return specs[0].method, jax.tree.structure([plant.simulation for plant in plants if isinstance(plant, SimPlant)])
+
+
+def fly_lot(
+    setup: Setup,
+    policies: Sequence[Policy | LoraPolicy],
+    specs: Sequence[FlightSpec],
+    starts: Sequence[State],
+    seconds: float,
+    *,
+    state: LearnerState | None = None,
+    progress: Callable[[float], None] = lambda share: None,
+    stop: Any = None,
+    cold: bool = False,
+) -> list[Flight]:
+    """Fly flights as a batch; see :func:`program_of`.
+
+    Args:
+        setup: Preset of the policies, on the scenario's reference.
+        policies: What flies, one for each flight.
+        specs: One scenario and method; starts and seeds.
+        starts: States at the start, one for each flight.
+        seconds: Length of the flights.
+        state: What an earlier flight learnt, to go on from.
+        progress: Called now and then with the share that was flown.
+        stop: A ``threading.Event`` that gives the flights up.
+        cold: No such batch was flown yet.
+
+    Raises:
+        FlightStopped: ``stop`` was set.
+    """
+    preset = setup.preset
+    pilots = [setup.pilot(p, s.method, s.key(), state=state) for p, s in zip(policies, specs, strict=True)]
+    plants = [spec.scenario.make(preset.vehicle, dt=preset.dt, seed=spec.plant_seed) for spec in specs]
+    simulated = [plant for plant in plants if isinstance(plant, SimPlant)]
+    ticks = round(seconds / preset.dt)
+    logs = fly_together(simulated, pilots, starts, ticks=ticks, progress=progress, stop=stop, cold=cold)
+    return [
+        _scored(setup, spec, _until_terminated(setup.flown, log), pilot)
+        for spec, log, pilot in zip(specs, logs, pilots, strict=True)
+    ]
+
+
+def _until_terminated(task: AbstractTask, log: Log) -> Log:
+    """Cut a log where the vehicle left the task's bounds; a batch flies on."""
+    left = np.flatnonzero(np.asarray(_ends(task, log.t, log.true.as_state()))[1:])
+    if not len(left):
+        return log
+    rows = int(left[0]) + 2
+    true, measured = (States(*(part[:rows] for part in states)) for states in (log.true, log.measured))
+    events = tuple(event for event in log.events if event.t < log.t[rows - 1])
+    return Log(log.t[:rows], true, measured, log.u[:rows], log.dt, True, events)
+
+
+def _scored(setup: Setup, spec: FlightSpec, log: Log, pilot: Pilot) -> Flight:
+    task = setup.flown
+    error, cross = _errors(task, log.t, log.true.as_state())
+    return Flight(
+        spec,
+        spec.scenario.vehicle_name(setup.preset.vehicle),
+        log,
+        np.asarray(error),
+        task.metric,
+        task.steady_seconds,
+        None if cross is None else np.asarray(cross),
+        pilot.state if isinstance(pilot, AdaptivePilot) else None,
+    )
+
+
+@eqx.filter_jit
+def _terminated(task: AbstractTask, t: Any, x: State) -> Array:
+    return task.terminated(jnp.asarray(t, dtype=x.p.dtype), x) | (x.p[2] < FLOOR)
+
+
+@eqx.filter_jit
+def _ends(task: AbstractTask, t: Any, x: State) -> Array:
+    times = jnp.asarray(t, dtype=x.p.dtype)
+    ends: Array = jax.vmap(lambda t, x: task.terminated(t, x) | (x.p[2] < FLOOR))(times, x)
+    return ends
+
+
+@eqx.filter_jit
+def _errors(task: AbstractTask, t: Any, x: State) -> tuple[Array, Array | None]:
+    times = jnp.asarray(t, dtype=x.p.dtype)
+    error = jax.vmap(task.error)(times, x)
+    first = jax.eval_shape(task.cross_track, jax.tree.map(lambda leaf: leaf[0], x))
+    return error, None if first is None else lax.map(task.cross_track, x)

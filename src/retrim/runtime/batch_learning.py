@@ -1,0 +1,218 @@
+"""Learning beside a batch of flights, on the virtual clock.
+
+When learners are offered windows, and when their updates become visible, follows from periods and latencies alone. So
+between two such instants all flights are one program, and so are the fits and the updates of all flights.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import random
+from jaxtyping import Array, Key
+
+from ..adapt.gate import Verdict
+from ..adapt.learner import FitReport, LearnerState, OnlineLearner
+from ..adapt.updates import Layer, Skip, Update
+from ..adapt.workers import PolicyWorker, ResidualWorker, policy_update, residual_update
+from ..control.controller import AbstractController
+from ..control.policy import Policy
+from ..learn.bptt import PolicyState
+from ..learn.window import Window
+from ..physics.state import where
+from .adaptive import AdaptivePilot
+from .batch import Batch
+from .events import Event
+from .lockstep import LockstepLearner
+
+RESIDUAL, POLICY = 0, 1
+LAYERS: tuple[Layer, Layer] = ("residual", "policy")
+"""In the order in which a pilot asks them."""
+
+
+class Offer(NamedTuple):
+    """A window that is offered to a learner, and what comes of it."""
+
+    tick: int
+    visible: int | None
+    """Tick at which its update becomes visible; None for a learner that is busy."""
+
+
+def offers(period: int, latency: int, ticks: int) -> list[Offer]:
+    """Return every offer to a learner in a flight.
+
+    Args:
+        period: Time between offers [ticks].
+        latency: From an offer to its update [ticks].
+        ticks: Length of the flight.
+    """
+    found, free = list[Offer](), 0
+    for tick in range(period, ticks, period):
+        busy = tick < free
+        free = free if busy else tick + latency
+        found.append(Offer(tick, None if busy else free))
+    return found
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How a pilot of the virtual clock learns, as values."""
+
+    learner: OnlineLearner
+    controller: Callable[[Policy], AbstractController[Any]]
+    key: Key[Array, ""]
+    """Seed of its updates."""
+    window: int
+    periods: tuple[int, int]
+    """Of the two layers [ticks]."""
+    latencies: tuple[int, int]
+
+    @classmethod
+    def of(cls, pilot: AdaptivePilot) -> "Plan | None":
+        """Return the plan of a pilot; None if it has other learners, or is charged what the clock shows."""
+        match [each.learner for each in pilot.learners]:
+            case [
+                LockstepLearner(worker=ResidualWorker(learner=other), latency_s=float(first)) as fit,
+                LockstepLearner(worker=PolicyWorker(learner=learner, key=key), latency_s=float(second)) as update,
+            ] if other is learner:
+                latencies = fit.ticks(first), update.ticks(second)
+                periods = pilot.periods[RESIDUAL], pilot.periods[POLICY]
+                return cls(learner, pilot.controller_of, key, pilot.window, periods, latencies)
+            case _:
+                return None
+
+    def same_as(self, other: "Plan") -> bool:
+        """Return whether two plans differ in their seeds only."""
+        mine, theirs = ((p.controller, p.window, p.periods, p.latencies) for p in (self, other))
+        return self.learner is other.learner and mine == theirs
+
+
+def fly_and_learn(
+    batch: Batch, plans: Sequence[Plan], state: LearnerState, *, cold: bool
+) -> tuple[LearnerState, list[list[Event]]]:
+    """Fly a batch to its end, with learning.
+
+    Args:
+        batch: Flights that have not begun.
+        plans: One for each flight, the same but for their seeds.
+        state: What each has learnt before (leading axis flights).
+        cold: Programs are not compiled yet; those of flight and of learning are at the same time.
+
+    Returns:
+        What each has learnt, and the events of each flight.
+    """
+    plan, keys = plans[0], jnp.stack([each.key for each in plans])
+    instants = _instants(plan, batch.ticks)
+    swaps = [instant.tick for instant in instants if instant.published and instant.layer == POLICY]
+    batch.chunk = math.gcd(*swaps) if swaps else batch.ticks
+    batch.controllers = _controllers(plan, state)
+    if cold:
+        with ThreadPoolExecutor(1) as beside:
+            compiled = beside.submit(_learn_from_nothing, plan.learner, state, batch.blank_window(plan.window), keys)
+            batch.fly_to(1)
+            compiled.result()
+    pending: dict[int, tuple[Any, list[Update]]] = {}
+    events = [list[Event]() for _ in plans]
+    for instant in instants:
+        tick, _, layer, offer = instant
+        if instant.published:
+            learnt, updates = pending.pop(layer)
+            if layer == RESIDUAL:
+                state = LearnerState(state.policy, learnt)
+            else:
+                batch.fly_to(tick)
+                state = LearnerState(learnt, state.residual)
+                batch.controllers = _controllers(plan, state)
+        elif offer.visible is None:
+            updates = [Skip(tick * batch.dt, LAYERS[layer])] * len(plans)
+        else:
+            batch.fly_to(tick + 1)
+            window = batch.window(tick, plan.window)
+            if layer == RESIDUAL:
+                pending[layer] = _fitted(plan.learner, state, window)
+            else:
+                keys, trained, updates = _updated(plan.learner, state, window, keys)
+                pending[layer] = trained, updates
+            continue
+        for told, update in zip(events, updates, strict=True):
+            told.append(Event.of(tick * batch.dt, update))
+    batch.fly_to(batch.ticks)
+    return state, events
+
+
+def _learn_from_nothing(learner: OnlineLearner, state: LearnerState, window: Window, keys: Key[Array, " n"]) -> None:
+    """Compile the programs of learning; what they learn is dropped."""
+    _fitted(learner, state, window)
+    _updated(learner, state, window, keys)
+
+
+class _Instant(NamedTuple):
+    """Something that happens beside the flights; sorted, they are in the order of a pilot."""
+
+    tick: int
+    order: int
+    """0: an update is published, before the tick is flown; 1: a window is offered, after the command."""
+    layer: int
+    offer: Offer
+
+    @property
+    def published(self) -> bool:
+        return self.order == 0
+
+
+def _instants(plan: Plan, ticks: int) -> list[_Instant]:
+    found = list[_Instant]()
+    for layer in (RESIDUAL, POLICY):
+        for offer in offers(plan.periods[layer], plan.latencies[layer], ticks):
+            found.append(_Instant(offer.tick, 1, layer, offer))
+            if offer.visible is not None and offer.visible < ticks:
+                found.append(_Instant(offer.visible, 0, layer, offer))
+    return sorted(found, key=lambda instant: instant[:3])
+
+
+def _controllers(plan: Plan, state: LearnerState) -> Any:
+    return eqx.filter_vmap(lambda policy: plan.controller(policy.merged()))(state.policy.policy)
+
+
+def _fitted(learner: OnlineLearner, state: LearnerState, window: Window) -> tuple[Any, list[Update]]:
+    """Fit the residual of every flight; return the states, and what each flight is told, with the states of all."""
+    states, reports = _fit(learner, state.residual, window)
+    reports, t = jax.device_get((reports, window.t[:, -1]))
+    return states, [residual_update(float(t[i]), states, _row(reports, i)) for i in range(len(t))]
+
+
+def _updated(
+    learner: OnlineLearner, state: LearnerState, window: Window, keys: Key[Array, " n"]
+) -> tuple[Key[Array, " n"], Any, list[Update]]:
+    """Re-train the policy of every flight; a flight keeps its own where the gate refused the new one."""
+    keys, trained, verdicts = _update(learner, state, window, keys)
+    verdicts, t = jax.device_get((verdicts, window.t[:, -1]))
+    return keys, trained, [policy_update(float(t[i]), trained, _row(verdicts, i)) for i in range(len(t))]
+
+
+def _row(tree: Any, i: int) -> Any:
+    return jax.tree.map(lambda leaf: leaf[i], tree)
+
+
+@eqx.filter_jit
+def _fit(learner: OnlineLearner, residuals: Any, windows: Window) -> tuple[Any, FitReport]:
+    fitted: tuple[Any, FitReport] = eqx.filter_vmap(learner.fit_residual)(residuals, windows)
+    return fitted
+
+
+@eqx.filter_jit
+def _update(
+    learner: OnlineLearner, state: LearnerState, windows: Window, keys: Key[Array, " n"]
+) -> tuple[Key[Array, " n"], PolicyState, Verdict]:
+    def update(state: LearnerState, window: Window, key: Key[Array, ""]) -> tuple[Key[Array, ""], PolicyState, Verdict]:
+        key, now = random.split(key)
+        trained, verdict = learner.update_policy(state.policy, state.residual, window, now)
+        return key, where(verdict.admitted, trained, state.policy), verdict
+
+    updated: tuple[Key[Array, " n"], PolicyState, Verdict] = eqx.filter_vmap(update)(state, windows, keys)
+    return updated

@@ -1,0 +1,91 @@
+"""Many flights at once: a batch in step, the same flights as each flown alone with its own pilot."""
+
+import threading
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+
+from ..physics.state import State
+from ..plants.plant import Plant
+from ..plants.sim import SimPlant
+from .adaptive import AdaptivePilot
+from .batch import Batch, one, stacked
+from .batch_learning import Plan, fly_and_learn
+from .events import Event
+from .flight import Log
+from .pilot import ControllerPilot, Pilot
+
+
+def can_fly_together(plants: Sequence[Plant], pilots: Sequence[Pilot]) -> bool:
+    """Return whether flights can be one batch: simulated plants of one make, and pilots of one kind.
+
+    Such pilots fly one kind of controller, or learn by one learner on the virtual clock, with fixed latencies.
+    """
+    simulations = [plant.simulation for plant in plants if type(plant) is SimPlant]
+    if len(simulations) < len(plants) or not _alike(simulations):
+        return False
+    controllers = [pilot.controller for pilot in pilots if type(pilot) is ControllerPilot]
+    if controllers:
+        return len(controllers) == len(pilots) and _alike(controllers)
+    learning = [pilot for pilot in pilots if type(pilot) is AdaptivePilot]
+    plans = [plan for pilot in learning if (plan := Plan.of(pilot)) is not None]
+    alike = len(plans) == len(pilots) and all(plan.same_as(plans[0]) for plan in plans)
+    return alike and _alike([pilot.state for pilot in learning])
+
+
+def fly_together(
+    plants: Sequence[SimPlant],
+    pilots: Sequence[Pilot],
+    starts: Sequence[State],
+    *,
+    ticks: int,
+    progress: Callable[[float], None] = lambda share: None,
+    stop: threading.Event | None = None,
+    cold: bool = False,
+) -> list[Log]:
+    """Fly a batch. Nothing terminates a flight; pilots that learn have learnt when it is over.
+
+    Args:
+        plants: One for each flight.
+        pilots: One for each flight; :func:`can_fly_together` said so.
+        starts: States at the start.
+        ticks: Length of the flights.
+        progress: Called now and then with the share that was flown.
+        stop: Set from another thread to give the flights up.
+        cold: No such batch was flown yet: programs of flight and of learning are compiled at the same time.
+
+    Returns:
+        A log for each flight, with one row more than ticks.
+
+    Raises:
+        FlightStopped: ``stop`` was set.
+    """
+    batch = Batch(stacked([plant.simulation for plant in plants]), stacked(starts), ticks, plants[0].dt, progress, stop)
+    learning = [pilot for pilot in pilots if isinstance(pilot, AdaptivePilot)]
+    events: Sequence[Sequence[Event]]
+    if learning:
+        plans, begun = [_plan(pilot) for pilot in learning], stacked([pilot.state for pilot in learning])
+        states, events = fly_and_learn(batch, plans, begun, cold=cold)
+        for i, pilot in enumerate(learning):
+            pilot.state = one(states, i)
+    else:
+        batch.controllers = stacked([pilot.controller for pilot in pilots if isinstance(pilot, ControllerPilot)])
+        batch.fly_to(ticks)
+        events = [()] * len(pilots)
+    return [batch.log(i, events[i]) for i in range(len(pilots))]
+
+
+def _alike(trees: Sequence[Any]) -> bool:
+    """Return whether trees can be stacked: the same structure, shapes and types, and all else equal."""
+    kinds = [eqx.partition(tree, eqx.is_array) for tree in trees]
+    shapes = [[(leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(arrays)] for arrays, _ in kinds]
+    return all(bool(eqx.tree_equal(static, kinds[0][1])) for _, static in kinds) and all(s == shapes[0] for s in shapes)
+
+
+def _plan(pilot: AdaptivePilot) -> Plan:
+    plan = Plan.of(pilot)
+    if plan is None:
+        raise ValueError("fly_together: a pilot that learns by the clock flies alone")
+    return plan

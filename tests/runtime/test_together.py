@@ -1,0 +1,133 @@
+"""A batch of flights that learn is the same as each flown alone with its own pilot."""
+
+import threading
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from helpers import CheapModel, tiny_preset
+from retrim.adapt.updates import Rejection, Skip
+from retrim.config import Setup, disturbance
+from retrim.learn import Window
+from retrim.physics import Command
+from retrim.plants import SensorModel, SimPlant
+from retrim.runtime import FlightStopped, FunctionPilot, LockstepLearner, fly
+from retrim.runtime.batch_learning import offers
+from retrim.runtime.together import can_fly_together, fly_together
+
+TICKS = 70
+
+
+class Counting:
+    """A worker that learns nothing."""
+
+    layer = "policy"
+
+    def learn(self, window):
+        return Rejection(0.0, "policy", "learns nothing")
+
+    def receive(self, update):
+        pass
+
+
+STILL = Window.of(np.zeros(1), np.zeros((1, 3)), np.eye(3)[None], np.zeros((1, 3)), np.full(1, 9.81), np.zeros((1, 3)))
+
+
+@given(period=st.integers(1, 12), latency=st.integers(1, 30))
+def test_offers_are_those_of_a_learner_on_the_virtual_clock(period, latency):
+    learner, told = LockstepLearner(Counting(), 0.02 * latency, 0.02), []
+    for tick in range(60):
+        told += [(tick, type(update)) for update in learner.poll(tick)]
+        if tick and tick % period == 0:
+            learner.submit(STILL, tick)
+            told += [(tick, type(update)) for update in learner.poll(tick)]
+    expected = []
+    for offer in offers(period, latency, 60):
+        expected.append((offer.tick, Skip) if offer.visible is None else (offer.visible, Rejection))
+    assert sorted(told, key=str) == sorted((each for each in expected if each[0] < 60), key=str)
+
+
+@pytest.fixture(scope="module", params=["lora", "busy"])
+def flown(request, as_a_user):
+    """Three flights that learn, with noisy sensors; in the second case learners are busy at every other offer."""
+    busy = request.param == "busy"
+    soon = {"window": 20, "fit_every": 0.2, "update_every": 0.3, "fit_latency": 0.1, "update_latency": 0.1}
+    preset = tiny_preset(adapt=soon | ({"update_latency": 0.38} if busy else {}))
+    setup = Setup.of(preset)
+    policies = [setup.new_policy(jax.random.key(seed)) for seed in (0, 0, 5)]
+    starts = setup.flight_starts(3)
+    sensors = SensorModel.of(position=1e-3, velocity=3e-3, attitude=1e-3, latency=10)
+
+    def parts():
+        method = "full" if busy else "lora"
+        pilots = [setup.pilot(policy, method, jax.random.key(i)) for i, policy in enumerate(policies)]
+        push = disturbance("small")
+        return [SimPlant(CheapModel(0.02), push, sensors=sensors, seed=i) for i in range(3)], pilots
+
+    plants, pilots = parts()
+    assert can_fly_together(plants, pilots)
+    told = []
+    logs = fly_together(plants, pilots, starts, ticks=TICKS, progress=told.append, cold=busy)
+    others, alone = parts()
+    each = [fly(plant, pilot, x0, ticks=TICKS) for plant, pilot, x0 in zip(others, alone, starts, strict=True)]
+    return logs, pilots, each, alone, told, setup
+
+
+def test_states_commands_and_times_are_the_same(flown):
+    logs, _, each, _, told, _ = flown
+    for log, other in zip(logs, each, strict=True):
+        np.testing.assert_array_equal(log.t, other.t)
+        for states, others in ((log.true, other.true), (log.measured, other.measured)):
+            for a, b in zip(states, others, strict=True):
+                np.testing.assert_allclose(a, b, atol=2e-4)
+        np.testing.assert_allclose(log.u, other.u, atol=2e-3)
+        assert not log.terminated
+    assert told[-1] == 1.0
+    assert told == sorted(told)
+
+
+def test_events_are_the_same(flown):
+    logs, _, each, _, _, _ = flown
+    for log, other in zip(logs, each, strict=True):
+        assert [(e.t, e.kind) for e in log.events] == [(e.t, e.kind) for e in other.events]
+    kinds = {event.kind for log in logs for event in log.events}
+    assert "residual" in kinds
+    assert kinds & {"policy", "rejected"}
+
+
+def test_pilots_have_learnt_the_same(flown):
+    """By what it does: Adam moves a weight of hardly any gradient either way, by rounding."""
+    _, pilots, _, alone, _, setup = flown
+    inputs = np.random.default_rng(0).normal(size=(50, 23)).astype(np.float32)
+    for pilot, other in zip(pilots, alone, strict=True):
+        a, b = (jax.vmap(each.state.policy.policy.merged())(inputs) for each in (pilot, other))
+        np.testing.assert_allclose(a.c, b.c, atol=0.03)
+        np.testing.assert_allclose(a.omega, b.omega, atol=0.03)
+        a, b = (
+            setup.learner.residual_model.predict(each.state.residual, setup.flight_starts(1)[0], Command.hover())
+            for each in (pilot, other)
+        )
+        np.testing.assert_allclose(a, b, atol=0.05)
+
+
+def test_what_cannot_be_one_program_is_told(as_a_user):
+    setup = Setup.of(tiny_preset())
+    policy = setup.new_policy(jax.random.key(0))
+    calm, windy = ([SimPlant(CheapModel(0.02), disturbance(name), seed=i) for i in (0, 1)] for name in ("none", "wind"))
+    base = [setup.pilot(policy) for _ in range(2)]
+    learning = [setup.pilot(policy, "full", jax.random.key(i)) for i in range(2)]
+    assert can_fly_together(calm, base)
+    assert can_fly_together(windy, learning)
+    assert not can_fly_together([calm[0], windy[0]], base)
+    assert not can_fly_together(calm, [base[0], learning[0]])
+    assert not can_fly_together(calm, [base[0], setup.pilot(policy, "base-i")])
+    by_the_clock = [setup.pilot(policy, "full", jax.random.key(i), latency="measured") for i in range(2)]
+    assert not can_fly_together(calm, by_the_clock)
+    assert not can_fly_together(calm, [FunctionPilot(lambda m: None)] * 2)
+    stop = threading.Event()
+    stop.set()
+    with pytest.raises(FlightStopped):
+        fly_together(calm, base, setup.flight_starts(2), ticks=5, stop=stop)
