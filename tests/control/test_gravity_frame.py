@@ -75,7 +75,7 @@ def test_a_constant_push_leaves_nothing_to_learn():
 
 def test_the_frame_is_capped_and_defined_near_free_fall():
     """An estimate beyond the limit turns no farther; a falling vehicle still has a frame."""
-    observer = DisturbanceObserver(PointMass(0.02), jnp.array(0.2), jnp.array(6.0))
+    observer = DisturbanceObserver(PointMass(0.02), jnp.array(0.2), jnp.array(6.0), jnp.array(2.0))
     s = observer.init(State.at(jnp.zeros(3)))
     falling = State(jnp.zeros(3), jnp.eye(3), jnp.array([0.0, 0.0, -1e4]))
     s = observer(s, falling)
@@ -91,7 +91,7 @@ def test_a_flight_under_a_known_push_is_the_calm_flight_turned(d):
     env, d = hover_env(horizon=60), jnp.array(d)
     policy = Policy.of(15, small(), key=random.key(3), hidden=(8, 8))
     inner = PolicyController(env.task.observation, policy)
-    exact = replaced(DisturbanceObserver(PointMass(0.02), jnp.array(1e-9), jnp.array(9.0)))
+    exact = DisturbanceObserver(PointMass(0.02), jnp.array(1e-9), jnp.array(9.0), jnp.array(jnp.inf))
     framed = GravityFrame(inner, exact, PIVOT)
     x0 = State(PIVOT + jnp.array([0.2, -0.1, 0.3]), so3.exp(jnp.array([0.1, 0.2, 0.0])), jnp.zeros(3))
     Q, extra = tilted(d)
@@ -106,7 +106,8 @@ def test_a_flight_under_a_known_push_is_the_calm_flight_turned(d):
 
     memory = framed.init(x)
     gained = 9.81 * x.R[:, 2] - jnp.array([0.0, 0.0, 9.81]) + d  # in the tick before the start, at hover thrust
-    memory = replaced(memory, observer=replaced(memory.observer, d_hat=d, last=replaced(x, v=x.v - 0.02 * gained)))
+    before = replaced(x, v=x.v - 0.02 * gained)
+    memory = replaced(memory, observer=replaced(memory.observer, d_hat=d, last=before, v=before.v))
     positions = []
     for k in range(40):
         positions.append(turned(Q, PIVOT, x).p)

@@ -22,7 +22,8 @@ from ..tasks.observation import StateObs
 from ..tasks.task import AbstractTask
 from .presets import Preset
 
-OBSERVER_TAU = 0.2  # [s]
+OBSERVER_TAU = 0.05  # [s]: half of it is unstable where the plant's delay is 40 ms longer than declared
+WANDER = 4.0  # [m/s^2] in a second
 TILT_LIMIT = 6.0  # [m/s^2], largest disturbance that turns a frame: gravity keeps a downward part
 
 
@@ -70,6 +71,10 @@ def check_frame(preset: Preset, task: AbstractTask) -> None:
 def gravity_frame(controller: AbstractController[Any], preset: Preset, goal: Float[Array, "3"]) -> GravityFrame:
     """Return a controller for hover, flown in the gravity that a disturbance observer feels."""
     observer = DisturbanceObserver(
-        PointMass(preset.dt), jnp.array(OBSERVER_TAU), jnp.array(TILT_LIMIT), delay_ticks=preset.plant_delay_ticks
+        PointMass(preset.dt),
+        jnp.array(OBSERVER_TAU),
+        jnp.array(TILT_LIMIT),
+        jnp.array(WANDER),
+        delay_ticks=preset.plant_delay_ticks,
     )
     return GravityFrame(controller, observer, goal)

@@ -48,9 +48,8 @@ class GravityFrame(AbstractController[GravityFrameState]):
 
     def accepted(self, memory: GravityFrameState, u: Command) -> GravityFrameState:
         """Remember the accepted command, in the observer and, less the correction, in the controller inside."""
-        s = memory.observer
-        _, extra = tilted(s.d_hat)
-        observer = ObserverState(s.last, (*s.commands[:-1], u), s.d_hat)
+        _, extra = tilted(memory.observer.d_hat)
+        observer = self.observer.accepted(memory.observer, u)
         return GravityFrameState(observer, self.inner.accepted(memory.inner, Command(u.c - extra, u.omega)))
 
 

@@ -1,4 +1,16 @@
-"""Disturbance observer: the acceleration that the nominal model misses, low-passed, from states and commands."""
+"""Disturbance observer: the acceleration that the nominal model misses, from states and commands.
+
+A filter of two states per axis, velocity v and disturbance d: the nominal model predicts how v changes over a tick, d
+stands still, and the measured velocity corrects both,
+
+    v <- v_predicted + (1 - z w) (v_measured - v_predicted),
+    d <- d + (1 - z) (1 - w) (v_measured - v_predicted) / dt,
+
+with the poles z and w. One of them belongs to the time constant that a vehicle's unmodelled motors and delays allow.
+The other has the bandwidth of the steady Kalman filter for a disturbance that wanders by q sqrt(t) and velocities of
+noise r per tick, (q / (r sqrt(dt)))^(1/2) [rad/s]; r is that of the last second. Without noise it is zero, and the
+observer is a first-order low-pass of what the model missed in each tick.
+"""
 
 from typing import Any
 
@@ -6,48 +18,83 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..physics import so3
 from ..physics.dynamics import AbstractDynamics
 from ..physics.state import Command, State
+
+NOISE_TAU = 1.0  # [s], memory of the estimated noise
+SECOND_DIFFERENCE = 1.954  # mean magnitude of the second difference of white noise, in standard deviations
 
 
 class ObserverState(eqx.Module):
     """Memory of the observer."""
 
     last: State
-    """State one tick ago."""
+    """State measured one tick ago."""
     commands: tuple[Command, ...]
     """Commands of the last ticks, oldest first; the oldest acted during the tick that has just ended."""
+    v: Float[Array, "3"]
+    """Estimated velocity, world [m/s]."""
     d_hat: Float[Array, "3"]
     """Estimated disturbance acceleration, world [m/s^2]."""
+    missed: Float[Array, "3"]
+    """What the model missed in the last tick by the measured velocities alone, world [m/s^2]."""
+    noise: Float[Array, ""]
+    """Estimated standard deviation of a measured velocity per axis [m/s]."""
 
 
 class DisturbanceObserver(eqx.Module):
-    """First-order low-pass of a_gt - a_hat: the difference of velocity over a tick against the nominal model's."""
+    """Estimates the disturbance that acts now, as fast as noise and unmodelled dynamics allow."""
 
     nominal: AbstractDynamics[Any]
     tau: Float[Array, ""]
-    """Time constant of the filter [s]."""
+    """Smallest time constant [s]; what the model does not know of motors and delays must be faster."""
     limit: Float[Array, ""]
     """Largest norm of the estimate [m/s^2]."""
+    wander: Float[Array, ""]
+    """Standard deviation per axis of what the disturbance becomes within a second [m/s^2]; infinite: noise is none."""
     delay_ticks: int = eqx.field(static=True, default=0)
     """Declared command delay of the plant [ticks]."""
 
     def init(self, x: State) -> ObserverState:
         """Return the memory of a vehicle that hovers at ``x`` undisturbed."""
-        return ObserverState(x, (Command.hover(),) * (self.delay_ticks + 1), jnp.zeros_like(x.p))
+        zero = jnp.zeros_like(x.p)
+        commands = (Command.hover(x.p.dtype),) * (self.delay_ticks + 1)
+        return ObserverState(x, commands, x.v, zero, zero, jnp.zeros_like(x.p[0]))
 
     def __call__(self, s: ObserverState, x: State) -> ObserverState:
         """Return the memory with the estimate corrected by the newly measured state ``x``.
 
         Call it once per tick, then :meth:`issued` with the command of the new tick.
         """
-        nominal = self.nominal
-        expected = nominal.state(nominal.step(nominal.init(s.last), s.commands[0], jnp.zeros_like(x.p)))
-        missed = (x.v - expected.v) / nominal.dt
-        d_hat = s.d_hat + (1.0 - jnp.exp(-nominal.dt / self.tau)) * (missed - s.d_hat)
+        nominal, dt = self.nominal, self.nominal.dt
+        # The vehicle turned as it was measured to turn, whatever rates it was told.
+        u = Command(s.commands[0].c, so3.log(so3.mul(s.last.R.T, x.R)) / dt)
+        gained = nominal.state(nominal.step(nominal.init(s.last), u, jnp.zeros_like(x.p))).v - s.last.v
+        missed = (x.v - s.last.v - gained) / dt
+        noise = self._noise(s, missed)
+        z = jnp.exp(-jnp.sqrt(self.wander * dt**1.5 / (noise + 1e-9)))
+        w = jnp.maximum(jnp.exp(-dt / self.tau), z)
+        predicted = s.v + gained + dt * s.d_hat
+        innovation = x.v - predicted
+        d_hat = s.d_hat + (1.0 - z) * (1.0 - w) * innovation / dt
         norm = jnp.sqrt(jnp.sum(d_hat * d_hat) + 1e-12)
-        return ObserverState(x, s.commands, d_hat * jnp.minimum(1.0, self.limit / norm))
+        d_hat = d_hat * jnp.minimum(1.0, self.limit / norm)
+        return ObserverState(x, s.commands, predicted + (1.0 - z * w) * innovation, d_hat, missed, noise)
 
     def issued(self, s: ObserverState, u: Command) -> ObserverState:
         """Return the memory after the command ``u`` was issued for the tick that begins."""
-        return ObserverState(s.last, (*s.commands[1:], u), s.d_hat)
+        return self._with_commands(s, (*s.commands[1:], u))
+
+    def accepted(self, s: ObserverState, u: Command) -> ObserverState:
+        """Return the memory after the plant accepted ``u`` instead of the command that was issued last."""
+        return self._with_commands(s, (*s.commands[:-1], u))
+
+    def _noise(self, s: ObserverState, missed: Float[Array, "3"]) -> Float[Array, ""]:
+        """Noise of velocities shows in how much the missed acceleration jumps from tick to tick."""
+        seen = jnp.mean(jnp.abs(missed - s.missed)) * self.nominal.dt / SECOND_DIFFERENCE
+        return s.noise + (1.0 - jnp.exp(-self.nominal.dt / NOISE_TAU)) * (seen - s.noise)
+
+    @staticmethod
+    def _with_commands(s: ObserverState, commands: tuple[Command, ...]) -> ObserverState:
+        return ObserverState(s.last, commands, s.v, s.d_hat, s.missed, s.noise)

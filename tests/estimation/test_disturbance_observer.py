@@ -1,0 +1,86 @@
+"""The disturbance observer: exact without noise, told nothing of the noise that slows it down."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import random
+
+from retrim.estimation.disturbance_observer import DisturbanceObserver
+from retrim.physics import Command, PointMass, State
+
+DT, D = 0.02, jnp.array([1.5, -1.0, 2.0])
+
+
+def observed(observer, key, *, ticks=200, noise=0.0, late=0, turning=1.0, d=D):
+    """Estimates while a vehicle tumbles under random commands that act ``late`` ticks after they were issued.
+
+    It turns ``turning`` times as fast as it is told to; its velocity is measured with ``noise`` [m/s].
+    """
+    model = PointMass(DT)
+    keys = random.split(key, ticks)
+
+    def command(k):
+        return Command(9.81 + random.normal(k, ()), 2.0 * random.normal(random.fold_in(k, 1), (3,)))
+
+    def tick(carry, xs):
+        s, x, queue = carry
+        k, k_noise = xs
+        u = command(k)
+        s = observer.issued(s, u)
+        queue = jax.tree.map(lambda old, new: jnp.concatenate([old[1:], new[None]]), queue, u)
+        acting = jax.tree.map(lambda leaf: leaf[0], queue)
+        x = model.step(x, Command(acting.c, turning * acting.omega), d)
+        seen = State(x.p, x.R, x.v + noise * random.normal(k_noise, (3,)))
+        s = observer(s, seen)
+        return (s, x, queue), (s.d_hat, s.noise)
+
+    x = State.at(jnp.zeros(3))
+    hover = jax.tree.map(lambda leaf: jnp.stack([leaf] * (late + 1)), Command.hover(jnp.float64))
+    start = (observer.init(x), x, hover)
+    _, found = jax.lax.scan(tick, start, (keys, random.split(random.fold_in(key, 7), ticks)))
+    return found
+
+
+def make(*, tau=0.05, wander=4.0, delay_ticks=0, limit=9.0):
+    return DisturbanceObserver(
+        PointMass(DT), jnp.array(tau), jnp.array(limit), jnp.array(wander), delay_ticks=delay_ticks
+    )
+
+
+@pytest.mark.parametrize(("late", "turning"), [(0, 1.0), (2, 1.0), (0, 0.5)])
+def test_without_noise_it_is_a_low_pass_of_what_acts(late, turning, key):
+    """Whatever is commanded, however late, and whether the vehicle turns as it is told or not."""
+    found, _ = observed(make(delay_ticks=late, wander=np.inf), key, ticks=40, late=late, turning=turning)
+    expected = np.asarray(D) * (1.0 - np.exp(-DT / 0.05 * np.arange(1, 41)))[:, None]
+    np.testing.assert_allclose(found, expected, atol=2e-3 if turning == 1.0 else 2e-2)
+
+
+def test_the_estimated_noise_is_that_of_the_velocities(key):
+    for noise in (0.003, 0.03):
+        _, found = observed(make(), key, ticks=600, noise=noise)
+        assert float(found[300:].mean()) == pytest.approx(noise, rel=0.1)
+
+
+def test_noise_makes_it_slower_and_leaves_it_true(key):
+    fast, _ = observed(make(wander=np.inf), key, ticks=1000, noise=0.03)
+    wise, _ = observed(make(), key, ticks=1000, noise=0.03)
+    assert wise[500:].std(axis=0).max() < 0.5 * fast[500:].std(axis=0).min()
+    np.testing.assert_allclose(wise[500:].mean(axis=0), D, atol=0.05)
+
+
+def test_it_follows_a_wandering_disturbance_about_as_well_as_the_best_constant_filter(key):
+    """The filter that is optimal for this noise and this wander, found by trying time constants."""
+    walk = jnp.cumsum(4.0 * DT**0.5 * random.normal(random.fold_in(key, 3), (1500, 3)), axis=0)
+    seen = jnp.cumsum(DT * walk, axis=0) + 0.02 * random.normal(random.fold_in(key, 4), walk.shape)
+
+    def error(observer):
+        def tick(s, v):
+            s = observer.issued(observer(s, State(jnp.zeros(3), jnp.eye(3), v)), Command.hover(jnp.float64))
+            return s, s.d_hat
+
+        _, found = jax.lax.scan(tick, observer.init(State.at(jnp.zeros(3))), seen)
+        return float(jnp.sqrt(jnp.mean((found - walk)[200:] ** 2)))
+
+    constant = min(error(make(tau=tau, wander=np.inf, limit=99.0)) for tau in (0.02, 0.05, 0.1, 0.2, 0.4))
+    assert error(make(tau=1e-3, limit=99.0)) < 1.02 * constant
