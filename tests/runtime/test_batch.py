@@ -12,7 +12,7 @@ from retrim.control.controller import AbstractController
 from retrim.physics import Command, Constant, LinearDragQuadrotor, State, small
 from retrim.plants import SensorModel, SimPlant
 from retrim.runtime import ControllerPilot, batch_flight, fly
-from retrim.runtime.batch import one, stacked
+from retrim.runtime.batched import one, stacked
 
 
 @pytest.fixture(scope="module")

@@ -29,7 +29,8 @@ from ..physics.bem import BemQuadrotor
 from ..physics.state import Command, State
 from ..physics.vehicle import small
 from ..plants.sim import SimPlant
-from ..runtime.batch import batch_flight, stacked
+from ..runtime.batch import batch_flight
+from ..runtime.batched import stacked
 from ..runtime.flight import fly
 from .timing import Work, compiled, timed
 from .training import encode_and_pretrain, pretrain

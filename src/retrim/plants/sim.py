@@ -1,5 +1,6 @@
 """The simulated plant: a model at 1 kHz with command delay, external effects and sensors."""
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -11,6 +12,7 @@ from jaxtyping import Array, ArrayLike, Float, Int, Key
 
 from ..errors import PlantError
 from ..physics.disturbance import Disturbance
+from ..physics.effects import ExternalEffects
 from ..physics.state import Command, State
 from ..physics.substep import SUBSTEP, AbstractSubstepDynamics
 from .plant import Measurement, Plant, as_numpy, check_command, limited
@@ -58,6 +60,10 @@ class Simulation(eqx.Module):
             raise ValueError(
                 f"SimPlant: a tick of {self.model.dt} s is no multiple of the {self.sensors.period} ms of SensorModel"
             )
+
+    def undisturbed(self) -> "Simulation":
+        """Return the same without its disturbance."""
+        return dataclasses.replace(self, disturbance=_calm)
 
     def launch(self, x0: State) -> SimState:
         """Return the state of a plant that hovers at ``x0``, with hover commands under way and one sample of ``x0``."""
@@ -112,6 +118,11 @@ class Simulation(eqx.Module):
             return u
         low, high = self.model.command_limits
         return jax.tree.map(jnp.clip, u, low, high)  # type: ignore[no-any-return]
+
+
+def _calm(t: Float[Array, ""], x: State) -> ExternalEffects:
+    del t
+    return ExternalEffects.calm(x.p.dtype)
 
 
 _launch = eqx.filter_jit(Simulation.launch)

@@ -4,7 +4,6 @@ When learners are offered windows, and when their updates become visible, follow
 between two such instants all flights are one program, and so are the fits and the updates of all flights.
 """
 
-import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -26,7 +25,7 @@ from ..learn.bptt import PolicyState
 from ..learn.window import Window
 from ..physics.state import where
 from .adaptive import AdaptivePilot
-from .batch import Batch
+from .batched import Batch
 from .events import Event
 from .lockstep import LockstepLearner
 
@@ -107,9 +106,6 @@ def fly_and_learn(
         What each has learnt, and the events of each flight.
     """
     plan, keys = plans[0], jnp.stack([each.key for each in plans])
-    instants = _instants(plan, batch.ticks)
-    swaps = [instant.tick for instant in instants if instant.published and instant.layer == POLICY]
-    batch.chunk = math.gcd(*swaps) if swaps else batch.ticks
     batch.controllers = _controllers(plan, state)
     if cold:
         with ThreadPoolExecutor(1) as beside:
@@ -118,7 +114,7 @@ def fly_and_learn(
             compiled.result()
     pending: dict[int, tuple[Any, list[Update]]] = {}
     events = [list[Event]() for _ in plans]
-    for instant in instants:
+    for instant in _instants(plan, batch.ticks):
         tick, _, layer, offer = instant
         if instant.published:
             learnt, updates = pending.pop(layer)

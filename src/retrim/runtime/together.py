@@ -11,8 +11,8 @@ from ..physics.state import State
 from ..plants.plant import Plant
 from ..plants.sim import SimPlant
 from .adaptive import AdaptivePilot
-from .batch import Batch, one, stacked
 from .batch_learning import Plan, fly_and_learn
+from .batched import Batch, one, stacked
 from .events import Event
 from .flight import Log
 from .pilot import ControllerPilot, Pilot
@@ -62,7 +62,7 @@ def fly_together(
     Raises:
         FlightStopped: ``stop`` was set.
     """
-    batch = Batch(stacked([plant.simulation for plant in plants]), stacked(starts), ticks, plants[0].dt, progress, stop)
+    batch = Batch([plant.simulation for plant in plants], starts, ticks, plants[0].dt, progress, stop)
     learning = [pilot for pilot in pilots if isinstance(pilot, AdaptivePilot)]
     events: Sequence[Sequence[Event]]
     if learning:

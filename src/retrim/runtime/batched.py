@@ -1,0 +1,174 @@
+"""Flights in step: arrays with a leading axis of flights, and the record that they leave."""
+
+import threading
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ..learn.window import Window
+from ..physics.state import Command, State
+from ..plants.sim import SimState, Simulation
+from .batch import InFlight, Ticks, fly_ticks
+from .events import Event
+from .flight import FlightStopped, Log, States
+
+T = TypeVar("T")
+
+ROOM = 50  # ticks of one call; progress is told, and a stop is seen, so often
+
+
+class Batch:
+    """Flights in the air, and what they have left so far. Every array has a leading axis of flights."""
+
+    def __init__(
+        self,
+        simulations: Sequence[Simulation],
+        starts: Sequence[State],
+        ticks: int,
+        dt: float,
+        progress: Callable[[float], None],
+        stop: threading.Event | None,
+    ) -> None:
+        self.ticks, self.dt = ticks, dt
+        self.controllers: Any = None
+        """They fly; the next one takes over the memory of the last."""
+        self._simulations, self._starts, self._progress, self._stop = (
+            stacked(simulations),
+            stacked(starts),
+            progress,
+            stop,
+        )
+        # Without their disturbances plants of one make are alike whatever disturbs them: one program launches them all.
+        self._on_the_ground = stacked([simulation.undisturbed() for simulation in simulations])
+        self._flights: InFlight | None = None
+        self._flown = 0
+        self._measured: Any = None  # from the start on
+        self._rows: Any = None
+
+    def fly_to(self, tick: int) -> None:
+        """Fly on until so many ticks are flown.
+
+        Raises:
+            FlightStopped: The flights were given up.
+        """
+        while self._flown < tick:
+            if self._stop is not None and self._stop.is_set():
+                raise FlightStopped("the flights were given up")
+            if self._flights is None:
+                sims, first = _launch(self._on_the_ground, self._starts)
+                self._flights = _begin(self.controllers, sims, first)
+                self._measured = _recorded(None, first, 0, self.ticks + 1, rows=1)
+            n = min(ROOM, tick - self._flown)
+            self._flights, rows = _fly_on(self._simulations, self.controllers, self._flights, jnp.asarray(n))
+            self._measured = _recorded(self._measured, rows.measured, self._flown + 1, self.ticks + 1, rows=n)
+            self._rows = _recorded(self._rows, rows, self._flown, self.ticks, rows=n)
+            self._flown += n
+            self._progress(self._flown / self.ticks)
+
+    def blank_window(self, size: int) -> Window:
+        """Return windows of the shapes of a flight, of vehicles that hover where they start."""
+        n = self._starts.p.shape[0]
+        repeated = lambda leaf: jnp.asarray(np.repeat(np.asarray(leaf)[:, None], size, axis=1))  # noqa: E731
+        hover = np.broadcast_to(np.asarray(Command.hover().vector()), (n, 4)).astype(self._starts.p.dtype)
+        u = jax.tree.map(repeated, jax.vmap(Command.of)(jnp.asarray(hover)))
+        t = jnp.asarray(np.broadcast_to(np.arange(size) * self.dt, (n, size)), dtype=self._starts.p.dtype)
+        blank: Window = jax.vmap(Window)(t, jax.tree.map(repeated, self._starts), u, jnp.ones((n, size), dtype=bool))
+        return blank
+
+    def window(self, tick: int, size: int) -> Window:
+        """Return the windows that learners are offered at ``tick``; it has been flown."""
+        wanted = np.arange(tick - size + 1, tick + 1)
+        at = np.maximum(wanted, 0)
+        x = jax.tree.map(lambda leaf: jnp.asarray(leaf[:, at]), self._measured)
+        # The plant has not accepted the newest command yet.
+        newest = lambda old, new: jnp.asarray(np.concatenate([old[:, at[:-1]], new[:, at[-1:]]], axis=1))  # noqa: E731
+        u = jax.tree.map(newest, self._rows.accepted, self._rows.issued)
+        n = x.p.shape[0]
+        t = jnp.asarray(np.broadcast_to(at * self.dt, (n, size)), dtype=x.p.dtype)
+        windows: Window = jax.vmap(Window)(t, x, u, jnp.asarray(np.broadcast_to(wanted >= 0, (n, size))))
+        return windows
+
+    def log(self, i: int, events: Sequence[Event]) -> Log:
+        """Return the log of one flight."""
+        first, rows, measured = jax.tree.map(
+            lambda leaf: np.asarray(leaf)[i], (self._starts, self._rows, self._measured)
+        )
+        accepted = rows.accepted
+        names = ("p", "R", "v")
+        true = (np.concatenate([getattr(first, name)[None], getattr(rows.true, name)]) for name in names)
+        u = np.concatenate([accepted.c[:, None], accepted.omega], axis=1)
+        hover = np.asarray(Command.hover().vector(), dtype=u.dtype)[None]
+        t = np.arange(self.ticks + 1) * self.dt
+        return Log(
+            t,
+            States(*true),
+            States(*(getattr(measured, name) for name in names)),
+            np.concatenate([hover, u]),
+            self.dt,
+            False,
+            tuple(events),
+        )
+
+
+def stacked(trees: Sequence[T]) -> T:
+    """Return trees of one structure as one, with a leading axis."""
+    arrays = [eqx.filter(tree, eqx.is_array) for tree in trees]
+    together = jax.tree.map(lambda *leaves: _stack(leaves), *arrays)
+    whole: T = eqx.combine(together, eqx.filter(trees[0], eqx.is_array, inverse=True))
+    return whole
+
+
+def one(tree: T, i: int) -> T:
+    """Return one of :func:`stacked` trees."""
+    found: T = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[i]), tree)
+    return found
+
+
+def _stack(leaves: Sequence[Any]) -> Array:
+    """Stack arrays, without a program to compile for every shape."""
+    if jnp.issubdtype(leaves[0].dtype, jax.dtypes.prng_key):
+        return jnp.stack(leaves)
+    return jnp.asarray(np.stack([np.asarray(leaf) for leaf in leaves]))
+
+
+def _recorded(record: Any, flown: Any, at: int, size: int, *, rows: int) -> Any:
+    """Write the first rows of what was flown into a record of the whole flight, at a tick; the second axis is time."""
+    if record is None:
+        record = jax.tree.map(lambda leaf: np.empty((leaf.shape[0], size, *leaf.shape[2:]), leaf.dtype), flown)
+
+    def write(whole: np.ndarray, part: Any) -> np.ndarray:
+        whole[:, at : at + rows] = np.asarray(part)[:, :rows]
+        return whole
+
+    return jax.tree.map(write, record, flown)
+
+
+@eqx.filter_jit
+def _launch(simulations: Simulation, starts: State) -> tuple[SimState, State]:
+    def launch(simulation: Simulation, x0: State) -> tuple[SimState, State]:
+        sim = simulation.launch(x0)
+        return sim, jax.tree.map(lambda leaf: leaf[None], simulation.measured(sim))
+
+    launched: tuple[SimState, State] = eqx.filter_vmap(launch)(simulations, starts)
+    return launched
+
+
+@eqx.filter_jit
+def _begin(controllers: Any, sims: SimState, measured: State) -> InFlight:
+    begun: InFlight = eqx.filter_vmap(
+        lambda controller, sim, x: InFlight(sim, controller.init(jax.tree.map(lambda leaf: leaf[0], x)), jnp.array(0))
+    )(controllers, sims, measured)
+    return begun
+
+
+@eqx.filter_jit
+def _fly_on(simulations: Simulation, controllers: Any, flights: InFlight, ticks: Array) -> tuple[InFlight, Ticks]:
+    flown: tuple[InFlight, Ticks] = eqx.filter_vmap(lambda s, c, f: fly_ticks(s, c, f, ticks, room=ROOM))(
+        simulations, controllers, flights
+    )
+    return flown
