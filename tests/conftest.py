@@ -1,7 +1,14 @@
 """Strict everywhere: double precision, no silent promotion of types or ranks; shapes are checked by the import hook."""
 
+import os
 import signal
 from pathlib import Path
+
+# Nearly all of the suite's time is compiling, and half of that is optimisation that a short test never earns back. The
+# commands that tests start inherit this. What users run, optimised, is what `make demo` and `make wheel` fly.
+FLAGS = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+if FLAGS not in (given := os.environ.get("XLA_FLAGS", "")):  # workers have it from their parent
+    os.environ["XLA_FLAGS"] = f"{given} {FLAGS}".strip()
 
 import retrim  # noqa: F401  (before jax: it quiets the log of the compile cache)  # isort: skip
 import jax
