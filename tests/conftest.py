@@ -6,9 +6,15 @@ from pathlib import Path
 
 # Nearly all of the suite's time is compiling, and half of that is optimisation that a short test never earns back. The
 # commands that tests start inherit this. What users run, optimised, is what `make demo` and `make wheel` fly.
-FLAGS = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
-if FLAGS not in (given := os.environ.get("XLA_FLAGS", "")):  # workers have it from their parent
-    os.environ["XLA_FLAGS"] = f"{given} {FLAGS}".strip()
+os.environ["XLA_FLAGS"] = " ".join(
+    dict.fromkeys(
+        [
+            *os.environ.get("XLA_FLAGS", "").split(),
+            "--xla_backend_optimization_level=0",
+            "--xla_cpu_use_fusion_emitters=false",
+        ]
+    )
+)
 
 import retrim  # noqa: F401  (before jax: it quiets the log of the compile cache)  # isort: skip
 import jax
