@@ -30,6 +30,8 @@ def effects(name, t=0.0, seed=0):
         ("small", 3.0, 0.5),
         ("large", 3.0, 2.0),
         ("push", 0.0, 1.0),
+        ("kick", 7.9, 0.0),
+        ("kick", 8.2, 0.0),
         ("step", 7.9, 0.0),
         ("step", 8.0, 2.0),
         ("step=-1", 29.0, -1.0),
@@ -123,6 +125,7 @@ def test_what_is_random_follows_from_the_seed():
 BOUNDS = {
     "push": (-10.0, 10.0),
     "step": (-10.0, 10.0),
+    "kick": (0.0, 10.0),
     "reversing": (-10.0, 10.0),
     "walk": (0.0, 10.0),
     "wind": (0.0, 20.0),
@@ -164,6 +167,17 @@ def test_sizes_that_cannot_be(name, message):
     with pytest.raises(ConfigError, match=message) as error:
         disturbance(name)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("plant", ["bem", "simple"])
+def test_a_delay_is_that_of_the_plant(plant):
+    assert Scenario(plant=plant, delay=0.035).make().simulation.delay_s == 0.035
+    assert Scenario(plant=plant).make().simulation.delay_s == 0.02
+
+
+def test_a_kick_gains_its_speed_within_a_tenth_of_a_second():
+    gained = sum(0.001 * effects("kick=4", 7.95 + 0.001 * ms).push for ms in range(300))
+    np.testing.assert_allclose(gained, [4.0 / 2**0.5, 4.0 / 2**0.5, 0.0], rtol=0.02)
 
 
 def test_every_disturbance_is_looked_at_here():
@@ -231,6 +245,9 @@ def test_scenarios_that_cannot_be():
     for wrong, message in (
         ({"thrust_error": 0.9}, "thrust error 0.9 must be between"),
         ({"sensors": "mocap", "plant": "mujoco"}, "measures its true state"),
+        ({"delay": 0.0205}, "delay 0.0205 s must be a whole number of milliseconds"),
+        ({"delay": 0.3}, "delay 0.3 s must be a whole number of milliseconds, 0 to 0.2 s"),
+        ({"delay": 0.04, "plant": "mujoco"}, "plant 'mujoco' has its own command delay"),
         ({"thrust_error": 0.0, "plant": "mujoco"}, "plant 'mujoco' has its own thrust map"),
         ({"plant": "rotorpy", "vehicle": "large"}, "flies its own vehicle, hummingbird, not large"),
         ({"disturbance": "weather"}, "no disturbance 'weather'"),

@@ -35,6 +35,7 @@ def fly(
     vehicle: str | None = None,
     sensors: str = "ideal",
     thrust_error: float = 0.035,
+    delay: float = 0.02,
     residual: str | None = None,
     config: Path | None = None,
     latency: Latency = "fixed",
@@ -50,7 +51,7 @@ def fly(
         resume: Instead of a policy: a learnt.safetensors of an earlier flight (policy, residual, optimiser states),
             to go on from.
         delta: A low-rank delta.safetensors of an earlier flight, to put on the policy.
-        disturbance: What disturbs the flight: none, small, large, push, step, reversing, walk, wind, gusts, fan,
+        disturbance: What disturbs the flight: none, small, large, push, step, kick, reversing, walk, wind, gusts, fan,
             payload, pickup, battery, weak-rotor, with a size, as wind=6 [m/s] or payload=0.2 [kg], several at once, as
             wind+payload=0.1, or module:name.
         plant: bem: blade-element rotors; simple: rotors with linear drag; rotorpy, mujoco, crazyflow: independent
@@ -65,6 +66,7 @@ def fly(
         sensors: What the policy is shown of the state: ideal, mocap (0.3 mm, 3 mm/s, 1 mrad), rough (1 mm, 10 mm/s,
             3 mrad, 10 ms late, 5 % of the samples lost), or module:name.
         thrust_error: By how much more than commanded the rotors give, as a share (bem and simple).
+        delay: Command delay of the plant [s], in whole milliseconds (bem and simple); the policy does not know of it.
         residual: Residual model: ensemble, regression, or module:name.
         config: TOML file that overlays the policy's own preset, for example with a table [adapt].
         latency: fixed: learning costs the preset's flight time, so that a run repeats bit for bit; measured: what the
@@ -85,7 +87,7 @@ def fly(
                 raise ConfigError(f"--residual {residual}: a resumed flight goes on with its own residual")
             preset = changed(preset, adapt={"residual": residual})
         follows = _flown_reference(preset, reference)
-        scenario = Scenario(disturbance, plant, vehicle, sensors, thrust_error, follows)
+        scenario = Scenario(disturbance, plant, vehicle, sensors, thrust_error, follows, delay)
         methods: tuple[str, ...] = ("base",) if adapt in ("none", "base") else ("base", adapt)
         fleet = Fleet(
             preset, {seed: weights}, [scenario], methods=methods, starts=starts, seconds=seconds, latency=latency,

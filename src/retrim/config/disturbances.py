@@ -7,7 +7,7 @@ from jax import random
 from jaxtyping import Array, Key
 
 from ..errors import ConfigError
-from ..physics.disturbance import Constant, Disturbance, RandomWalk, Reversing, Step, Together
+from ..physics.disturbance import Constant, Disturbance, Kick, RandomWalk, Reversing, Step, Together
 from ..physics.faults import BatterySag, Payload, WeakRotor
 from ..physics.wind import Dryden, Fan, SteadyWind
 from .registry import Registry
@@ -82,6 +82,9 @@ _BUILT_IN: dict[str, DisturbanceFactory] = {
     "large": _push(2.0),
     "push": _push(None),
     "step": lambda key, size: Step(jnp.full(3, _bounded(size, 2.0, -10.0, 10.0, "m/s^2")), jnp.array(8.0)),
+    "kick": lambda key, size: Kick(  # a speed gained within 0.1 s, level and diagonal
+        10.0 * _diagonal(_bounded(size, 3.0, 0.0, 10.0, "m/s")), jnp.array(8.0), jnp.array(0.1)
+    ),
     "reversing": lambda key, size: Reversing(  # Sec. IV-B.3
         jnp.full(3, _bounded(size, 0.5, -10.0, 10.0, "m/s^2")), jnp.array(15.0)
     ),

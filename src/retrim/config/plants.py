@@ -15,6 +15,8 @@ from ..plants.sensors import SensorModel
 from ..plants.sim import SimPlant
 from .registry import Registry
 
+DELAY = 0.02  # [s], of commands, where a scenario may choose it
+
 
 @dataclass(frozen=True)
 class PlantRequest:
@@ -28,6 +30,8 @@ class PlantRequest:
     dt: float
     """Control period [s]."""
     seed: int
+    delay: float = DELAY
+    """Command delay [s]."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +47,8 @@ class PlantEntry:
     """Whether it takes a sensor model."""
     has_thrust_error: bool = False
     """Whether it takes an error of the thrust map."""
+    has_delay: bool = False
+    """Whether it takes a command delay."""
 
 
 PLANTS: Registry[PlantEntry] = Registry("plant", example="module:name of a PlantEntry")
@@ -51,12 +57,12 @@ register_plant = PLANTS.register
 
 def _bem(r: PlantRequest) -> Plant:
     model = BemQuadrotor.of(r.vehicle, r.dt, thrust_error=r.thrust_error)
-    return SimPlant(model, r.disturbance, sensors=r.sensors, seed=r.seed)
+    return SimPlant(model, r.disturbance, delay_s=r.delay, sensors=r.sensors, seed=r.seed)
 
 
 def _simple(r: PlantRequest) -> Plant:
     model = LinearDragQuadrotor.of(r.vehicle, r.dt, thrust_error=r.thrust_error)
-    return SimPlant(model, r.disturbance, sensors=r.sensors, seed=r.seed)
+    return SimPlant(model, r.disturbance, delay_s=r.delay, sensors=r.sensors, seed=r.seed)
 
 
 register_plant(
@@ -66,6 +72,7 @@ register_plant(
         "blade-element rotors, firmware's rate loop, body drag, at 1 kHz, 20 ms of command delay",
         has_sensors=True,
         has_thrust_error=True,
+        has_delay=True,
     ),
 )
 register_plant(
@@ -75,6 +82,7 @@ register_plant(
         "rotors with linear drag, at 1 kHz, 20 ms of command delay",
         has_sensors=True,
         has_thrust_error=True,
+        has_delay=True,
     ),
 )
 register_plant(

@@ -7,7 +7,7 @@ from ..errors import ConfigError
 from ..physics.vehicle import Vehicle
 from ..plants.plant import Plant
 from .disturbances import disturbance
-from .plants import PLANTS, PlantEntry, PlantRequest
+from .plants import DELAY, PLANTS, PlantEntry, PlantRequest
 from .sensors import SENSORS
 from .vehicle_file import VehicleSpec
 from .vehicles import make_vehicle, name_of, vehicle_from
@@ -29,6 +29,8 @@ class Scenario:
     """By how much more than commanded the rotors give, as a share; bem and simple only."""
     reference: str | None = None
     """What a tracking policy follows; None: what it was trained on."""
+    delay: float = DELAY
+    """Command delay of the plant [s]; bem and simple only. The policy does not know of it."""
 
     def __post_init__(self) -> None:
         """Raise :class:`ConfigError` for an unknown name, and for a choice that the plant does not have."""
@@ -47,6 +49,10 @@ class Scenario:
             )
         if self.thrust_error != THRUST_ERROR and not entry.has_thrust_error:
             raise ConfigError(f"plant {self.plant!r} has its own thrust map; a thrust error needs bem or simple")
+        if self.delay != DELAY and not entry.has_delay:
+            raise ConfigError(f"plant {self.plant!r} has its own command delay; another one needs bem or simple")
+        if not 0.0 <= self.delay <= 0.2 or abs(1000 * self.delay - round(1000 * self.delay)) > 1e-6:
+            raise ConfigError(f"delay {self.delay} s must be a whole number of milliseconds, 0 to 0.2 s")
         if not -0.5 <= self.thrust_error <= 0.5:
             raise ConfigError(f"thrust error {self.thrust_error} must be between -0.5 and 0.5")
 
@@ -59,7 +65,11 @@ class Scenario:
         if not callable(entry):
             raise ConfigError(f"plant {self.plant!r} is a {type(entry).__name__}, not a function of a PlantRequest")
         return PlantEntry(
-            entry, about=(entry.__doc__ or self.plant).strip().splitlines()[0], has_sensors=True, has_thrust_error=True
+            entry,
+            about=(entry.__doc__ or self.plant).strip().splitlines()[0],
+            has_sensors=True,
+            has_thrust_error=True,
+            has_delay=True,
         )
 
     def vehicle_name(self, trained_for: str | VehicleSpec) -> str:
@@ -93,5 +103,6 @@ class Scenario:
             self.thrust_error,
             dt,
             seed,
+            self.delay,
         )
         return entry.make(request)

@@ -18,7 +18,7 @@ class Rows(list[dict[str, Any]]):
         return pandas.DataFrame(list(self))
 
 
-CONDITIONS = ("disturbance", "method", "plant", "vehicle", "sensors", "thrust_error", "reference")
+CONDITIONS = ("disturbance", "method", "plant", "vehicle", "sensors", "thrust_error", "delay", "reference")
 """What the flights of one row have in common."""
 
 
@@ -33,6 +33,7 @@ def record(flight: Flight) -> dict[str, Any]:
         "vehicle": flight.vehicle,
         "sensors": scenario.sensors,
         "thrust_error": scenario.thrust_error,
+        "delay": scenario.delay,
         "reference": scenario.reference,
         "seed": spec.seed,
         "start": spec.start,

@@ -68,6 +68,21 @@ class Step(eqx.Module):
         return ExternalEffects.of(x.p.dtype, push=jnp.where(t >= self.since, self.a, jnp.zeros_like(self.a)))
 
 
+class Kick(eqx.Module):
+    """An acceleration of short duration."""
+
+    a: Float[Array, "3"]
+    since: Float[Array, ""]
+    """[s]"""
+    duration: Float[Array, ""]
+    """[s]"""
+
+    def __call__(self, t: Float[Array, ""], x: State) -> ExternalEffects:
+        """Return ``a`` [m/s^2] from ``since`` on, for ``duration``."""
+        acts = (t >= self.since) & (t < self.since + self.duration)
+        return ExternalEffects.of(x.p.dtype, push=jnp.where(acts, self.a, jnp.zeros_like(self.a)))
+
+
 class Reversing(eqx.Module):
     """``+a`` and ``-a`` by turns, reversed every ``period`` seconds (paper, Sec. IV-B.3: every 15 s)."""
 

@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 
 from ...config.methods import find_method
-from ...config.scenario import Scenario
 from ...config.setup import Setup
 from ...errors import ConfigError, PlantError
 from ...viz import plots
 from ...viz.panels import Curve, Panel, heat_map, panel_figure
+from ..conditions import conditions
 from ..flights import Flight
 from ..recovery import change_times, recoveries
 from ..reporter import Reporter
@@ -26,36 +26,6 @@ the last 2 s; late: mean error after 5 s; peak: largest error after 5 s; recover
 until the error stays below 5 or 2 cm (without a change: from the start, 1 m away). Means over flights, and the worst in
 brackets; a flight that crashed, or did not recover, is infinite (∞). Learning is charged to flight time by the preset's
 fixed latencies."""
-
-
-def conditions() -> dict[str, Scenario]:
-    """Return what is flown, by name; a function, since scenarios are checked when they are made."""
-    return {
-        "none": Scenario(),
-        "small": Scenario("small"),
-        "large": Scenario("large"),
-        "step": Scenario("step"),
-        "reversing": Scenario("reversing"),
-        "gusts": Scenario("gusts"),
-        "fan": Scenario("fan"),
-        "walk": Scenario("walk"),
-        "pickup": Scenario("pickup"),
-        "battery": Scenario("battery"),
-        "weak-rotor": Scenario("weak-rotor"),
-        "all": Scenario("wind+payload+battery+weak-rotor"),
-        "thrust+20": Scenario("step", thrust_error=0.2),
-        "thrust-20": Scenario("step", thrust_error=-0.2),
-        "none/mocap": Scenario(sensors="mocap"),
-        "none/rough": Scenario(sensors="rough"),
-        "step/rough": Scenario("step", sensors="rough"),
-        "gusts/rough": Scenario("gusts", sensors="rough"),
-        "step/large-quadrotor": Scenario("step", vehicle="large"),
-        "step/kingfisher": Scenario("step", vehicle="kingfisher"),
-        "wind/simple": Scenario("wind", plant="simple"),
-        "wind/rotorpy": Scenario("wind", plant="rotorpy"),
-        "wind/mujoco": Scenario("wind", plant="mujoco"),
-        "wind/crazyflow": Scenario("wind", plant="crazyflow"),
-    }
 
 
 def gauntlet(
@@ -146,6 +116,7 @@ def rows_of(name: str, flights: Sequence[Flight], changes: Sequence[float]) -> l
                     "vehicle": group[0].vehicle,
                     "sensors": scenario.sensors,
                     "thrust_error": scenario.thrust_error,
+                    "delay": scenario.delay,
                 }
             )
     return found
