@@ -29,7 +29,7 @@ from retrim.experiments.compile_cache import enable_compile_cache  # noqa: E402 
 
 enable_compile_cache()  # shared by the workers and by the commands that tests start
 # Only what takes long to compile is worth a file: thousands of small programs are not written from test workers.
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.03)
 # What a shell starts in the background ignores Ctrl-C; tests raise it, wherever they run.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 settings.register_profile("repeatable", derandomize=True)  # the same examples on every machine
