@@ -26,6 +26,7 @@ def found(error, changes, limit, **more):
     [
         ("none", 30.0, []),
         ("large", 30.0, []),
+        ("kick", 30.0, [8.0]),
         ("step", 30.0, [8.0]),
         ("step", 5.0, []),
         ("reversing", 60.0, [15.0, 30.0, 45.0]),

@@ -12,6 +12,7 @@ from ..physics.effects import ExternalEffects
 from ..physics.state import State
 
 STEP = 0.1  # [s], between samples of a disturbance
+AT_ONCE = 0.5  # [s]
 FEW = 10  # a disturbance with more changes in a flight changes all the time
 
 
@@ -35,9 +36,15 @@ def timeline(name: str, home: Array, seconds: float) -> tuple[np.ndarray, Extern
 
 
 def change_times(name: str, home: Array, seconds: float) -> list[float]:
-    """Return when a disturbance changes in flight [s]; nothing for one that does all the time, or never."""
+    """Return when a disturbance changes in flight [s]; nothing for one that does all the time, or never.
+
+    A change that follows another within half a second is part of it: a kick is one, not two.
+    """
     times, _, changes = timeline(name, home, seconds)
-    return [float(times[i]) for i in changes] if len(changes) <= FEW else []
+    if len(changes) > FEW:
+        return []
+    found = [float(times[i]) for i in changes]
+    return [t for i, t in enumerate(found) if i == 0 or t - found[i - 1] > AT_ONCE]
 
 
 def recoveries(
