@@ -103,7 +103,6 @@ def fly(
 def _fly(fleet: Fleet, setup: Setup, scenario: Scenario, run: Run) -> int:
     with run.interruptible(), RichReporter().progress("flying") as advance:
         advance(0.0, "compiling the programs of a flight (kept in a cache for the next time)")
-    with RichReporter().progress("flying") as advance:
         flights = fleet.run(stop=run.stop, progress=lambda done, n: advance(done / n, f"{done} of {n} flights")).flown
     if not flights:
         console.print("interrupted before the first flight was over; nothing was saved")

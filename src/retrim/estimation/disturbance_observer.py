@@ -8,10 +8,11 @@ stands still, and the measured velocity corrects both,
 
 with the poles z and w. One of them belongs to the time constant that a vehicle's unmodelled motors and delays allow.
 The other has the bandwidth of the steady Kalman filter for a disturbance that wanders by q sqrt(t) and velocities of
-noise r per tick, (q / (r sqrt(dt)))^(1/2) [rad/s]; r is that of the last second. Without noise it is zero, and the
+noise r per tick, (q / (r sqrt(dt)))^(1/2) [rad/s]; r is that of the last second. Without noise z is zero, and the
 observer is a first-order low-pass of what the model missed in each tick.
 """
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -84,17 +85,13 @@ class DisturbanceObserver(eqx.Module):
 
     def issued(self, s: ObserverState, u: Command) -> ObserverState:
         """Return the memory after the command ``u`` was issued for the tick that begins."""
-        return self._with_commands(s, (*s.commands[1:], u))
+        return dataclasses.replace(s, commands=(*s.commands[1:], u))
 
     def accepted(self, s: ObserverState, u: Command) -> ObserverState:
         """Return the memory after the plant accepted ``u`` instead of the command that was issued last."""
-        return self._with_commands(s, (*s.commands[:-1], u))
+        return dataclasses.replace(s, commands=(*s.commands[:-1], u))
 
     def _noise(self, s: ObserverState, missed: Float[Array, "3"]) -> Float[Array, ""]:
         """Noise of velocities shows in how much the missed acceleration jumps from tick to tick."""
         seen = jnp.mean(jnp.abs(missed - s.missed)) * self.nominal.dt / SECOND_DIFFERENCE
         return s.noise + (1.0 - jnp.exp(-self.nominal.dt / NOISE_TAU)) * (seen - s.noise)
-
-    @staticmethod
-    def _with_commands(s: ObserverState, commands: tuple[Command, ...]) -> ObserverState:
-        return ObserverState(s.last, commands, s.v, s.d_hat, s.missed, s.noise)

@@ -80,7 +80,8 @@ def program_of(setup: Setup, policy: Policy | LoraPolicy, specs: Sequence[Flight
     """
     if len(specs) < 2:
         return None
-    plants = [spec.scenario.make(setup.preset.vehicle, dt=setup.preset.dt) for spec in specs[:2]]
+    preset = setup.preset
+    plants = [spec.scenario.make(preset.vehicle, dt=preset.dt, seed=spec.plant_seed) for spec in specs[:2]]
     if not can_fly_together(plants, [setup.pilot(policy, spec.method, spec.key()) for spec in specs[:2]]):
         return None
     return specs[0].method, jax.tree.structure([plant.simulation for plant in plants if isinstance(plant, SimPlant)])
@@ -117,6 +118,9 @@ def fly_lot(
     preset = setup.preset
     pilots = [setup.pilot(p, s.method, s.key(), state=state) for p, s in zip(policies, specs, strict=True)]
     plants = [spec.scenario.make(preset.vehicle, dt=preset.dt, seed=spec.plant_seed) for spec in specs]
+    if not can_fly_together(plants, pilots):  # the first two were alike, another one is not
+        each = zip(policies, specs, starts, strict=True)
+        return [fly_one(setup, policy, spec, x0, seconds, state=state, stop=stop) for policy, spec, x0 in each]
     simulated = [plant for plant in plants if isinstance(plant, SimPlant)]
     ticks = round(seconds / preset.dt)
     logs = fly_together(simulated, pilots, starts, ticks=ticks, progress=progress, stop=stop, cold=cold)
@@ -128,7 +132,7 @@ def fly_lot(
 
 def _until_terminated(task: AbstractTask, log: Log) -> Log:
     """Cut a log where the vehicle left the task's bounds; a batch flies on."""
-    left = np.flatnonzero(np.asarray(_ends(task, log.t, log.true.as_state()))[1:])
+    left = np.flatnonzero(np.asarray(_all_terminated(task, log.t, log.true.as_state()))[1:])
     if not len(left):
         return log
     rows = int(left[0]) + 2
@@ -152,16 +156,17 @@ def _scored(setup: Setup, spec: FlightSpec, log: Log, pilot: Pilot) -> Flight:
     )
 
 
-@eqx.filter_jit
-def _terminated(task: AbstractTask, t: Any, x: State) -> Array:
+def _out_of_bounds(task: AbstractTask, t: Any, x: State) -> Array:
     return task.terminated(jnp.asarray(t, dtype=x.p.dtype), x) | (x.p[2] < FLOOR)
 
 
+_terminated = eqx.filter_jit(_out_of_bounds)
+
+
 @eqx.filter_jit
-def _ends(task: AbstractTask, t: Any, x: State) -> Array:
-    times = jnp.asarray(t, dtype=x.p.dtype)
-    ends: Array = jax.vmap(lambda t, x: task.terminated(t, x) | (x.p[2] < FLOOR))(times, x)
-    return ends
+def _all_terminated(task: AbstractTask, t: Any, x: State) -> Array:
+    found: Array = jax.vmap(lambda t, x: _out_of_bounds(task, t, x))(t, x)
+    return found
 
 
 @eqx.filter_jit

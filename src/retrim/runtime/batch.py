@@ -79,7 +79,9 @@ def fly_ticks(
         flight, row = tick(carry[0])
         return flight, jax.tree.map(lambda whole, new: whole.at[i].set(new), carry[1], row)
 
-    blank = jax.tree.map(lambda leaf: jnp.zeros((room, *leaf.shape), leaf.dtype), jax.eval_shape(tick, flight)[1])
+    x = simulation.true(flight.sim)
+    u = Command.hover(x.p.dtype)
+    blank = jax.tree.map(lambda leaf: jnp.zeros((room, *leaf.shape), leaf.dtype), Ticks(x, x, u, u))
     flown: tuple[InFlight, Ticks] = lax.fori_loop(0, ticks, step, (flight, blank))
     return flown
 

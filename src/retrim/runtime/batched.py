@@ -37,12 +37,8 @@ class Batch:
         self.ticks, self.dt = ticks, dt
         self.controllers: Any = None
         """They fly; the next one takes over the memory of the last."""
-        self._simulations, self._starts, self._progress, self._stop = (
-            stacked(simulations),
-            stacked(starts),
-            progress,
-            stop,
-        )
+        self._simulations, self._starts = stacked(simulations), stacked(starts)
+        self._progress, self._stop = progress, stop
         # Without their disturbances plants of one make are alike whatever disturbs them: one program launches them all.
         self._on_the_ground = stacked([simulation.undisturbed() for simulation in simulations])
         self._flights: InFlight | None = None
@@ -73,11 +69,10 @@ class Batch:
     def blank_window(self, size: int) -> Window:
         """Return windows of the shapes of a flight, of vehicles that hover where they start."""
         n = self._starts.p.shape[0]
-        repeated = lambda leaf: jnp.asarray(np.repeat(np.asarray(leaf)[:, None], size, axis=1))  # noqa: E731
-        hover = np.broadcast_to(np.asarray(Command.hover().vector()), (n, 4)).astype(self._starts.p.dtype)
-        u = jax.tree.map(repeated, jax.vmap(Command.of)(jnp.asarray(hover)))
-        t = jnp.asarray(np.broadcast_to(np.arange(size) * self.dt, (n, size)), dtype=self._starts.p.dtype)
-        blank: Window = jax.vmap(Window)(t, jax.tree.map(repeated, self._starts), u, jnp.ones((n, size), dtype=bool))
+        x = jax.tree.map(lambda leaf: jnp.asarray(np.repeat(np.asarray(leaf)[:, None], size, axis=1)), self._starts)
+        hover = Command.hover(x.p.dtype)
+        u = jax.tree.map(lambda leaf: jnp.asarray(np.broadcast_to(leaf, (n, size, *leaf.shape))), hover)
+        blank: Window = jax.vmap(Window)(jnp.zeros((n, size), x.p.dtype), x, u, jnp.ones((n, size), dtype=bool))
         return blank
 
     def window(self, tick: int, size: int) -> Window:
