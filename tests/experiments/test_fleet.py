@@ -117,6 +117,28 @@ def test_a_lot_ends_each_flight_where_it_is_terminated(fleet):
         assert len(flight.log.t) == len(other.log.t) == len(flight.error) == len(flight.log.u)
 
 
+def test_a_lot_with_an_odd_flight_is_flown_one_by_one(fleet, flights, monkeypatch):
+    """The first two of a lot look alike; all of them are looked at before they fly."""
+    from retrim.experiments import fleet as module
+    from retrim.experiments import flying
+
+    looked = []
+
+    def alike(plants, pilots):
+        looked.append(len(plants))
+        return len(looked) == 1  # when it is planned, not when it is flown
+
+    monkeypatch.setattr(module, "lanes", lambda: 1)
+    monkeypatch.setattr(flying, "can_fly_together", alike)
+    part = [spec for spec in fleet.specs if spec.method == "base"][:2]
+    alone = {flight.spec: flight for flight in flights.flown}
+    flown = fleet.run(only=part).flown
+    assert looked == [2, 2]
+    assert [flight.spec for flight in flown] == part
+    for flight in flown:
+        np.testing.assert_array_equal(flight.log.p, alone[flight.spec].log.p)
+
+
 def test_progress_counts_the_flights_that_are_over(fleet):
     told = []
     part = fleet.specs[:3]
