@@ -165,7 +165,7 @@ WRONG = [
     (("sweep", "size.toml"), "'abc' is not a number"),
     (
         ("sweep", "method.toml"),
-        "a disturbance observer turns the frame about a fixed hover goal, for a policy that sees its state",
+        "task 'vision' has no frame for a disturbance observer: Keypoints cannot be turned into another frame",
     ),
     (("sweep", "ranks.toml"), "LoRA: 3 ranks (4, 10, 1) for 2 layers"),
     (("sweep", "overlay.toml"), "nonsense: unknown key"),

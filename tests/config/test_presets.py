@@ -60,7 +60,8 @@ def test_a_hundred_hertz_has_the_same_times():
         ({"pretrain": {"hidden_sizes": []}}, r"pretrain\.hidden_sizes: "),
         ({"pretrain": {"max_grad_norm": 0.0}}, r"pretrain\.max_grad_norm: Input should be greater than 0"),
         ({"actuator_tau": -0.1}, r"actuator_tau: Input should be greater than 0"),
-        ({"reward": "l3"}, r"reward: Input should be 'paper' or 'l2'"),
+        ({"reward": "sharp"}, r"reward = 'sharp' is for task = 'track', not for 'hover'"),
+        ({"reward": "l3"}, r"reward: Input should be 'paper', 'l2' or 'sharp'"),
     ],
 )
 def test_what_does_not_fit_together(tables, message):
@@ -169,6 +170,13 @@ OURS = {
         },
         "adapt": {"max_grad_norm": 1.0},
     },
+}
+OURS["track/retrim"] = OURS["track/preview"] | {
+    "reward": "sharp",
+    "track": {"reference": "circle+figure8+star", "observation": "flat", "felt_copies": 7, "felt_push": 4.0},
+    "pretrain": OURS["track/preview"]["pretrain"]
+    | {"num_updates": 1200, "learning_rate": 5e-3, "adam_b2": 0.95, "hidden_sizes": (128, 128)},
+    "adapt": OURS["hover/retrim"]["adapt"] | {"window": 150, "memory": 2.0},
 }
 OURS["vision/occluded"] = OURS["vision/ideal"] | {
     "vision": {"occlusion": True, "pixel_noise": 1.0, "dropout": 0.05, "whiten_pixels": True, "encoder_steps": 3000}

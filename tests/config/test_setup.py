@@ -13,7 +13,7 @@ from helpers import tiny_preset
 from retrim import ConfigError
 from retrim.adapt.optimisers import CarriedAdam, FreshAdam
 from retrim.adapt.starts import TaskStarts
-from retrim.adapt.views import WorldView
+from retrim.adapt.views import GravityView, WorldView
 from retrim.config import PRESETS, Scenario, Setup, changed, load, setup
 from retrim.config.learners import check_frame
 from retrim.config.vehicles import make_vehicle
@@ -23,7 +23,7 @@ from retrim.learn import policy_loss
 from retrim.physics.actuators import Lagged
 from retrim.physics.dynamics import PointMass
 from retrim.runtime import fly
-from retrim.tasks import Hover, Keypoints, L2Hover, L2Track, Preview, StateObs, Track
+from retrim.tasks import Hover, Keypoints, L2Hover, L2Track, Preview, SharpTrack, StateObs, Track
 
 pytestmark = pytest.mark.usefixtures("optax_promotion")
 
@@ -54,7 +54,7 @@ def test_the_model_has_the_presets_delay_and_lag(built):
     )
     for env in (made.env, made.learner.env):
         assert env.delay_ticks == preset.delay_ticks
-        if preset.name == "track/preview":
+        if preset.name in ("track/preview", "track/retrim"):
             assert isinstance(env.dynamics, Lagged)
             assert float(env.dynamics.tau) == preset.actuator_tau == 0.033
             assert isinstance(env.dynamics.base, PointMass)
@@ -66,7 +66,7 @@ def test_the_model_has_the_presets_delay_and_lag(built):
 def test_the_task_has_the_presets_numbers(built):
     preset, made = built
     kinds = {("hover", "paper"): Hover, ("hover", "l2"): L2Hover, ("vision", "paper"): Hover, ("vision", "l2"): L2Hover}
-    kinds |= {("track", "paper"): Track, ("track", "l2"): L2Track}
+    kinds |= {("track", "paper"): Track, ("track", "l2"): L2Track, ("track", "sharp"): SharpTrack}
     for task in (made.env.task, made.flown):
         assert type(task) is kinds[preset.task, preset.reward]
         assert task.horizon == preset.pretrain.horizon
@@ -93,7 +93,9 @@ def test_the_observation_has_the_presets_numbers(built):
         assert seen.dt == preset.dt
         assert seen.delay_ticks == preset.plant_delay_ticks
     else:
-        assert type(seen) is (Preview if preset.name == "track/preview" else StateObs)
+        assert type(seen) is (Preview if preset.name in ("track/preview", "track/retrim") else StateObs)
+        if preset.task == "track" and preset.track.observation != "state":
+            assert seen.accelerations == ((0.04,) if preset.track.observation == "flat" else ())
         assert seen.history == preset.command_history
 
 
@@ -140,7 +142,7 @@ def test_the_learner_has_the_presets_numbers(built):
     else:
         assert (learner.starts.from_task, float(learner.starts.spread)) == (a.task_starts, a.start_noise)
     if a.frame == "gravity":
-        np.testing.assert_array_equal(learner.view.pivot, preset.goal)
+        assert isinstance(learner.view, GravityView)
     else:
         assert isinstance(learner.view, WorldView)
     assert learner.env.task is made.flown
@@ -180,10 +182,11 @@ def test_the_pilot_has_the_presets_schedule(built, latency, monkeypatch):
     ]
     ((controller, *numbers),) = pilots
     assert numbers == [[a.fit_every, a.update_every], preset.dt, a.window]
-    flown = controller(made.new_policy(random.key(0)))
+    flown = controller(made.learner.init(made.new_policy(random.key(0)), random.key(2)))
     if a.frame == "gravity":
         assert isinstance(flown, GravityFrame)
         assert flown.observer.delay_ticks == preset.plant_delay_ticks
+        assert flown.known.model is made.learner.residual_model
         flown = flown.inner
     assert isinstance(flown, PolicyController)
     assert flown.observation is made.flown.observation_in_flight
@@ -282,8 +285,8 @@ def test_flight_starts_follow_from_seed_and_home_alone():
     assert 0.05 < np.stack([x.v for x in starts]).std() < 0.2
 
 
-def test_a_frame_turns_about_a_fixed_goal_only():
-    """A goal that moves, a reference and keypoints are refused."""
+def test_a_frame_is_refused_for_what_cannot_be_turned():
+    """A goal that moves, and keypoints on the ground."""
 
     class Moving(Hover):
         def target(self, t):
@@ -292,11 +295,25 @@ def test_a_frame_turns_about_a_fixed_goal_only():
     fixed = Setup.of(tiny_preset())
     f = fixed.flown
     check_frame(fixed.preset, f)
-    with pytest.raises(ConfigError, match="about a fixed hover goal"):
+    with pytest.raises(ConfigError, match="Moving moves its target: it must say how that is turned"):
         check_frame(fixed.preset, Moving(f.goal, f.observation, f.box, f.heading, f.dt, f.horizon))
-    for name in ("track/preview", "vision/ideal"):
-        with pytest.raises(ConfigError, match="about a fixed hover goal"):
-            Setup.of(changed(load(name), adapt={"frame": "gravity"}))
+    with pytest.raises(ConfigError, match=r"'vision' has no frame .*: Keypoints cannot be turned into another frame"):
+        Setup.of(changed(load("vision/ideal"), adapt={"frame": "gravity"}))
+
+
+def test_training_follows_references_as_they_are_felt():
+    """Every member of the family is a built-in reference, level or tilted and scaled; flight follows the plain one."""
+    made = Setup.of(changed(load("track/retrim"), track={"reference": "circle+star", "felt_copies": 2}))
+    trained, flown = made.env.task.reference, made.flown.reference
+    assert trained.joins.shape[0] == 2 * (1 + 2)
+    assert flown.joins.shape[0] == 2
+    starts = trained.joins[:, 0]
+    p = jax.vmap(jax.vmap(trained, (0,)))(starts[:, None] + jnp.linspace(3.0, 12.0, 200)[None]).p
+    height = np.ptp(np.asarray(p)[:, :, 2], axis=1)
+    assert (height[[0, 3]] < 1e-4).all()
+    assert (height[[1, 2, 4, 5]] > 0.01).all()
+    width = np.linalg.norm(np.ptp(np.asarray(p), axis=1), axis=1)
+    assert len(set(np.round(width[:3], 2))) == 3
 
 
 # ---- at 100 Hz

@@ -8,30 +8,36 @@ import pytest
 from jax import random
 
 from helpers import GOAL, hover_env, random_command, random_state, replaced
-from retrim.adapt.views import GravityView, TurnedResidual, WorldView
+from retrim.adapt.views import GravityView, WorldView
 from retrim.control import Policy
 from retrim.control.controller import PolicyController
-from retrim.control.gravity_frame import GravityFrame, tilted, turned
+from retrim.control.gravity_frame import GravityFrame, Unsteady
 from retrim.estimation.disturbance_observer import DisturbanceObserver
-from retrim.learn import Env, Window, rollout
+from retrim.learn import Env, rollout
 from retrim.physics import Command, Hybrid, PointMass, State, small, so3
-from retrim.physics.actuators import Trimmed
-from retrim.tasks import Start
+from retrim.physics.actuators import Lagged
+from retrim.physics.felt_frame import FeltFrame
+from retrim.tasks import L2Track, Preview, Start, Track
+from retrim.tasks.shapes import circle, figure8, star
 
-PIVOT = jnp.array(GOAL)
+HOME = jnp.array(GOAL)
+LIMIT = jnp.array(6.0)
 PUSHES = [(0.0, 0.0, 0.0), (2.0, 2.0, 2.0), (-3.0, 1.0, -2.5), (0.0, 0.0, -6.0), (5.0, -3.0, 1.0)]
 
 
+def close(a, b, atol=1e-12):
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=atol), a, b)
+
+
 @pytest.mark.parametrize("d", PUSHES)
-def test_the_frame_turns_felt_gravity_down(d):
-    d = jnp.array(d)
-    Q, extra = tilted(d)
-    np.testing.assert_allclose(Q @ Q.T, np.eye(3), atol=1e-12)
-    assert float(jnp.linalg.det(Q)) == pytest.approx(1.0)
-    felt = jnp.array([0.0, 0.0, -9.81]) + d
-    np.testing.assert_allclose(Q @ felt, [0.0, 0.0, -(9.81 + float(extra))], atol=1e-3)
+def test_felt_gravity_is_standard_gravity_in_the_frame(d):
+    frame = FeltFrame.of(jnp.array(d))
+    np.testing.assert_allclose(frame.Q @ frame.Q.T, np.eye(3), atol=1e-12)
+    assert float(jnp.linalg.det(frame.Q)) == pytest.approx(1.0)
+    felt = jnp.array([0.0, 0.0, -9.81]) + jnp.array(d)
+    np.testing.assert_allclose(frame.vector(felt), [0.0, 0.0, -9.81], atol=1e-12)
     axis = jnp.cross(felt, jnp.array([0.0, 0.0, 1.0]))  # the smallest rotation leaves this one alone
-    np.testing.assert_allclose(Q @ axis, axis, atol=1e-9)
+    np.testing.assert_allclose(frame.Q @ axis, axis, atol=1e-9)
 
 
 @pytest.mark.parametrize("d", PUSHES)
@@ -42,74 +48,183 @@ def test_a_tick_in_the_frame_is_a_tick_in_the_world(d, state_dependent, key):
     x, u = random_state(k_x), random_command(k_u)
     drag = 0.3 if state_dependent else 0.0
     residual = lambda x, u: d - drag * x.v + drag * u.c * x.R[:, 0]  # noqa: E731
-    Q, extra = tilted(d)
-    in_world = Hybrid(PointMass(0.02), residual).step(x, Command(u.c + extra, u.omega), jnp.zeros(3))
-    model = Hybrid(Trimmed(PointMass(0.02), extra), TurnedResidual(residual, d, PIVOT))
-    inside = model.step(turned(Q, PIVOT, x), u, jnp.zeros(3))
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-12), inside, turned(Q, PIVOT, in_world))
+    frame = FeltFrame.of(d)
+    left = lambda x, u: frame.vector(residual(frame.world_state(x), frame.world_command(u)) - d)  # noqa: E731
+    for model in (PointMass(0.02), Lagged(PointMass(0.02), jnp.array(0.03))):
+        world, inside = Hybrid(model, residual), Hybrid(model, left)
+        s, turned = world.init(x), inside.init(frame.state(x))
+        if isinstance(model, Lagged):  # its actuators hover at first, in the world as in the frame
+            turned = replaced(turned, acting=frame.command(s.acting))
+        s, turned = world.step(s, u, jnp.zeros(3)), inside.step(turned, frame.command(u), jnp.zeros(3))
+        close(inside.state(turned), frame.state(world.state(s)))
 
 
-def test_turning_there_and_back_is_nothing(key):
-    Q, x = so3.exp(random.normal(key, (3,))), random_state(key)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-12), turned(Q.T, PIVOT, turned(Q, PIVOT, x)), x)
+def test_into_the_frame_and_back_is_nothing(key):
+    frame = FeltFrame.of(jnp.array([1.0, -2.0, 3.0]))
+    x, u = random_state(key), random_command(key)
+    close(frame.world_state(frame.state(x)), x)
+    close(frame.world_command(frame.command(u)), u)
 
 
-def test_a_constant_push_leaves_nothing_to_learn():
-    """At rest in trim the view's residual is zero; so it is for a known push in every attitude that is level there."""
-    env = hover_env()
-    d = jnp.array([2.0, -1.0, 1.5])
-    window = Window.of(
-        np.arange(12.0), np.zeros((12, 3)), np.tile(np.eye(3), (12, 1, 1)), np.zeros((12, 3)), np.full(12, 9.81),
-        np.zeros((12, 3)),
-    )  # fmt: skip
-    corrected, seen = GravityView(PIVOT, jnp.array(6.0))(env, lambda x, u: d, window)
-    after = corrected.dynamics.step(State.at(PIVOT), Command.hover(), jnp.zeros(3))
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-12), after, State.at(PIVOT))
-    Q, extra = tilted(d)
-    np.testing.assert_allclose(seen.x.p[0], PIVOT + Q @ (0.0 - PIVOT), atol=1e-9)
-    np.testing.assert_allclose(seen.u.c, 9.81 - extra, atol=1e-9)
-    same, window_too = WorldView()(env, lambda x, u: d, window)
-    assert window_too is window
-    np.testing.assert_array_equal(same.dynamics.residual(State.at(PIVOT), Command.hover()), d)
+@pytest.mark.parametrize("d", PUSHES)
+@pytest.mark.parametrize("make", [circle, figure8, star])
+def test_flatness_flies_the_turned_reference(make, d):
+    """The reference's command in the frame, taken back to the world, gives its acceleration under the push."""
+    d = jnp.array(d)
+    frame, reference = FeltFrame.of(d), make()
+    times = jnp.array([0.0, 0.8, 2.2, 4.3, 5.1])
+    here = jax.vmap(reference)(times)
+    turned = jax.vmap(reference.in_frame(frame))(times)
+    close(turned.p, jax.vmap(frame.vector)(here.p))
+    close(turned.v, jax.vmap(frame.vector)(here.v))
+    thrust = np.asarray(turned.u)[:, 0] / float(frame.scale)
+    needed = np.linalg.norm(np.asarray(here.a) - np.array([0.0, 0.0, -9.81]) - np.asarray(d), axis=1)
+    np.testing.assert_allclose(thrust, needed, rtol=1e-6)
+    if not d.any():
+        np.testing.assert_allclose(turned.u, here.u, atol=0.02)
+    np.testing.assert_array_equal(reference.in_frame(frame).lap, reference.lap)
+    away = HOME + jnp.array([0.1, 0.7, -0.2])
+    inside = reference.in_frame(frame).distance(frame.vector(away)) / frame.scale
+    np.testing.assert_allclose(inside, reference.distance(away), rtol=1e-6)
+
+
+@pytest.mark.parametrize("d", [(2.0, -1.0, 1.5), (0.0, 3.0, -2.0)])
+def test_the_turned_command_follows_the_turned_path(d):
+    """From the reference's own state its rates keep the thrust where the path needs it, over a second."""
+    frame = FeltFrame.of(jnp.array(d))
+    reference = circle().in_frame(frame)
+
+    def attitude(t):
+        here = reference(t)
+        z = here.a + jnp.array([0.0, 0.0, 9.81])
+        z = z / jnp.linalg.norm(z)
+        y = jnp.cross(z, jnp.array([1.0, 0.0, 0.0]))
+        y = y / jnp.linalg.norm(y)
+        return jnp.stack([jnp.cross(y, z), y, z], axis=1)
+
+    model = PointMass(0.005)
+
+    def tick(k, x):
+        return model.step(x, Command.of(reference(4.0025 + 0.005 * k).u), jnp.zeros(3))
+
+    begin, end = jnp.array(4.0), jnp.array(5.0)
+    x = State(reference(begin).p, attitude(begin), reference(begin).v)
+    x = jax.lax.fori_loop(0, 200, tick, x)
+    np.testing.assert_allclose(x.p, reference(end).p, atol=0.002)
+
+
+@pytest.mark.parametrize("kind", [Track, L2Track])
+def test_a_turned_task_sees_and_rewards_the_same(kind, key):
+    """The reference's own state has the same reward, and what a preview shows is turned and scaled."""
+    reference, frame = figure8(), FeltFrame.of(jnp.array([1.0, 2.0, -1.0]))
+    task = kind(reference, Preview(reference, small().omega_max), jnp.array(1.0), jnp.array(5.0), 0.02, 50)
+    turned, t, x = task.in_frame(frame), jnp.array(4.2), random_state(key)
+    memory = task.observation.init(x)
+    seen, _ = task.observation(memory, t, x, Command.hover())
+    inside, _ = turned.observation(memory, t, frame.state(x), Command.hover())
+    for k in (0, 3, 6, 9, 12, 15, 18, 30):  # positions, velocities, and its own velocity
+        np.testing.assert_allclose(inside[k : k + 3], frame.vector(seen[k : k + 3]), atol=1e-9)
+    np.testing.assert_allclose(turned.error(t, frame.state(x)), frame.scale * task.error(t, x), rtol=1e-9)
+    at = turned.reference(t)
+    there = State(at.p, jnp.eye(3), at.v)
+    heads = 0.5 * (1.0 - np.cos(float(at.heading)))
+    if kind is L2Track:
+        np.testing.assert_allclose(turned.reward(t, there, Command.of(at.u)), -heads, atol=1e-9)
+
+
+@pytest.mark.parametrize("d", [(2.0, -1.0, 1.5), (-2.0, 2.0, 2.0)])
+def test_a_constant_push_leaves_nothing_to_learn(d, key):
+    """Roll-outs in the view under a known push are those without one, in the frame; so are their rewards."""
+    env, d = hover_env(horizon=25), jnp.array(d)  # too short to be terminated
+    frame, policy = FeltFrame.of(d), Policy.of(15, small(), key=key, hidden=(8, 8))
+    start = Start(jnp.array(0.0), random_state(key))
+    pushed = eqx.filter_jit(rollout)(GravityView(LIMIT)(env, lambda x, u: d), policy, start)
+    calm_env, calm_start = Env(env.dynamics, env.task.in_frame(frame)), Start(start.t, frame.state(start.x))
+    calm = eqx.filter_jit(rollout)(calm_env, policy, calm_start)
+    close(jax.vmap(frame.state)(pushed.x), calm.x, 1e-9)
+    close(jax.vmap(frame.command)(pushed.u), calm.u, 1e-9)
+    np.testing.assert_allclose(pushed.reward, calm.reward, atol=1e-9)
+
+
+def test_the_world_is_seen_as_it_is():
+    env, residual = hover_env(), lambda x, u: x.v
+    seen = WorldView()(env, residual)
+    assert seen.felt is None
+    assert seen.dynamics.residual is residual
+
+
+def test_the_frame_sends_no_gradient_back(key):
+    """As for the residual (paper, Sec. III-D), gradients flow through the analytical model only."""
+    env = hover_env(horizon=5)
+    view = GravityView(LIMIT)(env, lambda x, u: -0.5 * x.v)
+    x = random_state(key)
+
+    def tilt(v):
+        return view.frame(replaced(x, v=v), Command.hover()).Q
+
+    np.testing.assert_array_equal(jax.jacobian(tilt)(x.v), 0.0)
+
+
+def test_what_is_known_needs_no_estimate(key):
+    """The observer sees what the known residual does not say; the frame answers both, each once."""
+    d = jnp.array([1.0, 0.0, -2.0])
+    residual = lambda x, u: d - 0.4 * x.v + 0.1 * (u.c - 9.81) * x.R[:, 2]  # noqa: E731
+    x, u = random_state(key), random_command(key)
+    np.testing.assert_allclose(Unsteady(residual)(x, u) + d, residual(x, u), atol=1e-12)
+    observer = DisturbanceObserver(PointMass(0.02), jnp.array(1e-9), LIMIT, jnp.array(jnp.inf))
+    policy = Policy.of(15, small(), key=key, hidden=(8, 8))
+    framed = GravityFrame(PolicyController(hover_env().task.observation, policy), observer, residual)
+    memory = framed.init(x)
+    memory = replaced(memory, observer=observer.issued(memory.observer, u))  # no delay is declared: it acts at once
+    after = Hybrid(PointMass(0.02), residual).step(x, u, jnp.zeros(3))
+    _, memory = framed(memory, jnp.array(0.0), after)
+    np.testing.assert_allclose(memory.observer.d_hat, d, atol=1e-6)
+    np.testing.assert_allclose(memory.frame.d, residual(after, u), atol=1e-6)
 
 
 def test_the_frame_is_capped_and_defined_near_free_fall():
     """An estimate beyond the limit turns no farther; a falling vehicle still has a frame."""
-    observer = DisturbanceObserver(PointMass(0.02), jnp.array(0.2), jnp.array(6.0), jnp.array(2.0))
+    observer = DisturbanceObserver(PointMass(0.02), jnp.array(0.2), LIMIT, jnp.array(2.0))
     s = observer.init(State.at(jnp.zeros(3)))
     falling = State(jnp.zeros(3), jnp.eye(3), jnp.array([0.0, 0.0, -1e4]))
     s = observer(s, falling)
     assert float(jnp.linalg.norm(s.d_hat)) <= 6.0 + 1e-6
-    Q, extra = tilted(s.d_hat)
-    assert np.isfinite(Q).all()
-    assert float(extra) > -9.81
+    frame = FeltFrame.of(s.d_hat)
+    assert np.isfinite(frame.Q).all()
+    assert 0.0 < float(frame.scale) < 3.0
 
 
 @pytest.mark.parametrize("d", [(1.0, 0.5, -1.0), (-2.0, 2.0, 2.0)])
-def test_a_flight_under_a_known_push_is_the_calm_flight_turned(d):
-    """With a perfect estimate, the controller flies under a push as without one, but for the strength of gravity."""
+@pytest.mark.parametrize("tracking", [False, True])
+def test_a_flight_under_a_known_push_is_the_calm_flight_turned(d, tracking):
+    """With a perfect estimate, a controller flies under a push as without one, in the frame."""
     env, d = hover_env(horizon=60), jnp.array(d)
-    policy = Policy.of(15, small(), key=random.key(3), hidden=(8, 8))
+    frame, x0 = (
+        FeltFrame.of(d),
+        State(HOME + jnp.array([0.2, -0.1, 0.3]), so3.exp(jnp.array([0.1, 0.2, 0.0])), jnp.zeros(3)),
+    )
+    if tracking:
+        reference = circle()
+        task = Track(reference, Preview(reference, small().omega_max), jnp.array(1.0), jnp.array(5.0), 0.02, 60)
+        env = Env(PointMass(0.02), task)
+    policy = Policy.of(env.task.observation.size, small(), key=random.key(3), hidden=(8, 8))
     inner = PolicyController(env.task.observation, policy)
     exact = DisturbanceObserver(PointMass(0.02), jnp.array(1e-9), jnp.array(9.0), jnp.array(jnp.inf))
-    framed = GravityFrame(inner, exact, PIVOT)
-    x0 = State(PIVOT + jnp.array([0.2, -0.1, 0.3]), so3.exp(jnp.array([0.1, 0.2, 0.0])), jnp.zeros(3))
-    Q, extra = tilted(d)
-    heavier = Hybrid(Trimmed(PointMass(0.02), extra), lambda x, u: jnp.array([0.0, 0.0, -1.0]) * extra)
-    calm = eqx.filter_jit(rollout)(Env(heavier, env.task), policy, Start(jnp.array(0.0), x0))
-    x = turned(Q.T, PIVOT, x0)
+    framed = GravityFrame(inner, exact)
+    start = Start(jnp.array(0.0), frame.state(x0))
+    calm = eqx.filter_jit(rollout)(Env(PointMass(0.02), env.task.in_frame(frame)), policy, start)
 
     @jax.jit
     def tick(memory, x, k):
         u, memory = framed(memory, 0.02 * k, x)
         return memory, PointMass(0.02).step(x, u, d)
 
-    memory = framed.init(x)
+    x, memory = x0, framed.init(x0)
     gained = 9.81 * x.R[:, 2] - jnp.array([0.0, 0.0, 9.81]) + d  # in the tick before the start, at hover thrust
     before = replaced(x, v=x.v - 0.02 * gained)
     memory = replaced(memory, observer=replaced(memory.observer, d_hat=d, last=before, v=before.v))
     positions = []
     for k in range(40):
-        positions.append(turned(Q, PIVOT, x).p)
+        positions.append(frame.vector(x.p))
         memory, x = tick(memory, x, jnp.array(float(k)))
     np.testing.assert_allclose(np.stack(positions), calm.x.p[:40], atol=1e-6)

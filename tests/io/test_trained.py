@@ -76,7 +76,14 @@ def test_round_trip_is_exact(tmp_path, setup):
 
 
 SIZES = {"hover/fast": 23, "hover/released": 27, "hover/paper": 15, "hover/100hz": 31, "track/preview": 43}
-SIZES |= {"hover/retrim": 23, "track/paper": 15, "vision/ideal": 89, "vision/occluded": 89, "vision/paper": 89}
+SIZES |= {
+    "hover/retrim": 23,
+    "track/paper": 15,
+    "track/retrim": 49,
+    "vision/ideal": 89,
+    "vision/occluded": 89,
+    "vision/paper": 89,
+}
 
 
 @pytest.mark.parametrize("name", PRESETS)

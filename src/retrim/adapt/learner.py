@@ -105,15 +105,15 @@ class OnlineLearner(eqx.Module):
         Returns:
             The trained policy, and the gate's verdict on it.
         """
-        corrected, seen = self.view(self.env, FittedResidual(self.residual_model, residual), window)
+        corrected = self.view(self.env, FittedResidual(self.residual_model, residual))
         k_train, k_gate, k_window = random.split(key, 3)
-        x0 = self.starts(self.env.task, seen, k_train, self.num_updates, self.num_envs)
+        x0 = self.starts(self.env.task, window, k_train, self.num_updates, self.num_envs)
         begun = self.optimiser.begin(state, self.num_updates)
         trained, _ = bptt(begun, corrected, x0, optimiser=self.optimiser.transformation(self.num_updates))
         held_out = jax.tree.map(
             lambda a, b: jnp.concatenate([a, b]),
             jax.vmap(self.env.task.reset)(random.split(k_gate, 4)),
-            drawn(seen, k_window, (4,)),
+            drawn(window, k_window, (4,)),
         )
         return trained, judge(trained.policy.merged(), state.policy.merged(), corrected, held_out)
 

@@ -4,7 +4,6 @@ import math
 from typing import Any
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from ..adapt.learner import OnlineLearner
 from ..adapt.optimisers import CarriedAdam, FreshAdam
@@ -16,9 +15,8 @@ from ..errors import ConfigError
 from ..estimation.disturbance_observer import DisturbanceObserver
 from ..learn.env import Env
 from ..learn.residuals.model import ResidualModel
-from ..physics.dynamics import PointMass
-from ..tasks.hover import AbstractHover
-from ..tasks.observation import StateObs
+from ..physics.dynamics import PointMass, Residual
+from ..physics.felt_frame import FeltFrame
 from ..tasks.task import AbstractTask
 from .presets import Preset
 
@@ -50,26 +48,30 @@ def make_learner(preset: Preset, model: ResidualModel, env: Env) -> OnlineLearne
         num_updates=a.num_updates,
         num_envs=a.num_envs,
         starts=TaskStarts() if a.task_starts is None else FlownStarts(jnp.array(a.start_noise), a.task_starts),
-        view=GravityView(env.task.home(), jnp.array(TILT_LIMIT)) if a.frame == "gravity" else WorldView(),
+        view=GravityView(jnp.array(TILT_LIMIT)) if a.frame == "gravity" else WorldView(),
     )
 
 
 def check_frame(preset: Preset, task: AbstractTask) -> None:
-    """Refuse a frame that turns about a goal for a task without a fixed one, or a policy that does not see its state.
+    """Refuse a frame for a task that cannot be turned.
 
     Raises:
-        ConfigError: It names the task.
+        ConfigError: It names the task, and what cannot be turned.
     """
-    fixed = isinstance(task, AbstractHover) and type(task).target is AbstractHover.target
-    if not fixed or not isinstance(task.observation, StateObs):
-        raise ConfigError(
-            "a disturbance observer turns the frame about a fixed hover goal, for a policy that sees its state; task "
-            f"{preset.task!r} has no such goal, or hides the state"
-        )
+    try:
+        task.in_frame(FeltFrame.of(jnp.zeros(3)))
+    except NotImplementedError as error:
+        raise ConfigError(f"task {preset.task!r} has no frame for a disturbance observer: {error}") from error
 
 
-def gravity_frame(controller: AbstractController[Any], preset: Preset, goal: Float[Array, "3"]) -> GravityFrame:
-    """Return a controller for hover, flown in the gravity that a disturbance observer feels."""
+def gravity_frame(controller: AbstractController[Any], preset: Preset, known: Residual | None = None) -> GravityFrame:
+    """Return a controller, flown in the gravity that a disturbance observer feels.
+
+    Args:
+        controller: It can be turned.
+        preset: Its control period and declared delay are those of the observer.
+        known: What is known of the residual; the observer sees the rest.
+    """
     observer = DisturbanceObserver(
         PointMass(preset.dt),
         jnp.array(OBSERVER_TAU),
@@ -77,4 +79,4 @@ def gravity_frame(controller: AbstractController[Any], preset: Preset, goal: Flo
         jnp.array(WANDER),
         delay_ticks=preset.plant_delay_ticks,
     )
-    return GravityFrame(controller, observer, goal)
+    return GravityFrame(controller, observer, known)

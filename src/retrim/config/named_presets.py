@@ -49,9 +49,22 @@ RETRIM = dataclasses.replace(
     ),
 )  # fmt: skip
 
+TRACK_RETRIM = dataclasses.replace(
+    TRACK,
+    name="track/retrim",
+    reward="sharp",
+    track=Track(reference="circle+figure8+star", observation="flat", felt_copies=7),
+    pretrain=dataclasses.replace(
+        TRACK.pretrain, num_updates=1200, learning_rate=5e-3, adam_b2=0.95, hidden_sizes=(128, 128)
+    ),
+    adapt=dataclasses.replace(RETRIM.adapt, window=150, memory=2.0),
+)
+
 PRESETS: dict[str, Preset] = {
     # Ours: the frame of the gravity that is felt answers in a second, short bursts of learning take what it leaves.
     "hover/retrim": RETRIM,
+    # The same for tracking: trained on references as they are and as they are felt under a push.
+    "track/retrim": TRACK_RETRIM,
     # The paper's loop with one tick of delay, the last two commands, and a small budget that reaches the same error.
     "hover/fast": FAST,
     # The delay and the observation of the authors' code: 2 ticks, the last three commands, 200 x 200 x 150.

@@ -91,10 +91,15 @@ class Track:
 
     reference: str = "circle"
     """Reference of training: circle, figure8, star, a CSV file, module:name, or several of these joined by +."""
-    observation: Literal["state", "preview"] = "state"
-    """state: o = [p, R, v]; preview: the reference relative to the vehicle, now and soon."""
+    observation: Literal["state", "preview", "flat"] = "state"
+    """state: o = [p, R, v]; preview: the reference relative to the vehicle, now and soon; flat: its acceleration and
+    jerk, too."""
     start_spread: Positive = 1.0
     """Starts lie within this of the reference, per axis [m]."""
+    felt_copies: int = Field(default=0, ge=0, le=100, strict=True)
+    """Training also follows so many copies of each reference as they are where a constant push is gravity."""
+    felt_push: Positive = 4.0
+    """Largest such push [m/s^2]."""
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -120,8 +125,8 @@ class Preset:
     name: str = "hover/paper"
     task: str = "hover"
     """hover, track, vision, or module:name."""
-    reward: Literal["paper", "l2"] = "paper"
-    """paper: as printed; l2: ours, with a tip at the goal."""
+    reward: Literal["paper", "l2", "sharp"] = "paper"
+    """paper: as printed; l2: ours, with a tip at the goal in hover; sharp: l2 with a tip at the reference, too."""
     vehicle: str | VehicleSpec = "small"
     """Vehicle of training: small, large, kingfisher, module:name, or a vehicle file."""
     dt: float = Field(default=0.02, ge=0.002, le=0.1, strict=True)
@@ -151,6 +156,8 @@ class Preset:
         for name in ("track", "vision"):
             if getattr(self, name) is not None and self.task != name:
                 raise ValueError(f"a table [{name}] needs task = {name!r}, not {self.task!r}")
+        if self.reward == "sharp" and self.task != "track":
+            raise ValueError(f"reward = 'sharp' is for task = 'track', not for {self.task!r}")
         if self.options and self.task in BUILT_IN_TASKS:
             raise ValueError(f"a table [options] is for a task of one's own, not for {self.task!r}")
         if abs(1000 * self.dt - round(1000 * self.dt)) > 1e-6:

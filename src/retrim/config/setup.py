@@ -23,7 +23,7 @@ from ..errors import ConfigError
 from ..learn.encoder import pretrain_encoder
 from ..learn.env import Env
 from ..learn.pretrain import pretrain
-from ..learn.residuals.model import ResidualModel
+from ..learn.residuals.model import FittedResidual, ResidualModel
 from ..physics.actuators import Lagged
 from ..physics.dynamics import AbstractDynamics, PointMass
 from ..physics.state import State
@@ -37,8 +37,9 @@ from ..tasks.reference import Reference
 from ..tasks.task import AbstractTask
 from .learners import check_frame, gravity_frame, make_learner
 from .presets import Preset
+from .presets import Track as TrackTable
 from .residuals import ResidualRequest, make_residual
-from .tasks import TaskRequest, find_task, make_reference
+from .tasks import TaskRequest, find_task, make_reference, make_training_reference
 from .vehicles import make_vehicle
 
 Latency = Literal["fixed", "measured"]
@@ -86,9 +87,10 @@ class Setup:
         if reference is not None and not entry.has_reference:
             raise ConfigError(f"reference {reference!r}: a {preset.task} policy follows none")
         vehicle = make_vehicle(preset.vehicle)
-        trained_on = (
-            make_reference(preset.track.reference if preset.track else "circle") if entry.has_reference else None
-        )
+        table = preset.track or TrackTable()
+        trained_on = make_training_reference(table) if entry.has_reference else None
+        if table.felt_copies and reference is None:
+            reference = table.reference
         try:
             task = entry.make(TaskRequest(preset, vehicle, trained_on))
             flown = task
@@ -176,19 +178,21 @@ class Setup:
             pilot.dt = self.preset.dt
         return pilot
 
-    def controller(self, policy: Policy) -> AbstractController[Any]:
+    def controller(self, state: LearnerState) -> AbstractController[Any]:
         """Return the controller of a policy that adapts: behind its observation, in the preset's frame."""
-        plain = PolicyController(self.flown.observation_in_flight, policy)
-        return self.in_gravity_frame(plain) if self.preset.adapt.frame == "gravity" else plain
+        plain = PolicyController(self.flown.observation_in_flight, state.policy.policy.merged())
+        if self.preset.adapt.frame == "world":
+            return plain
+        return gravity_frame(plain, self.preset, FittedResidual(self.learner.residual_model, state.residual))
 
     def in_gravity_frame(self, controller: AbstractController[Any]) -> GravityFrame:
-        """Return a controller for hover, flown in the gravity that a disturbance observer feels.
+        """Return a controller flown in the gravity that a disturbance observer feels.
 
         Raises:
-            ConfigError: The task tracks a reference, or the policy does not see its state.
+            ConfigError: The task cannot be turned, or its policy does not see its state.
         """
         check_frame(self.preset, self.env.task)
-        return gravity_frame(controller, self.preset, self.flown.home())
+        return gravity_frame(controller, self.preset)
 
     def low_rank(self, policy: Policy | LoraPolicy, key: Key[Array, ""]) -> LoraPolicy:
         """Return ``policy`` with a fresh low-rank delta (ranks 4, 10, 1 and scale 4, as in the paper).

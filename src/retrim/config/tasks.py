@@ -8,17 +8,19 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax import random
 
 from ..errors import ConfigError
+from ..physics.felt_frame import FeltFrame
 from ..physics.vehicle import Vehicle
 from ..tasks.hover import Hover, L2Hover
 from ..tasks.keypoints import Keypoints
 from ..tasks.observation import AbstractObservation, StateObs
 from ..tasks.preview import Preview
-from ..tasks.reference import Reference, joined
+from ..tasks.reference import AbstractReference, Reference, joined
 from ..tasks.shapes import REFERENCES as BUILT_IN
 from ..tasks.task import AbstractTask
-from ..tasks.track import L2Track
+from ..tasks.track import AbstractTrack, L2Track, SharpTrack
 from ..tasks.track import Track as PaperTrack
 from ..tasks.trajectory_csv import from_csv
 from .presets import Preset
@@ -32,6 +34,12 @@ REFERENCES: Registry[Callable[[], Reference]] = Registry(
 for _name, _make in BUILT_IN.items():
     REFERENCES.register(_name, _make)
 register_reference = REFERENCES.register
+
+FELT_TAG = 5
+"""Key of the pushes under which references are felt in training; the same for every seed of a policy."""
+
+LEAD = 0.04  # [s]: about as late as commands act, behind a delay and motors
+TRACKS: dict[str, type[AbstractTrack]] = {"paper": PaperTrack, "l2": L2Track, "sharp": SharpTrack}
 
 LAPS = {"": None, "laps": True, "once": False}
 """What may stand behind a CSV file and a colon: whether it repeats."""
@@ -110,6 +118,24 @@ def _built_in(names: str, x64: bool) -> Reference:
     return found[0] if len(found) == 1 else joined(found)
 
 
+def make_training_reference(table: TrackTable) -> Reference:
+    """Return the reference that a policy is trained on: as named, and as felt under constant pushes.
+
+    Raises:
+        ConfigError: As :func:`make_reference`.
+    """
+    if not table.felt_copies:
+        return make_reference(table.reference)
+    members = list[AbstractReference]()
+    for name in table.reference.split("+"):
+        plain = make_reference(name)
+        members.append(plain)
+        for k in range(table.felt_copies):
+            push = table.felt_push * random.ball(random.fold_in(random.key(FELT_TAG), len(members) + k), 3)
+            members.append(plain.in_frame(FeltFrame.of(push)))
+    return joined(members)
+
+
 def _one_reference(name: str) -> Reference:
     file, _, how = name.rpartition(":") if ".csv:" in name.lower() else (name, "", "")
     try:
@@ -170,9 +196,10 @@ def _track(request: TaskRequest) -> AbstractTask:
     if request.reference is None:
         raise ConfigError("task 'track' needs a reference")
     observation: AbstractObservation[Any] = request.state_observation()
-    if table.observation == "preview":
-        observation = Preview(request.reference, request.vehicle.omega_max, p.command_history)
-    kind = L2Track if p.reward == "l2" else PaperTrack
+    if table.observation != "state":
+        ahead = (LEAD,) if table.observation == "flat" else ()
+        observation = Preview(request.reference, request.vehicle.omega_max, p.command_history, ahead)
+    kind = TRACKS[p.reward]
     return kind(
         request.reference,
         observation,
@@ -185,4 +212,4 @@ def _track(request: TaskRequest) -> AbstractTask:
 
 register_task("hover", TaskEntry(_hover, "hover/retrim"))
 register_task("vision", TaskEntry(_vision, "vision/ideal"))
-register_task("track", TaskEntry(_track, "track/preview", has_reference=True))
+register_task("track", TaskEntry(_track, "track/retrim", has_reference=True))

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 from jaxtyping import Array, Float
 
+from ..physics.felt_frame import FeltFrame
 from ..physics.state import Command, State
 from ..tasks.observation import AbstractObservation
 from .policy import Policy
@@ -39,6 +40,14 @@ class AbstractController(eqx.Module, Generic[M]):
         del u
         return memory
 
+    def in_frame(self, frame: FeltFrame) -> "AbstractController[M]":
+        """Return the same controller for states and commands of ``frame``.
+
+        Raises:
+            NotImplementedError: It cannot be turned.
+        """
+        raise NotImplementedError(f"{type(self).__name__} cannot be flown in another frame")
+
 
 class PolicyController(AbstractController[tuple[Any, Command]]):
     """A policy behind its observation. The memory is that of the observation, and the last command."""
@@ -62,3 +71,7 @@ class PolicyController(AbstractController[tuple[Any, Command]]):
     def accepted(self, memory: tuple[Any, Command], u: Command) -> tuple[Any, Command]:
         """Remember ``u`` as the last command."""
         return memory[0], u
+
+    def in_frame(self, frame: FeltFrame) -> "PolicyController":
+        """Return the same policy behind the turned observation."""
+        return PolicyController(self.observation.in_frame(frame), self.policy)

@@ -1,10 +1,8 @@
-"""A constant disturbance is gravity tilted and scaled: fly the unchanged controller in the frame of that gravity.
+"""Fly an unchanged controller in the frame of the gravity that the vehicle feels.
 
-With g' = g + d_hat, let Q be the smallest rotation that takes -g'/|g'| to the vertical. If p, R, v obey Eq. (1) with
-the disturbance d_hat, then Q p, Q R, Q v obey Eq. (1) with a gravity of |g'| along -z and no disturbance: the equation
-is equivariant under rotations, and d_hat enters as gravity does. What is left is the difference of the two magnitudes,
-which is added to the thrust. A controller for hover therefore needs no other input to hold its goal under a constant
-push.
+A constant disturbance is gravity, tilted and scaled (:mod:`retrim.physics.felt_frame`): in that frame nothing disturbs
+the vehicle, so a controller needs no other input, and no other training, to do its task under a constant push. What
+changes with state and command is answered as if it stayed as it is now.
 """
 
 from typing import Any
@@ -14,8 +12,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..estimation.disturbance_observer import DisturbanceObserver, ObserverState
-from ..physics import so3
-from ..physics.state import STANDARD_GRAVITY, Command, State
+from ..physics.dynamics import Hybrid, Residual
+from ..physics.felt_frame import FeltFrame
+from ..physics.state import Command, State
 from .controller import AbstractController
 
 
@@ -24,55 +23,66 @@ class GravityFrameState(eqx.Module):
 
     observer: ObserverState
     inner: Any
+    frame: FeltFrame
+    """Frame of the last command."""
 
 
 class GravityFrame(AbstractController[GravityFrameState]):
-    """Any controller of a state and a fixed goal, flown in the gravity that a disturbance observer estimates."""
+    """Any controller that can be turned, in the gravity that is known and that a disturbance observer estimates."""
 
     inner: AbstractController[Any]
     observer: DisturbanceObserver
-    pivot: Float[Array, "3"]
-    """The goal: the frame is turned about it, world [m]."""
+    """It estimates what is not known."""
+    known: Residual | None = None
+    """Residual that has been learnt, world frame [m/s^2]: what it says beyond what it says at rest needs no estimate,
+    which would come late."""
 
     def init(self, x: State) -> GravityFrameState:
         """Return the memory at the start of a flight."""
-        return GravityFrameState(self.observer.init(x), self.inner.init(x))
+        observed = self.observer.init(x)
+        return GravityFrameState(observed, self.inner.init(x), FeltFrame.of(observed.d_hat))
 
     def __call__(self, memory: GravityFrameState, t: Float[Array, ""], x: State) -> tuple[Command, GravityFrameState]:
-        """Return the inner controller's command in the estimated gravity, with corrected thrust."""
-        observed = self.observer(memory.observer, x)
-        Q, extra = tilted(observed.d_hat)
-        u, inner = self.inner(memory.inner, t, turned(Q, self.pivot, x))
-        u = Command(u.c + extra, u.omega)
-        return u, GravityFrameState(self.observer.issued(observed, u), inner)
+        """Return the inner controller's command in the frame of what is felt now."""
+        observer, felt = self.observer, jnp.zeros_like(x.p)
+        if self.known is not None:
+            unsteady = Unsteady(self.known)
+            felt = unsteady(x, memory.observer.commands[-1])
+            observer = eqx.tree_at(lambda o: o.nominal, observer, Hybrid(observer.nominal, unsteady))
+        observed = observer(memory.observer, x)
+        frame = FeltFrame.of(capped(observed.d_hat + felt, observer.limit))
+        u, inner = self.inner.in_frame(frame)(memory.inner, t, frame.state(x))
+        u = frame.world_command(u)
+        return u, GravityFrameState(observer.issued(observed, u), inner, frame)
 
     def accepted(self, memory: GravityFrameState, u: Command) -> GravityFrameState:
-        """Remember the accepted command, in the observer and, less the correction, in the controller inside."""
-        _, extra = tilted(memory.observer.d_hat)
+        """Remember the accepted command, in the observer and, as the frame has it, in the controller inside."""
         observer = self.observer.accepted(memory.observer, u)
-        return GravityFrameState(observer, self.inner.accepted(memory.inner, Command(u.c - extra, u.omega)))
+        return GravityFrameState(observer, self.inner.accepted(memory.inner, memory.frame.command(u)), memory.frame)
 
 
-def tilted(d_hat: Float[Array, "3"]) -> tuple[Float[Array, "3 3"], Float[Array, ""]]:
-    """Return the rotation into the frame of g + ``d_hat`` [m/s^2], and how much stronger gravity is there [m/s^2].
+class Unsteady(eqx.Module):
+    """What a residual predicts beyond what it predicts at rest: that part depends on state and command."""
 
-    Defined for every ``d_hat`` whose vertical part is smaller than gravity; a weightless vehicle has no such frame.
-    """
-    up = -d_hat + jnp.array([0.0, 0.0, STANDARD_GRAVITY], dtype=d_hat.dtype)
-    strength = jnp.sqrt(jnp.sum(up * up))
-    a, b, c = up / strength
-    # Rodrigues' formula for the smallest rotation that takes (a, b, c) to (0, 0, 1).
-    k = 1.0 / (1.0 + c)
-    Q = jnp.stack(
-        [
-            jnp.stack([1.0 - k * a * a, -k * a * b, -a]),
-            jnp.stack([-k * a * b, 1.0 - k * b * b, -b]),
-            jnp.stack([a, b, c]),
-        ]
-    )
-    return Q, strength - STANDARD_GRAVITY
+    residual: Residual
+
+    def __call__(self, x: State, u: Command) -> Float[Array, "3"]:
+        """Return the rest of the residual acceleration, world frame [m/s^2]."""
+        return self.residual(x, u) - self.residual(State.at(x.p), Command.hover(x.p.dtype))
 
 
-def turned(Q: Float[Array, "3 3"], pivot: Float[Array, "3"], x: State) -> State:
-    """Return the state ``x`` turned by ``Q`` about ``pivot``, world [m]."""
-    return State(pivot + so3.act(Q, x.p - pivot), so3.mul(Q, x.R), so3.act(Q, x.v))
+class Capped(eqx.Module):
+    """A residual whose norm is limited, so that there is a frame of the gravity that is felt."""
+
+    residual: Residual
+    limit: Float[Array, ""]
+    """[m/s^2]"""
+
+    def __call__(self, x: State, u: Command) -> Float[Array, "3"]:
+        """Return the residual acceleration, world frame [m/s^2]."""
+        return capped(self.residual(x, u), self.limit)
+
+
+def capped(d: Float[Array, "3"], limit: Float[Array, ""]) -> Float[Array, "3"]:
+    """Return ``d``, shortened to ``limit`` if it is longer."""
+    return d * jnp.minimum(1.0, limit / jnp.sqrt(jnp.sum(d * d) + 1e-12))

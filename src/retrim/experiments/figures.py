@@ -14,6 +14,7 @@ from ..config.setup import Setup
 from ..physics.effects import ExternalEffects
 from ..physics.state import State
 from ..tasks.keypoints import Keypoints
+from ..tasks.reference import Reference
 from ..tasks.track import AbstractTrack
 from ..viz import plots
 from .flights import Flight
@@ -54,7 +55,7 @@ def picture(
             [_image_track(observation, f.log.true.as_state()) for f in group[:1]] for group in (before, after)
         )
         beside = partial(plots.camera, base=first, adapted=last, wanted=_image_track(observation, home).pixel[0])
-    elif isinstance(task, AbstractTrack):
+    elif isinstance(task, AbstractTrack) and isinstance(task.reference, Reference):
         beside = partial(plots.laps, base=base, adapted=adapted, lap=np.asarray(task.reference.rows)[:, :3])
     else:
         x, y, z = (float(value) for value in task.home())

@@ -3,8 +3,11 @@
 from typing import Any
 
 import equinox as eqx
+from jax import lax
 
 from ..physics.dynamics import AbstractDynamics, Hybrid, Residual
+from ..physics.felt_frame import FeltFrame
+from ..physics.state import Command, State
 from ..tasks.task import AbstractTask
 
 
@@ -16,6 +19,9 @@ class Env(eqx.Module):
     task: AbstractTask
     delay_ticks: int = eqx.field(static=True, default=0)
     """A command issued at a tick acts this many ticks later."""
+    felt: Residual | None = None
+    """The disturbance that a controller around the policy answers by the frame of the gravity that is felt, given the
+    state and the last command, world [m/s^2]; None if the policy sees the world as it is."""
 
     def __check_init__(self) -> None:
         """Raise ``ValueError`` for a negative delay, and for a model and a task that tick at different rates."""
@@ -26,4 +32,13 @@ class Env(eqx.Module):
 
     def with_residual(self, residual: Residual) -> "Env":
         """Return the same environment with ``residual`` added to its model, without gradients through it."""
-        return Env(Hybrid(self.dynamics, residual), self.task, self.delay_ticks)
+        return Env(Hybrid(self.dynamics, residual), self.task, self.delay_ticks, self.felt)
+
+    def frame(self, x: State, last: Command) -> FeltFrame | None:
+        """Return the frame in which the policy sees the world, without gradients through it; None for the world's own.
+
+        Args:
+            x: State.
+            last: Command issued one tick ago.
+        """
+        return None if self.felt is None else FeltFrame.of(lax.stop_gradient(self.felt(x, last)))

@@ -66,26 +66,32 @@ def _scan(env: Env, policy: Policy, start: Start, perturbations: Perturbations |
     hover = policy.u_hover
 
     def tick(carry: Any, xs: Any) -> Any:
-        s, memory, last, pending, alive, worst = carry
+        s, memory, last, issued, pending, alive, worst = carry
         k, perturbation = xs
         t = start.t + k * task.dt
         x = dynamics.state(s)
-        o, memory = task.observation(memory, t, x, last)
-        u, inputs = (policy(o), ()) if perturbation is None else policy.perturbed(o, perturbation)
-        queue = (*pending, u)
+        frame = env.frame(x, issued)
+        seen = task if frame is None else task.in_frame(frame)
+        x_seen = x if frame is None else frame.state(x)
+        o, memory = seen.observation(memory, t, x_seen, last)
+        last, inputs = (policy(o), ()) if perturbation is None else policy.perturbed(o, perturbation)
+        issued = last if frame is None else frame.world_command(last)
+        queue = (*pending, issued)
         acting, waiting = queue[0], queue[1:]
-        reward = jnp.where(alive, task.reward(t, x, acting), worst)
+        reward = seen.reward(t, x_seen, acting if frame is None else frame.command(acting))
+        reward = jnp.where(alive, reward, worst)
         after = dynamics.step(s, acting, calm)
         survived = alive & ~task.terminated(t + task.dt, dynamics.state(after))
         # A terminated vehicle is frozen at its last good state: a diverging state turns masked rewards into NaN
         # gradients.
         s = where(survived, after, lax.stop_gradient(s))
         worst = jnp.minimum(worst, lax.stop_gradient(reward))
-        return (s, memory, u, waiting, survived, worst), ((x, acting, reward, ~alive), inputs)
+        return (s, memory, last, issued, waiting, survived, worst), ((x, acting, reward, ~alive), inputs)
 
     carry = (
         dynamics.init(start.x),
         task.observation.init(start.x),
+        hover,
         hover,
         (hover,) * env.delay_ticks,
         jnp.array(True),

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .dynamics import AbstractDynamics, AbstractWrapper
+from .dynamics import AbstractDynamics
 from .state import Command, State
 
 X = TypeVar("X")
@@ -56,15 +56,3 @@ class Lagged(AbstractDynamics[LagState[X]]):
         mean = jax.tree.map(lambda old, new: new + left * (old - new), s.acting, u)
         end = jax.tree.map(lambda old, new: new + decay * (old - new), s.acting, u)
         return LagState(self.base.step(s.inner, mean, a_ext), end)
-
-
-class Trimmed(AbstractWrapper[X]):
-    """A model that adds a constant to the thrust of every command, as a controller around a policy does in flight."""
-
-    base: AbstractDynamics[X]
-    extra: Float[Array, ""]
-    """Mass-normalised thrust [m/s^2]."""
-
-    def step(self, s: X, u: Command, a_ext: Float[Array, "3"]) -> X:
-        """Advance the base model by one tick under more thrust."""
-        return self.base.step(s, Command(u.c + self.extra, u.omega), a_ext)

@@ -7,7 +7,6 @@ from ..adapt.buffer import RollingBuffer
 from ..adapt.learner import LearnerState
 from ..adapt.updates import PolicyUpdate, ResidualUpdate, Update
 from ..control.controller import AbstractController
-from ..control.policy import Policy
 from ..physics.state import Command
 from ..plants.plant import Measurement
 from .events import Event
@@ -28,7 +27,7 @@ class AdaptivePilot(Pilot):
 
     def __init__(
         self,
-        controller: Callable[[Policy], AbstractController[Any]],
+        controller: Callable[[LearnerState], AbstractController[Any]],
         state: LearnerState,
         learners: Sequence[Scheduled],
         *,
@@ -38,7 +37,7 @@ class AdaptivePilot(Pilot):
         """Build a pilot.
 
         Args:
-            controller: It puts a policy behind its observation; the memory of one goes on in the next.
+            controller: What flies, given what was learnt; the memory of one goes on in the next.
             state: Policy and residual at the start.
             learners: They are offered windows in this order.
             dt: Control tick [s].
@@ -50,7 +49,7 @@ class AdaptivePilot(Pilot):
         self.periods = [max(1, round(each.every_s / dt)) for each in self.learners]
         self.window = window
         self._buffer = RollingBuffer(window)
-        self._pilot = ControllerPilot(controller(state.policy.policy.merged()))
+        self._pilot = ControllerPilot(controller(state))
         self._ticks_offered = [0] * len(self.learners)
         self._start = 0.0
         self._new_events: list[Event] = []
@@ -110,6 +109,6 @@ class AdaptivePilot(Pilot):
             self.state = LearnerState(self.state.policy, update.state)
         elif isinstance(update, PolicyUpdate):
             self.state = LearnerState(update.state, self.state.residual)
-            self._pilot.controller = self.controller_of(update.state.policy.merged())
+        self._pilot.controller = self.controller_of(self.state)
         for learner, _ in self.learners:
             learner.receive(update)

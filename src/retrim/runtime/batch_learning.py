@@ -20,7 +20,6 @@ from ..adapt.learner import FitReport, LearnerState, OnlineLearner
 from ..adapt.updates import Layer, Skip, Update
 from ..adapt.workers import PolicyWorker, ResidualWorker, policy_update, residual_update
 from ..control.controller import AbstractController
-from ..control.policy import Policy
 from ..learn.bptt import PolicyState
 from ..learn.window import Window
 from ..physics.state import where
@@ -63,7 +62,7 @@ class Plan:
     """How a pilot of the virtual clock learns, as values."""
 
     learner: OnlineLearner
-    controller: Callable[[Policy], AbstractController[Any]]
+    controller: Callable[[LearnerState], AbstractController[Any]]
     key: Key[Array, ""]
     """Seed of its updates."""
     window: int
@@ -118,12 +117,10 @@ def fly_and_learn(
         tick, _, layer, offer = instant
         if instant.published:
             learnt, updates = pending.pop(layer)
-            if layer == RESIDUAL:
-                state = LearnerState(state.policy, learnt)
-            else:
-                batch.fly_to(tick)
-                state = LearnerState(learnt, state.residual)
-                batch.controllers = _controllers(plan, state)
+            policy, residual = (state.policy, learnt) if layer == RESIDUAL else (learnt, state.residual)
+            batch.fly_to(tick)
+            state = LearnerState(policy, residual)
+            batch.controllers = _controllers(plan, state)
         elif offer.visible is None:
             updates = [Skip(tick * batch.dt, LAYERS[layer])] * len(plans)
         else:
@@ -172,7 +169,7 @@ def _instants(plan: Plan, ticks: int) -> list[_Instant]:
 
 
 def _controllers(plan: Plan, state: LearnerState) -> Any:
-    return eqx.filter_vmap(lambda policy: plan.controller(policy.merged()))(state.policy.policy)
+    return eqx.filter_vmap(plan.controller)(state)
 
 
 def _fitted(learner: OnlineLearner, state: LearnerState, window: Window) -> tuple[Any, list[Update]]:

@@ -7,7 +7,9 @@ from .keypoints import Keypoints as Keypoints
 from .observation import AbstractObservation as AbstractObservation
 from .observation import StateObs as StateObs
 from .preview import Preview as Preview
+from .reference import AbstractReference as AbstractReference
 from .reference import Reference as Reference
+from .reference import TurnedReference as TurnedReference
 from .reference import joined as joined
 from .shapes import REFERENCES as REFERENCES
 from .shapes import smooth_start as smooth_start
@@ -16,5 +18,6 @@ from .task import Start as Start
 from .task import huber as huber
 from .track import AbstractTrack as AbstractTrack
 from .track import L2Track as L2Track
+from .track import SharpTrack as SharpTrack
 from .track import Track as Track
 from .trajectory_csv import from_csv as from_csv

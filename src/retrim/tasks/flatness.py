@@ -2,7 +2,9 @@
 
 from collections.abc import Callable, Sequence
 
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from ..physics.state import STANDARD_GRAVITY
 
@@ -27,8 +29,9 @@ def flat_rows(path: Path3, times: np.ndarray, last: float) -> np.ndarray:
         last: End of what may be evaluated [s]; infinite for a path that repeats.
 
     Returns:
-        Eleven numbers for each instant, shape (n, 11): position [m] and velocity [m/s] in the world frame, collective
-        thrust [m/s^2], body rates [rad/s] in the body frame, heading [rad].
+        Eighteen numbers for each instant, shape (n, 18): position [m] and velocity [m/s] in the world frame, collective
+        thrust [m/s^2], body rates [rad/s] in the body frame, heading [rad], acceleration [m/s^2] and jerk [m/s^3] in
+        the world frame, rate of the heading [rad/s]. The last seven are zero where the command is that of hover.
 
     Raises:
         ValueError: The path does not give 3 or 4 finite numbers.
@@ -49,8 +52,39 @@ def flat_rows(path: Path3, times: np.ndarray, last: float) -> np.ndarray:
     thrust = np.linalg.norm(accelerations[1] + UP, axis=1)
     flown = np.stack([thrust, turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]], axis=1)
     hover = np.array([STANDARD_GRAVITY, 0.0, 0.0, 0.0])
-    u = np.where((before & now & after & ~jumps)[:, None], flown, hover)
-    return np.concatenate([here[:, :3], v, u, here[:, 3:]], axis=1)
+    defined = (before & now & after & ~jumps)[:, None]
+    u = np.where(defined, flown, hover)
+    jerk = (accelerations[2] - accelerations[0]) / (2.0 * h)
+    heading_rate = (around[3] - around[1])[:, 3:] / (2.0 * h)
+    moving = np.where(defined, np.concatenate([accelerations[1], jerk, heading_rate], axis=1), 0.0)
+    return np.concatenate([here[:, :3], v, u, here[:, 3:], moving], axis=1)
+
+
+def flat_command(
+    thrust: Float[Array, "3"], jerk: Float[Array, "3"], heading: Float[Array, ""], heading_rate: Float[Array, ""]
+) -> Float[Array, "4"]:
+    """Return the command that a point mass needs at one instant.
+
+    Args:
+        thrust: Mass-normalised thrust that it needs, a vector that is not zero and not horizontal [m/s^2].
+        jerk: Its rate [m/s^3].
+        heading: Where the nose points [rad].
+        heading_rate: Its rate [rad/s].
+
+    Returns:
+        Collective thrust [m/s^2] and body rates [rad/s].
+    """
+    c = jnp.sqrt(jnp.sum(thrust * thrust))
+    z = thrust / c
+    z_dot = (jerk - z * jnp.sum(z * jerk)) / c
+    nose = jnp.stack([jnp.cos(heading), jnp.sin(heading), jnp.zeros_like(heading)])
+    nose_dot = heading_rate * jnp.stack([-jnp.sin(heading), jnp.cos(heading), jnp.zeros_like(heading)])
+    sideways = jnp.cross(z, nose)
+    length = jnp.sqrt(jnp.sum(sideways * sideways))
+    y = sideways / length
+    x = jnp.cross(y, z)
+    turn = -jnp.sum(x * (jnp.cross(z_dot, nose) + jnp.cross(z, nose_dot))) / length
+    return jnp.stack([c, -jnp.sum(y * z_dot), jnp.sum(x * z_dot), turn])
 
 
 def _points(path: Path3, times: np.ndarray) -> np.ndarray:

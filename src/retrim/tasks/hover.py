@@ -1,5 +1,6 @@
 """Stabilising hover at a goal (paper, Sec. IV-A.1)."""
 
+import dataclasses
 import math
 from typing import Any
 
@@ -9,6 +10,7 @@ from jax import random
 from jaxtyping import Array, Bool, Float, Key
 
 from ..physics import so3
+from ..physics.felt_frame import FeltFrame
 from ..physics.state import Command, State
 from .observation import AbstractObservation
 from .task import AbstractTask, Start, huber, within
@@ -63,6 +65,21 @@ class AbstractHover(AbstractTask):
     def error(self, t: Float[Array, ""], x: State) -> Float[Array, ""]:
         """Return the distance from the goal [m]."""
         return jnp.sqrt(jnp.sum((x.p - self.target(t)) ** 2))
+
+    def in_frame(self, frame: FeltFrame) -> "AbstractHover":
+        """Return hover at the same goal.
+
+        Raises:
+            NotImplementedError: A subclass moves the target, or the observation cannot be turned.
+        """
+        if type(self).target is not AbstractHover.target:
+            raise NotImplementedError(f"{type(self).__name__} moves its target: it must say how that is turned")
+        return dataclasses.replace(
+            self,
+            goal=frame.vector(self.goal),
+            observation=self.observation.in_frame(frame),
+            in_flight=None if self.in_flight is None else self.in_flight.in_frame(frame),
+        )
 
 
 class Hover(AbstractHover):

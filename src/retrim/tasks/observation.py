@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..physics.felt_frame import FeltFrame
 from ..physics.state import STANDARD_GRAVITY, Command, State
 
 M = TypeVar("M")
@@ -41,6 +42,14 @@ class AbstractObservation(eqx.Module, Generic[M]):
             The observation, and the new memory of the same shapes.
         """
 
+    def in_frame(self, frame: FeltFrame) -> "AbstractObservation[M]":
+        """Return the same observation for states and commands of ``frame``.
+
+        Raises:
+            NotImplementedError: It cannot be turned.
+        """
+        raise NotImplementedError(f"{type(self).__name__} cannot be turned into another frame")
+
 
 class StateObs(AbstractObservation[Float[Array, "history 4"]]):
     """o = [p, R, v] and the last ``history`` commands, oldest first: 15 + 4 ``history`` numbers.
@@ -70,3 +79,7 @@ class StateObs(AbstractObservation[Float[Array, "history 4"]]):
         memory = jnp.concatenate([memory, scaled[None]])[1:]
         state = jnp.concatenate([(x.p - self.origin) / POSITION_SCALE, x.R.reshape(9), x.v / VELOCITY_SCALE])
         return jnp.concatenate([state, memory.reshape(-1)]), memory
+
+    def in_frame(self, frame: FeltFrame) -> "StateObs":
+        """Return the observation about the same origin."""
+        return StateObs(frame.vector(self.origin), self.omega_max, self.history)

@@ -5,12 +5,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..physics.felt_frame import FeltFrame
 from ..physics.state import STANDARD_GRAVITY, Command, State
 from .observation import VELOCITY_SCALE, AbstractObservation
-from .reference import Reference
+from .reference import AbstractReference
 
 POSITIONS = (0.0, 0.08, 0.16, 0.28, 0.4)  # [s] ahead
 VELOCITIES = (0.0, 0.2)
+ACCELERATION_SCALE = 10.0  # [m/s^2]
+JERK_SCALE = 20.0  # [m/s^3]
 
 
 class Preview(AbstractObservation[Float[Array, "history 4"]]):
@@ -19,14 +22,16 @@ class Preview(AbstractObservation[Float[Array, "history 4"]]):
     No absolute position: one policy can fly the same shape anywhere. Every entry is scaled to order one.
     """
 
-    reference: Reference
+    reference: AbstractReference
     omega_max: Float[Array, "3"]
     history: int = eqx.field(static=True, default=2)
+    accelerations: tuple[float, ...] = eqx.field(static=True, default=())
+    """Also show the acceleration and jerk of the reference so far ahead [s]."""
 
     @property
     def size(self) -> int:
         """Length of the observation: 35 + 4 ``history``."""
-        return 3 * len(POSITIONS) + 3 * len(VELOCITIES) + 9 + 3 + 2 + 4 * self.history
+        return 3 * len(POSITIONS) + 3 * len(VELOCITIES) + 6 * len(self.accelerations) + 9 + 3 + 2 + 4 * self.history
 
     def init(self, x: State) -> Float[Array, "history 4"]:
         """Return the memory of a vehicle that has hovered until now."""
@@ -41,6 +46,7 @@ class Preview(AbstractObservation[Float[Array, "history 4"]]):
         soon = jax.vmap(self.reference)(t + jnp.array(POSITIONS, dtype=t.dtype))
         later = jax.vmap(self.reference)(t + jnp.array(VELOCITIES, dtype=t.dtype))
         heading = soon.heading[0]
+        moving = [self.reference(t + ahead) for ahead in self.accelerations]
         seen = [
             (soon.p - x.p[None]).reshape(-1),
             (later.v - x.v[None]).reshape(-1) / VELOCITY_SCALE,
@@ -48,5 +54,11 @@ class Preview(AbstractObservation[Float[Array, "history 4"]]):
             x.v / VELOCITY_SCALE,
             jnp.stack([jnp.cos(heading), jnp.sin(heading)]),
             memory.reshape(-1),
+            *(here.a / ACCELERATION_SCALE for here in moving),
+            *(here.jerk / JERK_SCALE for here in moving),
         ]
         return jnp.concatenate(seen), memory
+
+    def in_frame(self, frame: FeltFrame) -> "Preview":
+        """Return the observation of the turned reference."""
+        return Preview(self.reference.in_frame(frame), self.omega_max, self.history, self.accelerations)

@@ -4,9 +4,10 @@ Every reference is a table of one type, so that a policy takes it as data: anoth
 policy can be trained over a family and fly a member that it never saw.
 """
 
+import abc
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import equinox as eqx
 import jax
@@ -15,10 +16,12 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from ..physics import so3
+from ..physics.felt_frame import FeltFrame
 from ..physics.state import STANDARD_GRAVITY
 from ..physics.vehicle import Vehicle
 from .feasibility import unflyable
-from .flatness import STEP, Path3, flat_rows
+from .flatness import STEP, Path3, flat_command, flat_rows
 
 POINTS = 1024  # of a table
 
@@ -34,13 +37,81 @@ class Point(NamedTuple):
     """Command that a point mass needs (differential flatness): c [m/s^2], body rates [rad/s]; hover at a jump."""
     heading: Float[Array, ""]
     """[rad]"""
+    a: Float[Array, "3"]
+    """Acceleration, world [m/s^2]; zero where ``u`` is hover, as is what follows."""
+    jerk: Float[Array, "3"]
+    """World [m/s^3]."""
+    heading_rate: Float[Array, ""]
+    """[rad/s]"""
 
 
-class Reference(eqx.Module):
+class AbstractReference(eqx.Module):
+    """A trajectory to track."""
+
+    if TYPE_CHECKING:  # to a type checker an abstract variable would be a dataclass field
+
+        @property
+        def lap(self) -> Float[Array, "2"]:
+            """Start and end of the lap that repeats [s]; the same twice: the end is held."""
+
+        @property
+        def joins(self) -> Float[Array, "m 2"]:
+            """Spans of time in which a roll-out may start [s]; each is equally likely."""
+    else:
+        lap: eqx.AbstractVar[Array]
+        joins: eqx.AbstractVar[Array]
+
+    @abc.abstractmethod
+    def __call__(self, t: Float[Array, ""]) -> Point:
+        """Return the reference at time ``t`` [s]."""
+
+    @abc.abstractmethod
+    def distance(self, p: Float[Array, "3"]) -> Float[Array, ""]:
+        """Return the cross-track error: from ``p`` to the nearest point of the lap, or of all without a lap [m]."""
+
+    @abc.abstractmethod
+    def in_frame(self, frame: FeltFrame) -> "AbstractReference":
+        """Return the same trajectory as it is in ``frame``."""
+
+
+class TurnedReference(AbstractReference):
+    """A reference in the frame of the gravity that a vehicle feels; its command is that of flatness there."""
+
+    reference: AbstractReference
+    frame: FeltFrame
+
+    @property
+    def lap(self) -> Float[Array, "2"]:
+        """Times are the same in the frame [s]."""
+        return self.reference.lap
+
+    @property
+    def joins(self) -> Float[Array, "m 2"]:
+        """Times are the same in the frame [s]."""
+        return self.reference.joins
+
+    def __call__(self, t: Float[Array, ""]) -> Point:
+        """Turn and scale the reference at ``t``; headings are about the vertical of the frame."""
+        here, vector = self.reference(t), self.frame.vector
+        a, jerk = vector(here.a), vector(here.jerk)
+        thrust = a + jnp.array([0.0, 0.0, STANDARD_GRAVITY], dtype=a.dtype)
+        u = flat_command(thrust, jerk, here.heading, here.heading_rate)
+        return Point(vector(here.p), vector(here.v), u, here.heading, a, jerk, here.heading_rate)
+
+    def distance(self, p: Float[Array, "3"]) -> Float[Array, ""]:
+        """Return the cross-track error in metres of the frame."""
+        return self.frame.scale * self.reference.distance(so3.act(self.frame.Q.T, p) / self.frame.scale)
+
+    def in_frame(self, frame: FeltFrame) -> "TurnedReference":
+        """Turn it once more."""
+        return TurnedReference(self, frame)
+
+
+class Reference(AbstractReference):
     """A trajectory, sampled evenly; see :meth:`of`."""
 
-    rows: Float[Array, "n 11"]
-    """p, v, u, heading, as in :class:`Point`."""
+    rows: Float[Array, "n 18"]
+    """As in :class:`Point`."""
     every: Float[Array, ""]
     """Time between rows [s]."""
     lap: Float[Array, "2"]
@@ -88,7 +159,8 @@ class Reference(eqx.Module):
         over = (length <= 0) & (t >= end)  # at rest, where the end is held
         hover = jnp.zeros(4, dtype=row.dtype).at[0].set(STANDARD_GRAVITY)
         v, u = jnp.where(over, jnp.zeros_like(row[3:6]), row[3:6]), jnp.where(over, hover, row[6:10])
-        return Point(row[:3], v, u, row[10])
+        moving = jnp.where(over, jnp.zeros_like(row[11:]), row[11:])
+        return Point(row[:3], v, u, row[10], moving[:3], moving[3:6], moving[6])
 
     def distance(self, p: Float[Array, "3"]) -> Float[Array, ""]:
         """Return the cross-track error: from ``p`` to the nearest row of the lap, or of all without a lap [m].
@@ -100,6 +172,10 @@ class Reference(eqx.Module):
         on_lap = (times >= self.lap[0] - 1e-6) | (self.lap[0] == self.lap[1])
         away = jnp.sqrt(jnp.sum((self.rows[:, :3] - p[None]) ** 2, axis=1))
         return jnp.min(jnp.where(on_lap, away, jnp.inf))
+
+    def in_frame(self, frame: FeltFrame) -> TurnedReference:
+        """Return the trajectory as it is in ``frame``."""
+        return TurnedReference(self, frame)
 
     def infeasibility(self, vehicle: Vehicle) -> str | None:
         """Return what the vehicle cannot fly of this, in words; None if it can fly all of it.
@@ -114,7 +190,7 @@ class Reference(eqx.Module):
         return "; ".join(unflyable(np.asarray(self.rows, dtype=float), float(self.every), lap, vehicle)) or None
 
 
-def joined(references: Sequence[Reference], *, seconds: float = 20.0, every: float = 0.02) -> Reference:
+def joined(references: Sequence[AbstractReference], *, seconds: float = 20.0, every: float = 0.02) -> Reference:
     """Join a family into one table, one member after another, for training.
 
     Args:
@@ -134,7 +210,7 @@ def joined(references: Sequence[Reference], *, seconds: float = 20.0, every: flo
     rows = []
     for reference in references:
         points = jax.vmap(reference)(times)
-        rows.append(jnp.concatenate([points.p, points.v, points.u, points.heading[:, None]], axis=1))
+        rows.append(jnp.concatenate([leaf.reshape(len(times), -1) for leaf in points], axis=1))
     joins = [(k * seconds, (k + 1) * seconds - 5.0) for k in range(len(references))]
     end = len(references) * seconds
     return Reference(jnp.concatenate(rows), jnp.array(every), jnp.array([end, end]), jnp.array(joins))

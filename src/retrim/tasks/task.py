@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
+from ..physics.felt_frame import FeltFrame
 from ..physics.state import Command, State
 from .observation import AbstractObservation
 
@@ -90,6 +91,14 @@ class AbstractTask(eqx.Module):
     @abc.abstractmethod
     def error(self, t: Float[Array, ""], x: State) -> Float[Array, ""]:
         """Return the distance from where the vehicle should be [m]."""
+
+    def in_frame(self, frame: FeltFrame) -> "AbstractTask":
+        """Return the same task for states and commands of ``frame``.
+
+        Raises:
+            NotImplementedError: It cannot be turned.
+        """
+        raise NotImplementedError(f"{type(self).__name__} cannot be turned into another frame")
 
     def cross_track(self, x: State) -> Float[Array, ""] | None:
         """Return the distance from the nearest point of the reference [m]; None for a task without one."""

@@ -1,5 +1,6 @@
 """Tracking a reference (paper, Sec. IV-A.1)."""
 
+import dataclasses
 import math
 from typing import Any
 
@@ -9,9 +10,10 @@ from jax import random
 from jaxtyping import Array, Bool, Float, Key
 
 from ..physics import so3
+from ..physics.felt_frame import FeltFrame
 from ..physics.state import Command, State
 from .observation import AbstractObservation
-from .reference import Reference
+from .reference import AbstractReference
 from .task import AbstractTask, Start, huber, within
 
 NOISE = 0.1 * math.pi  # [rad]
@@ -23,7 +25,7 @@ class AbstractTrack(AbstractTask):
     A vehicle farther than ``box`` [m] from the reference along an axis is terminated.
     """
 
-    reference: Reference
+    reference: AbstractReference
     observation: AbstractObservation[Any]
     spread: Float[Array, ""]
     """Starts lie within +- this of the reference along each axis [m]."""
@@ -79,6 +81,11 @@ class AbstractTrack(AbstractTask):
         """Return the distance from the nearest point of the reference's lap [m]."""
         return self.reference.distance(x.p)
 
+    def in_frame(self, frame: FeltFrame) -> "AbstractTrack":
+        """Return tracking of the turned reference."""
+        observation = self.observation.in_frame(frame)
+        return dataclasses.replace(self, reference=self.reference.in_frame(frame), observation=observation)
+
 
 class Track(AbstractTrack):
     """Tracking with the paper's reward."""
@@ -101,3 +108,12 @@ class L2Track(AbstractTrack):
         heading = jnp.stack([jnp.cos(here.heading), jnp.sin(here.heading)])
         astray = 1.0 - jnp.sum(heading * x.R[:2, 0])
         return -huber(5.0 * (x.p - here.p)) - huber(x.v - here.v) - 0.1 * huber(u.vector() - here.u) - 0.5 * astray
+
+
+class SharpTrack(L2Track):
+    """Tracking with a reward that also has a tip at the reference: what is quadratic is flat near zero."""
+
+    def reward(self, t: Float[Array, ""], x: State, u: Command) -> Float[Array, ""]:
+        """Return that of :class:`L2Track` - 3 (sqrt(|p - p_ref|^2 + (1 cm)^2) - 1 cm)."""
+        tip = jnp.sqrt(jnp.sum((x.p - self.reference(t).p) ** 2) + 0.01**2) - 0.01
+        return super().reward(t, x, u) - 3.0 * tip

@@ -1,6 +1,6 @@
 """Table II of the paper: circle, figure-8 and star."""
 
-from typing import Any
+from collections.abc import Sequence
 
 from ...config.loading import changed
 from ...config.presets import Preset
@@ -33,16 +33,18 @@ PAPER: dict[str, PaperRows] = {  # Table II [m]
 INTRO = """\
 Made by `retrim reproduce tracking`. Mean distance from where the reference is at the time [m], over the last 10
 s: mean ± standard deviation over flights. Cross-track: distance from the nearest point of the lap. Small
-quadrotor. Preset `track/preview`: one policy, trained on all three references, sees them ahead. `track/paper`:
-the paper's observation o = [p, R, v] and reward, one policy per reference. Learning is charged to flight time
-by the preset's fixed latencies. The paper's rows are from its own plant; its circle and ours take 3 s."""
+quadrotor. Presets `track/retrim` and `track/preview`: one policy, trained on all three references, sees them
+ahead; `track/retrim` is flown and adapted in the frame of the gravity that it feels. `track/paper`: the paper's
+observation o = [p, R, v] and reward, one policy per reference. Learning is charged to flight time by the
+preset's fixed latencies. The paper's rows are from its own plant; its circle and ours take 3 s."""
 
 
 def tracking(
     run: Run,
     reporter: Reporter,
     *,
-    presets: tuple[str, ...] = ("track/preview", "track/paper"),
+    presets: tuple[str, ...] = ("track/retrim", "track/preview", "track/paper"),
+    methods: tuple[str, ...] = ("base", "base-i", "base-do", "full", "lora"),
     seeds: tuple[int, ...] = (0,),
     seconds: float = 60.0,
     starts: int = 8,
@@ -54,30 +56,31 @@ def tracking(
         run: Folder of tracking.md, tracking.json and the pictures.
         reporter: Receives progress and the sections.
         presets: Presets to train and fly.
+        methods: How they fly.
         seeds: Training seeds.
         seconds: Length of a flight [s].
         starts: Flights per disturbance, method and seed.
         plant: Where the policies fly.
     """
     loaded = table_presets(presets, "track", seeds=seeds, starts=starts, seconds=seconds)
-    sections = [section for preset in loaded for section in _sections(preset, plant)]
+    sections = [section for preset in loaded for section in _sections(preset, plant, methods)]
     document = Document(run, "tracking", "Tracking (Table II of the paper)", INTRO, seeds, reporter)
     fly_levels(document, sections, starts=starts, seconds=seconds)
 
 
-def _sections(preset: Preset, plant: str) -> list[Levels]:
+def _sections(preset: Preset, plant: str, methods: Sequence[str]) -> list[Levels]:
     """A section for each reference; a policy that sees it ahead is trained once for all, another for each."""
 
-    def section(title: str, preset: Preset, reference: str, paper: PaperRows, **more: Any) -> Levels:
+    def section(title: str, preset: Preset, reference: str, paper: PaperRows) -> Levels:
         trained_on = preset.track.reference.replace("+", "-") if preset.track else ""
         stem = "_".join(["tracking", preset.name.rpartition("/")[2], reference, trained_on])
-        return Levels(title, preset, Scenario(plant=plant, reference=reference), stem, paper=paper, **more)
+        return Levels(title, preset, Scenario(plant=plant, reference=reference), stem, methods, paper)
 
-    if preset.track is not None and preset.track.observation == "preview":
+    if preset.track is not None and preset.track.observation != "state":
         unseen = changed(preset, track={"reference": "circle+star"})
         return [
             *(section(f"{name}, seen ahead", preset, name, paper) for name, paper in PAPER.items()),
-            section("figure8, never seen in training", unseen, "figure8", (), methods=("base", "full")),
+            section("figure8, never seen in training", unseen, "figure8", ()),
         ]
     return [
         section(f"{name}, not seen", changed(preset, track={"reference": name}), name, paper)

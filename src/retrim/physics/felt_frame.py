@@ -1,0 +1,66 @@
+"""The frame of the gravity that a vehicle feels: a constant disturbance is gravity, tilted and scaled.
+
+With gamma = g + d, let Q be the smallest rotation that takes -gamma/|gamma| to the vertical, and s = |g| / |gamma|. If
+p, R, v obey Eq. (1) of the paper with the thrust c and the disturbance d, then s Q p, Q R, s Q v obey Eq. (1) with the
+thrust s c and no disturbance: the equation is equivariant under rotations, and under a change of the unit of length
+while time stays.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from . import so3
+from .state import STANDARD_GRAVITY, Command, State
+
+
+class FeltFrame(eqx.Module):
+    """A frame in which g + d is standard gravity, straight down."""
+
+    Q: Float[Array, "3 3"]
+    """Rotation into the frame."""
+    scale: Float[Array, ""]
+    """A metre of the world is so long in the frame."""
+    d: Float[Array, "3"]
+    """The disturbance that is gravity there, world [m/s^2]."""
+
+    @classmethod
+    def of(cls, d: Float[Array, "3"]) -> "FeltFrame":
+        """Return the frame of g + ``d``, world [m/s^2].
+
+        Defined for every ``d`` whose vertical part is smaller than gravity; a weightless vehicle has no such frame.
+        """
+        up = -d + jnp.array([0.0, 0.0, STANDARD_GRAVITY], dtype=d.dtype)
+        strength = jnp.sqrt(jnp.sum(up * up))
+        a, b, c = up / strength
+        # Rodrigues' formula for the smallest rotation that takes (a, b, c) to (0, 0, 1).
+        k = 1.0 / (1.0 + c)
+        Q = jnp.stack(
+            [
+                jnp.stack([1.0 - k * a * a, -k * a * b, -a]),
+                jnp.stack([-k * a * b, 1.0 - k * b * b, -b]),
+                jnp.stack([a, b, c]),
+            ]
+        )
+        return cls(Q, STANDARD_GRAVITY / strength, d)
+
+    def vector(self, y: Float[Array, "3"]) -> Float[Array, "3"]:
+        """Return a position, velocity, acceleration or jerk of the world, in the frame."""
+        return self.scale * so3.act(self.Q, y)
+
+    def state(self, x: State) -> State:
+        """Return a state of the world, in the frame."""
+        return State(self.vector(x.p), so3.mul(self.Q, x.R), self.vector(x.v))
+
+    def world_state(self, x: State) -> State:
+        """Return a state of the frame, in the world."""
+        back = so3.mul(self.Q.T, x.R)
+        return State(so3.act(self.Q.T, x.p) / self.scale, back, so3.act(self.Q.T, x.v) / self.scale)
+
+    def command(self, u: Command) -> Command:
+        """Return a command of the world, in the frame; body rates are the same."""
+        return Command(self.scale * u.c, u.omega)
+
+    def world_command(self, u: Command) -> Command:
+        """Return a command of the frame, in the world."""
+        return Command(u.c / self.scale, u.omega)
