@@ -178,6 +178,10 @@ OURS["track/retrim"] = OURS["track/preview"] | {
     | {"num_updates": 1200, "learning_rate": 5e-3, "adam_b2": 0.95, "hidden_sizes": (128, 128)},
     "adapt": OURS["hover/retrim"]["adapt"] | {"window": 150, "memory": 2.0},
 }
+OURS["track/fast"] = OURS["track/retrim"] | {
+    "vehicle": "kingfisher",
+    "track": OURS["track/retrim"]["track"] | {"reference": "circle=8+figure8=8+circle=4+figure8=4+star=1.5"},
+}
 OURS["vision/occluded"] = OURS["vision/ideal"] | {
     "vision": {"occlusion": True, "pixel_noise": 1.0, "dropout": 0.05, "whiten_pixels": True, "encoder_steps": 3000}
 }

@@ -54,7 +54,7 @@ def test_the_model_has_the_presets_delay_and_lag(built):
     )
     for env in (made.env, made.learner.env):
         assert env.delay_ticks == preset.delay_ticks
-        if preset.name in ("track/preview", "track/retrim"):
+        if preset.name in ("track/preview", "track/retrim", "track/fast"):
             assert isinstance(env.dynamics, Lagged)
             assert float(env.dynamics.tau) == preset.actuator_tau == 0.033
             assert isinstance(env.dynamics.base, PointMass)
@@ -93,7 +93,7 @@ def test_the_observation_has_the_presets_numbers(built):
         assert seen.dt == preset.dt
         assert seen.delay_ticks == preset.plant_delay_ticks
     else:
-        assert type(seen) is (Preview if preset.name in ("track/preview", "track/retrim") else StateObs)
+        assert type(seen) is (Preview if preset.name in ("track/preview", "track/retrim", "track/fast") else StateObs)
         if preset.task == "track" and preset.track.observation != "state":
             assert seen.accelerations == ((0.04,) if preset.track.observation == "flat" else ())
         assert seen.history == preset.command_history

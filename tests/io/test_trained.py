@@ -80,6 +80,7 @@ SIZES |= {
     "hover/retrim": 23,
     "track/paper": 15,
     "track/retrim": 49,
+    "track/fast": 49,
     "vision/ideal": 89,
     "vision/occluded": 89,
     "vision/paper": 89,

@@ -10,10 +10,10 @@ import pytest
 from jax import random
 
 from helpers import replaced
-from retrim.physics import Command, PointMass, State, small, with_payload
+from retrim.physics import Command, PointMass, State, kingfisher, small, with_payload
 from retrim.tasks import REFERENCES, Reference, joined, smooth_start
 from retrim.tasks.reference import POINTS
-from retrim.tasks.shapes import circle, figure8, star
+from retrim.tasks.shapes import AT_SPEED, circle, figure8, star
 
 PERIODS = {"circle": 3.0, "figure8": 5.0, "star": 6.0}
 RAMP = 3.0
@@ -453,3 +453,19 @@ def test_size_and_period_can_be_chosen(make):
     reference = make(period=4.0, ramp=2.0)
     np.testing.assert_array_equal(reference.lap, [2.0, 6.0])
     np.testing.assert_allclose(at_one(reference, 2.5).p, at_one(reference, 6.5).p, atol=1e-8)
+
+
+# ---- with a top speed
+
+
+@pytest.mark.parametrize("speed", [1.5, 4.0, 8.0])
+@pytest.mark.parametrize("shape", AT_SPEED)
+def test_a_shape_with_a_top_speed(shape, speed):
+    """It is that fast on the lap, never faster, and a vehicle of 2 g can fly it, corners of the star aside."""
+    reference = AT_SPEED[shape](speed)
+    rows, lap = np.asarray(reference.rows), np.asarray(reference.lap)
+    speeds = np.linalg.norm(rows[:, 3:6], axis=1)
+    assert speeds[row_times(reference) >= lap[0]].max() == pytest.approx(speed, rel=0.01)
+    assert speeds.max() < 1.01 * speed
+    assert rows[:, 6].max() < np.hypot(9.81, 12.0) + 0.1
+    assert reference.infeasibility(kingfisher()) is None or shape == "star"

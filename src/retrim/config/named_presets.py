@@ -49,15 +49,23 @@ RETRIM = dataclasses.replace(
     ),
 )  # fmt: skip
 
+FELT = Track(reference="circle+figure8+star", observation="flat", felt_copies=7)
 TRACK_RETRIM = dataclasses.replace(
     TRACK,
     name="track/retrim",
     reward="sharp",
-    track=Track(reference="circle+figure8+star", observation="flat", felt_copies=7),
+    track=FELT,
     pretrain=dataclasses.replace(
         TRACK.pretrain, num_updates=1200, learning_rate=5e-3, adam_b2=0.95, hidden_sizes=(128, 128)
     ),
     adapt=dataclasses.replace(RETRIM.adapt, window=150, memory=2.0),
+)
+
+TRACK_FAST = dataclasses.replace(
+    TRACK_RETRIM,
+    name="track/fast",
+    vehicle="kingfisher",
+    track=dataclasses.replace(FELT, reference="circle=8+figure8=8+circle=4+figure8=4+star=1.5"),
 )
 
 PRESETS: dict[str, Preset] = {
@@ -65,6 +73,8 @@ PRESETS: dict[str, Preset] = {
     "hover/retrim": RETRIM,
     # The same for tracking: trained on references as they are and as they are felt under a push.
     "track/retrim": TRACK_RETRIM,
+    # The same at up to 8 m/s, for the kingfisher.
+    "track/fast": TRACK_FAST,
     # The paper's loop with one tick of delay, the last two commands, and a small budget that reaches the same error.
     "hover/fast": FAST,
     # The delay and the observation of the authors' code: 2 ticks, the last three commands, 200 x 200 x 150.

@@ -1,14 +1,15 @@
 """Tasks and references by name."""
 
 import functools
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax import random
+import numpy as np
 
 from ..errors import ConfigError
 from ..physics.felt_frame import FeltFrame
@@ -17,7 +18,8 @@ from ..tasks.hover import Hover, L2Hover
 from ..tasks.keypoints import Keypoints
 from ..tasks.observation import AbstractObservation, StateObs
 from ..tasks.preview import Preview
-from ..tasks.reference import AbstractReference, Reference, joined
+from ..tasks.reference import Reference, joined
+from ..tasks.shapes import AT_SPEED, FASTEST
 from ..tasks.shapes import REFERENCES as BUILT_IN
 from ..tasks.task import AbstractTask
 from ..tasks.track import AbstractTrack, L2Track, SharpTrack
@@ -35,8 +37,8 @@ for _name, _make in BUILT_IN.items():
     REFERENCES.register(_name, _make)
 register_reference = REFERENCES.register
 
-FELT_TAG = 5
-"""Key of the pushes under which references are felt in training; the same for every seed of a policy."""
+FELT_SEED = 0
+"""Of the pushes under which references are felt in training; the same for every seed of a policy."""
 
 LEAD = 0.04  # [s]: about as late as commands act, behind a delay and motors
 TRACKS: dict[str, type[AbstractTrack]] = {"paper": PaperTrack, "l2": L2Track, "sharp": SharpTrack}
@@ -98,24 +100,14 @@ def make_reference(names: str) -> Reference:
 
     Args:
         names: A registered name, ``module:name`` of a function that makes one, or a CSV file. A closed file repeats as
-            laps, and any other is flown once; ``my.csv:laps`` insists on laps, ``my.csv:once`` flies it once. Several
-            of them, joined by ``+``, become a family.
+            laps, and any other is flown once; ``my.csv:laps`` insists on laps, ``my.csv:once`` flies it once. A
+            built-in shape may have a top speed [m/s], as ``circle=8``. Several of them, joined by ``+``, become a
+            family.
 
     Raises:
         ConfigError: There is no such reference, or its file cannot be used.
     """
-    parts = names.split("+")
-    if all(name in BUILT_IN for name in parts):
-        return _built_in(names, jax.config.values["jax_enable_x64"])
-    found = [_one_reference(name) for name in parts]
-    return found[0] if len(found) == 1 else joined(found)
-
-
-@functools.cache
-def _built_in(names: str, x64: bool) -> Reference:
-    """References that never change are sampled once per process and precision; files are read again each time."""
-    found = [BUILT_IN[name]() for name in names.split("+")]
-    return found[0] if len(found) == 1 else joined(found)
+    return _made(names, 0, 0.0)
 
 
 def make_training_reference(table: TrackTable) -> Reference:
@@ -124,21 +116,39 @@ def make_training_reference(table: TrackTable) -> Reference:
     Raises:
         ConfigError: As :func:`make_reference`.
     """
-    if not table.felt_copies:
-        return make_reference(table.reference)
-    members = list[AbstractReference]()
-    for name in table.reference.split("+"):
-        plain = make_reference(name)
-        members.append(plain)
-        for k in range(table.felt_copies):
-            push = table.felt_push * random.ball(random.fold_in(random.key(FELT_TAG), len(members) + k), 3)
-            members.append(plain.in_frame(FeltFrame.of(push)))
-    return joined(members)
+    return _made(table.reference, table.felt_copies, table.felt_push)
+
+
+def _made(names: str, copies: int, push: float) -> Reference:
+    """A reference or a family; each member also as felt under so many pushes of up to ``push`` [m/s^2]."""
+    if all(name.partition("=")[0] in BUILT_IN for name in names.split("+")):
+        return _built_in(names, copies, push, jax.config.values["jax_enable_x64"])
+    return _family([_one_reference(name) for name in names.split("+")], copies, push)
+
+
+@functools.cache
+def _built_in(names: str, copies: int, push: float, x64: bool) -> Reference:
+    """References that never change are sampled once per process and precision; files are read again each time."""
+    return _family([_one_reference(name) for name in names.split("+")], copies, push)
+
+
+def _family(plain: Sequence[Reference], copies: int, push: float) -> Reference:
+    if len(plain) == 1 and not copies:
+        return plain[0]
+    draw = np.random.default_rng(FELT_SEED)
+    directions = draw.normal(size=(len(plain), copies, 3))
+    sizes = push * draw.uniform(size=(len(plain), copies, 1)) ** (1.0 / 3.0)  # evenly in a ball
+    pushes = sizes * directions / np.linalg.norm(directions, axis=2, keepdims=True)
+    felt = [r.in_frame(FeltFrame.of(jnp.asarray(d))) for r, many in zip(plain, pushes, strict=True) for d in many]
+    return joined([*plain, *felt])
 
 
 def _one_reference(name: str) -> Reference:
     file, _, how = name.rpartition(":") if ".csv:" in name.lower() else (name, "", "")
+    shape, sized, speed = name.partition("=")
     try:
+        if sized and shape in AT_SPEED:
+            return AT_SPEED[shape](_speed(name, speed))
         if file.lower().endswith(".csv"):
             if how not in LAPS:
                 raise ConfigError(f"{name}: {how!r} is not 'laps' or 'once'")
@@ -151,6 +161,16 @@ def _one_reference(name: str) -> Reference:
     if not isinstance(made, Reference):
         raise ConfigError(f"reference {name!r} is a {type(made).__name__}, not a function that gives a Reference")
     return made
+
+
+def _speed(name: str, text: str) -> float:
+    try:
+        speed = float(text)
+    except ValueError:
+        speed = math.nan
+    if not 0.1 <= speed <= FASTEST:
+        raise ConfigError(f"reference {name!r}: {text!r} is no top speed of 0.1 to {FASTEST:g} m/s")
+    return speed
 
 
 def _hover(request: TaskRequest) -> AbstractTask:

@@ -209,8 +209,13 @@ def joined(references: Sequence[AbstractReference], *, seconds: float = 20.0, ev
     times = every * jnp.arange(round(seconds / every), dtype=float)
     rows = []
     for reference in references:
-        points = jax.vmap(reference)(times)
-        rows.append(jnp.concatenate([leaf.reshape(len(times), -1) for leaf in points], axis=1))
+        rows.append(_sampled(reference, times))
     joins = [(k * seconds, (k + 1) * seconds - 5.0) for k in range(len(references))]
     end = len(references) * seconds
     return Reference(jnp.concatenate(rows), jnp.array(every), jnp.array([end, end]), jnp.array(joins))
+
+
+@eqx.filter_jit
+def _sampled(reference: AbstractReference, times: Float[Array, " n"]) -> Float[Array, "n 18"]:
+    points = jax.vmap(reference)(times)
+    return jnp.concatenate([leaf.reshape(times.shape[0], -1) for leaf in points], axis=1)

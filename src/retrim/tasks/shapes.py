@@ -6,6 +6,7 @@ from collections.abc import Callable
 from .reference import Reference
 
 RAMP = 3.0  # [s], of a smooth start
+SIDEWAYS = 12.0  # [m/s^2]: shapes flown at a chosen speed grow until they need no more
 
 
 def smooth_start(t: float, ramp: float = RAMP) -> float:
@@ -75,5 +76,29 @@ def star(radius: float = 1.0, period: float = 6.0, ramp: float = RAMP) -> Refere
     return Reference.of(path, seconds=ramp + period, lap=ramp)
 
 
+def circle_at(speed: float) -> Reference:
+    """Return the circle, flown at ``speed`` [m/s]; it is as large as the vehicle's acceleration needs."""
+    radius = max(1.0, speed**2 / SIDEWAYS)
+    return circle(radius, 2.0 * math.pi * radius / speed, ramp=max(RAMP, speed))
+
+
+def figure8_at(speed: float) -> Reference:
+    """Return the figure-8 with a top speed of ``speed`` [m/s]; it is as large as the vehicle's acceleration needs."""
+    phi = [2.0 * math.pi * k / 1000 for k in range(1000)]  # of a figure-8 of 3 m x 1 m
+    fastest = max(math.hypot(1.5 * math.sin(p), math.cos(2.0 * p)) for p in phi)
+    sharpest = max(math.hypot(1.5 * math.cos(p), 2.0 * math.sin(2.0 * p)) for p in phi)
+    scale = max(1.0, (speed / fastest) ** 2 * sharpest / SIDEWAYS)
+    return figure8(3.0 * scale, scale, 2.0 * math.pi * scale * fastest / speed, ramp=max(RAMP, speed))
+
+
+def star_at(speed: float) -> Reference:
+    """Return the star of 1 m, flown at ``speed`` [m/s], through its corners, too."""
+    edge = 2.0 * math.sin(math.radians(72.0))
+    return star(1.0, 5.0 * edge / speed)
+
+
 REFERENCES: dict[str, Callable[[], Reference]] = {"circle": circle, "figure8": figure8, "star": star}
 """What makes each built-in trajectory, by name."""
+AT_SPEED: dict[str, Callable[[float], Reference]] = {"circle": circle_at, "figure8": figure8_at, "star": star_at}
+"""What makes it with a top speed [m/s]."""
+FASTEST = 20.0  # [m/s]
