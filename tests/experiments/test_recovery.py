@@ -75,6 +75,7 @@ def test_the_gauntlet_by_its_command(tmp_path, as_a_user, monkeypatch):
     assert all((tmp_path / "g" / name).stat().st_size > 10_000 for name in ("gauntlet.png", "gauntlet_flights.png"))
 
 
-def test_conditions_have_distinct_scenarios():
-    scenarios = list(conditions().values())
+@pytest.mark.parametrize("name", ["hover/retrim", "track/retrim", "track/fast"])
+def test_conditions_have_distinct_scenarios(name):
+    scenarios = list(conditions(presets.PRESETS[name]).values())
     assert len(set(scenarios)) == len(scenarios)

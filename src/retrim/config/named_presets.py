@@ -58,7 +58,7 @@ TRACK_RETRIM = dataclasses.replace(
     pretrain=dataclasses.replace(
         TRACK.pretrain, num_updates=1200, learning_rate=5e-3, adam_b2=0.95, hidden_sizes=(128, 128)
     ),
-    adapt=dataclasses.replace(RETRIM.adapt, window=150, memory=2.0),
+    adapt=dataclasses.replace(RETRIM.adapt, window=150, memory=2.0, thrust_prior=0.2),
 )
 
 TRACK_FAST = dataclasses.replace(

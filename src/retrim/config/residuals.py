@@ -52,7 +52,8 @@ def _ensemble(request: ResidualRequest) -> ResidualModel:
 
 
 def _regression(request: ResidualRequest) -> ResidualModel:
-    return RegressionModel.of(request.preset.dt, memory=request.preset.adapt.memory)
+    a = request.preset.adapt
+    return RegressionModel.of(request.preset.dt, memory=a.memory, thrust_prior=a.thrust_prior)
 
 
 register_residual("ensemble", _ensemble)

@@ -3,13 +3,55 @@
 import numpy as np
 from jaxtyping import Array
 
+from ..config.presets import Preset, Track
 from ..config.scenario import Scenario
 from ..config.vehicle_file import VehicleSpec
-from ..physics.vehicle import small
+from ..config.vehicles import make_vehicle
+from ..physics.vehicle import Vehicle, small
 
 
-def conditions() -> dict[str, Scenario]:
-    """Return what is flown, by name; a function, since scenarios are checked when they are made."""
+def conditions(preset: Preset) -> dict[str, Scenario]:
+    """Return what is flown with a preset, by name: at hover, or on every reference that it was trained on."""
+    return _on_references(preset) if preset.track else _at_hover()
+
+
+def _on_references(preset: Preset) -> dict[str, Scenario]:
+    references = (preset.track or Track()).reference.split("+")
+    found = {
+        f"{reference}/{name}": Scenario(disturbance, sensors=sensors, reference=reference)
+        for reference in references
+        for name, (disturbance, sensors) in FLOWN.items()
+    }
+    first, own = references[0], make_vehicle(preset.vehicle)
+    others = {"slow-motors": _like(own, "slow-motors", motor_tau=2.0)}
+    others |= {f"random-{n}": _random_vehicle(own, n) for n in range(3)}
+    found |= {f"{first}/{name}": Scenario(vehicle=vehicle, reference=first) for name, vehicle in others.items()}
+    found |= {
+        f"{first}/thrust+20": Scenario(thrust_error=0.2, reference=first),
+        f"{first}/thrust-20": Scenario(thrust_error=-0.2, reference=first),
+        f"{first}/delay-40ms": Scenario(delay=0.04, reference=first),
+        f"{first}/simple": Scenario("wind", plant="simple", reference=first),
+    }
+    return found
+
+
+FLOWN = {
+    "none": ("none", "ideal"),
+    "large": ("large", "ideal"),
+    "step": ("step", "ideal"),
+    "reversing": ("reversing", "ideal"),
+    "wind": ("wind=4", "ideal"),
+    "gusts": ("gusts", "ideal"),
+    "walk": ("walk", "ideal"),
+    "pickup": ("pickup", "ideal"),
+    "weak-rotor": ("weak-rotor", "ideal"),
+    "none-rough": ("none", "rough"),
+    "gusts-rough": ("gusts", "rough"),
+}
+"""On each reference: disturbance and sensors."""
+
+
+def _at_hover() -> dict[str, Scenario]:
     return {
         "none": Scenario(),
         "small": Scenario("small"),
@@ -31,8 +73,8 @@ def conditions() -> dict[str, Scenario]:
         "gusts/rough": Scenario("gusts", sensors="rough"),
         "kick": Scenario("kick"),
         "step/delay-40ms": Scenario("step", delay=0.04),
-        "step/slow-motors": Scenario("step", vehicle=_like_small("slow-motors", motor_tau=2.0)),
-        **{f"step/{vehicle.name}": Scenario("step", vehicle=vehicle) for vehicle in map(_random_vehicle, range(3))},
+        "step/slow-motors": Scenario("step", vehicle=_like(small(), "slow-motors", motor_tau=2.0)),
+        **{f"step/random-{n}": Scenario("step", vehicle=_random_vehicle(small(), n)) for n in range(3)},
         "step/large-quadrotor": Scenario("step", vehicle="large"),
         "step/kingfisher": Scenario("step", vehicle="kingfisher"),
         "wind/simple": Scenario("wind", plant="simple"),
@@ -42,11 +84,10 @@ def conditions() -> dict[str, Scenario]:
     }
 
 
-def _like_small(
-    name: str, *, mass: float = 1.0, thrust: float = 1.0, inertia: float = 1.0, motor_tau: float = 1.0
+def _like(
+    like: Vehicle, name: str, *, mass: float = 1.0, thrust: float = 1.0, inertia: float = 1.0, motor_tau: float = 1.0
 ) -> VehicleSpec:
-    """Return a vehicle as the small quadrotor, some of its numbers multiplied."""
-    like = small()
+    """Return a vehicle like another, some of its numbers multiplied; its propellers follow from its thrust."""
     return VehicleSpec(
         name=name,
         mass=mass * float(like.mass),
@@ -64,9 +105,10 @@ def _three(values: Array) -> tuple[float, float, float]:
     return x, y, z
 
 
-def _random_vehicle(n: int) -> VehicleSpec:
-    """Return a vehicle of 0.7 to 1.6 times the mass of the small one, with inertia, thrust and motors to match."""
+def _random_vehicle(like: Vehicle, n: int) -> VehicleSpec:
+    """Return a vehicle of 0.7 to 1.6 times the mass of another, with inertia, thrust and motors to match."""
     draw = np.random.default_rng(n)
     mass = float(draw.uniform(0.7, 1.6))
     inertia, thrust, motors = mass * draw.uniform(0.8, 1.25), draw.uniform(0.8, 1.2), draw.uniform(0.7, 2.0)
-    return _like_small(f"random-{n}", mass=mass, inertia=float(inertia), thrust=float(thrust), motor_tau=float(motors))
+    numbers = {"inertia": float(inertia), "thrust": float(thrust), "motor_tau": float(motors)}
+    return _like(like, f"random-{n}", mass=mass, **numbers)

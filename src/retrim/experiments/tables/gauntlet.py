@@ -1,10 +1,11 @@
-"""The gauntlet: one hover policy under everything that changes."""
+"""The gauntlet: one policy under everything that changes."""
 
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
+from ...config.loading import load
 from ...config.methods import find_method
 from ...config.setup import Setup
 from ...errors import ConfigError, PlantError
@@ -21,11 +22,11 @@ from .study import fly_all, table_presets, train_all
 METRICS = {"steady": "[m]", "late": "[m]", "peak": "[m]", "recovery_5cm": "[s]", "recovery_2cm": "[s]"}
 LATE = 5.0  # [s]: what happens before is the flight to the goal
 INTRO = """\
-Made by `retrim gauntlet`. Hover, small quadrotor on plant `bem` unless the row says otherwise. steady: mean error over
-the last 2 s; late: mean error after 5 s; peak: largest error after 5 s; recovery: time after a change of the world
-until the error stays below 5 or 2 cm (without a change: from the start, 1 m away). Means over flights, and the worst in
-brackets; a flight that crashed, or did not recover, is infinite (∞). Learning is charged to flight time by the preset's
-fixed latencies."""
+Made by `retrim gauntlet`. The preset's own vehicle on plant `bem` unless the row says otherwise, at hover or on the
+reference that the row names. steady: mean error over the last 2 s of hover, or the last 10 s of tracking; late: mean
+error after 5 s; peak: largest error after 5 s; recovery: time after a change of the world until the error stays below 5
+or 2 cm (without a change: from the start, 1 m away). Means over flights, and the worst in brackets; a flight that
+crashed, or did not recover, is infinite (∞). Learning is charged to flight time by the preset's fixed latencies."""
 
 
 def gauntlet(
@@ -39,20 +40,23 @@ def gauntlet(
     seconds: float = 30.0,
     starts: int = 4,
 ) -> None:
-    """Hover under everything that changes: recovery, steady and worst error of every method, as one heat map.
+    """Hover or tracking under everything that changes: recovery, steady and worst error, as one heat map.
 
     Args:
         run: Folder of gauntlet.md, results.json and the pictures.
         reporter: Receives progress and the table.
-        preset: A preset for hover, to train with.
+        preset: A preset for hover or tracking, to train with.
         only: Conditions to fly; all by default. One whose plant is not installed is left out, with a line.
         methods: How the policies fly.
         seeds: Training seeds; each also seeds the starts, the gusts and the learners of its flights.
         seconds: Length of a flight [s].
         starts: Flights per condition, method and seed.
     """
-    (loaded,) = table_presets([preset], "hover", seeds=seeds, starts=starts, seconds=seconds)
-    known = conditions()
+    task = load(preset).task
+    if task not in ("hover", "track"):
+        raise ConfigError(f"preset {preset!r} is for {task}; the gauntlet is flown at hover or on references")
+    (loaded,) = table_presets([preset], task, seeds=seeds, starts=starts, seconds=seconds)
+    known = conditions(loaded)
     if unknown := [name for name in only if name not in known]:
         raise ConfigError(f"no condition {unknown[0]!r}; there are {', '.join(known)}")
     for method in methods:
@@ -117,6 +121,7 @@ def rows_of(name: str, flights: Sequence[Flight], changes: Sequence[float]) -> l
                     "sensors": scenario.sensors,
                     "thrust_error": scenario.thrust_error,
                     "delay": scenario.delay,
+                    "reference": scenario.reference,
                 }
             )
     return found

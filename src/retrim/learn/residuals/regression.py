@@ -42,15 +42,16 @@ class RegressionModel(eqx.Module):
     """Control tick [s]."""
 
     @classmethod
-    def of(cls, dt: float, *, memory: float = 0.5, noise: float = 0.5) -> "RegressionModel":
+    def of(cls, dt: float, *, memory: float = 0.5, noise: float = 0.5, thrust_prior: float = 0.05) -> "RegressionModel":
         """Return the model with priors that fit small and medium quadrotors.
 
         Args:
             dt: Control tick [s].
             memory: Time constant of forgetting [s].
             noise: Standard deviation of one row of targets [m/s^2]: of the sensors, and of what no feature explains.
+            thrust_prior: Standard deviation of the thrust gain [-].
         """
-        prior = jnp.array([5.0, 5.0, 5.0, 0.05, 0.3, 0.3, 0.3, 0.03, 0.03, 0.03])
+        prior = jnp.array([5.0, 5.0, 5.0, thrust_prior, 0.3, 0.3, 0.3, 0.03, 0.03, 0.03])
         return cls(prior, jnp.array(noise), jnp.array(memory), dt)
 
     def init(self, key: Key[Array, ""]) -> RegressionState:
