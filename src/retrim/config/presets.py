@@ -54,7 +54,7 @@ class Adapt:
     memory: Seconds = 0.5
     """Regression: a tick counts for 1/e of the newest after this long [s]."""
     thrust_prior: float = Field(default=0.05, gt=0, le=1.0, strict=True)
-    """Regression: standard deviation of the thrust gain before any flight; a payload of a third of the mass is -0.25."""
+    """Regression: standard deviation of the thrust gain before any flight [-]; a third more mass is -0.25."""
     fit_every: Seconds = 3.0
     """Time between residual fits [s]."""
     fit_steps: Count = 100
