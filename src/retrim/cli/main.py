@@ -17,7 +17,7 @@ COMMANDS = {
     "fly": "Fly a policy on a plant, as it is and adapting as it flies.",
     "demo": "The whole loop: pretrain, fly, adapt; a table and pictures.",
     "sweep": "Presets x scenarios x seeds from a TOML file, to one table and one picture.",
-    "reproduce": "Make a table of the paper again: hover, tracking, vision, reversing, plants, model.",
+    "reproduce": "Make a table of the paper again: hover, tracking, vision, reversing, plants, model, ablation.",
     "gauntlet": "A hover policy under everything that changes: recovery, steady and worst error; one heat map.",
     "bench": "How long each piece of work takes on this machine.",
     "doctor": "Versions, device and cache, and known faults of dependencies.",

@@ -42,7 +42,13 @@ def command_of(make: Callable[..., None], called: str = "reproduce") -> Callable
     return command
 
 
-COMMANDS: dict[str, Callable[..., Ordered]] = {
-    make.__name__: command_of(make)
-    for make in (tables.hover, tables.reversing, tables.tracking, tables.vision, tables.plants, tables.model)
-}
+MADE = (
+    tables.hover,
+    tables.reversing,
+    tables.tracking,
+    tables.vision,
+    tables.plants,
+    tables.model,
+    tables.ablation,
+)
+COMMANDS: dict[str, Callable[..., Ordered]] = {make.__name__: command_of(make) for make in MADE}

@@ -1,0 +1,80 @@
+"""The levers of an ablation: what sets our presets apart from the paper's, one change each."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+LONG = {"num_updates": 30, "update_every": 5.0, "learning_rate": 1e-3, "update_latency": 1.0}
+SHORT = {"num_updates": 5, "update_every": 0.5, "learning_rate": 1e-4, "update_latency": 0.1}
+ENSEMBLE = {"residual": "ensemble", "fit_every": 3.0, "fit_latency": 0.2}
+REGRESSION = {"residual": "regression", "fit_every": 0.2, "fit_latency": 0.02}
+NEVER = {"update_every": 3600.0}
+
+
+@dataclass(frozen=True)
+class Lever:
+    """One change of a preset, or one way to fly it."""
+
+    label: str
+    changes: dict[str, Any] = field(default_factory=dict)
+    """Keys of the preset, as :func:`retrim.changed` takes them."""
+    method: str = "full"
+
+
+CONTROL = (
+    Lever("base policy", method="base"),
+    Lever("base policy + integral action", method="base-i"),
+)
+"""What no learning does."""
+
+OFF: dict[str, tuple[Lever, ...]] = {
+    "hover": (
+        Lever("**all levers**"),
+        Lever("disturbance observer alone", method="base-do"),
+        Lever("observer and regression, no bursts", {"adapt": NEVER}),
+        Lever("bursts alone: no frame", {"adapt": {"frame": "world"}}),
+        Lever("ensemble instead of regression", {"adapt": ENSEMBLE}),
+        Lever("long updates instead of bursts", {"adapt": LONG}),
+        Lever("all starts from the task", {"adapt": {"task_starts": None}}),
+        Lever("a new Adam for each burst", {"adapt": {"optimiser": "fresh"}}),
+        Lever("the paper's reward", {"reward": "paper"}),
+        Lever("no past commands", {"command_history": 0}),
+        Lever("no delay in the model", {"delay_ticks": 0}),
+    ),
+    "track": (
+        Lever("**all levers**"),
+        Lever("disturbance observer alone", method="base-do"),
+        Lever("observer and regression, no bursts", {"adapt": NEVER}),
+        Lever("bursts alone: no frame", {"adapt": {"frame": "world"}}),
+        Lever("ensemble instead of regression", {"adapt": ENSEMBLE}),
+        Lever("long updates instead of bursts", {"adapt": LONG}),
+        Lever("all starts from the task", {"adapt": {"task_starts": None}}),
+        Lever("references as they are only", {"track": {"felt_copies": 0}}),
+        Lever("no acceleration and jerk seen", {"track": {"observation": "preview"}}),
+        Lever("no tip in the reward", {"reward": "l2"}),
+        Lever("no actuator lag in the model", {"actuator_tau": None}),
+    ),
+}
+"""Each taken off our preset of a task."""
+
+ON: dict[str, tuple[Lever, ...]] = {
+    "hover": (
+        Lever("**as printed**"),
+        Lever("+ disturbance observer alone", method="base-do"),
+        Lever("+ frame", {"adapt": {"frame": "gravity"}}),
+        Lever("+ regression", {"adapt": REGRESSION}),
+        Lever("+ bursts, one Adam", {"adapt": {**SHORT, "optimiser": "carried"}}),
+        Lever("+ starts from flight", {"adapt": {"task_starts": 2}}),
+        Lever("+ sharp reward", {"reward": "l2"}),
+        Lever("+ past commands and delay", {"command_history": 2, "delay_ticks": 1}),
+    ),
+    "track": (
+        Lever("**as printed**"),
+        Lever("+ regression", {"adapt": REGRESSION}),
+        Lever("+ bursts, one Adam", {"adapt": {**SHORT, "optimiser": "carried"}}),
+        Lever("+ starts from flight", {"adapt": {"task_starts": 2}}),
+        Lever("+ steeper reward", {"reward": "l2"}),
+        Lever("+ reference seen ahead", {"track": {"observation": "preview"}}),
+        Lever("+ lag, past commands and delay", {"actuator_tau": 0.033, "command_history": 2, "delay_ticks": 1}),
+    ),
+}
+"""Each put on the paper's preset of a task."""

@@ -1,0 +1,118 @@
+"""Which lever does what: each off our preset, each on the paper's, beside control without learning."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, Literal
+
+import numpy as np
+
+from ...config.loading import changed, dump, load
+from ...config.presets import Adapt, Preset
+from ...config.scenario import Scenario
+from ..flights import Flight
+from ..levers import CONTROL, OFF, ON, Lever
+from ..limits import check_flights, check_seeds
+from ..reporter import Reporter
+from ..run import Run
+from .document import Document, TableSection
+from .study import Study, fly_all, train_all
+
+Task = Literal["hover", "track"]
+LATE = 5.0  # [s]: what happens before is the flight to the goal
+DISTURBANCES = {"hover": ("none", "large", "step", "gusts", "pickup"), "track": ("none", "large", "gusts")}
+REFERENCES: dict[str, tuple[str | None, ...]] = {"hover": (None,), "track": ("circle", "figure8")}
+INTRO = """\
+Made by `retrim reproduce ablation`. Mean error after 5 s of flight [m]: mean ± standard deviation over training seeds
+and starts; so what a change of the world costs counts, not only where a flight ends. Small quadrotor on plant `bem`,
+ideal sensors. Learning is charged to flight time by fixed latencies. A lever of pretraining trains its own policies."""
+
+
+def ablation(
+    run: Run,
+    reporter: Reporter,
+    *,
+    task: Task = "hover",
+    seeds: tuple[int, ...] = (0,),
+    seconds: float = 24.0,
+    starts: int = 8,
+) -> None:
+    """Which lever does what: each off our preset, each on the paper's, beside control without learning.
+
+    Args:
+        run: Folder of ablation.md and ablation.json.
+        reporter: Receives progress and the sections.
+        task: hover or track.
+        seeds: Training seeds; each also seeds the starts, the gusts and the learners of its flights.
+        seconds: Length of a flight [s].
+        starts: Flights per disturbance, lever and seed.
+    """
+    check_seeds(seeds)
+    check_flights(starts, seconds)
+    document = Document(run, "ablation", f"Ablation: {task}", INTRO, seeds, reporter)
+    studies = dict[str, Study]()
+    for name, levers in ((f"{task}/retrim", (*CONTROL, *OFF[task])), (f"{task}/paper", (*CONTROL, *ON[task]))):
+        lines, found = list[tuple[str, ...]](), list[dict[str, Any]]()
+        for lever in levers:
+            if run.interrupted:
+                break
+            reporter.say(f"{name}: {lever.label.strip('*')}")
+            preset = changed(load(name), **lever.changes)
+            cells = []
+            for reference in REFERENCES[task]:
+                followed = _follows(preset, reference)
+                study = _study(followed, studies, seeds, run, reporter)
+                scenarios = [Scenario(each, reference=reference) for each in DISTURBANCES[task]]
+                methods = (lever.method,)
+                flights = fly_all(study, scenarios, run, reporter, methods=methods, starts=starts, seconds=seconds)
+                for scenario in scenarios:
+                    row = _row([f for f in flights.flown if f.spec.scenario == scenario], name, lever)
+                    found += [row] if row["n"] else []
+                    cells.append(_cell(row))
+            if not run.interrupted:
+                lines.append((lever.label, *cells))
+        columns = tuple(
+            each if reference is None else f"{reference}, {each}"
+            for reference in REFERENCES[task]
+            for each in DISTURBANCES[task]
+        )
+        document.add(TableSection(("lever", *columns), tuple(lines), f"Preset {name}"), found)
+    document.write()
+
+
+def _follows(preset: Preset, reference: str | None) -> Preset:
+    """A policy that does not see its reference is trained on the one that it flies."""
+    if reference is None or preset.track is None or preset.track.observation != "state":
+        return preset
+    return changed(preset, track={"reference": reference})
+
+
+def _study(preset: Preset, studies: dict[str, Study], seeds: Sequence[int], run: Run, reporter: Reporter) -> Study:
+    """Policies of a preset; those whose training is the same are trained once."""
+    key = dump(replace(preset, adapt=Adapt()))
+    if key not in studies:
+        studies[key] = train_all(preset, seeds, run, reporter)
+    return replace(studies[key], preset=preset)
+
+
+def _row(flights: Sequence[Flight], preset: str, lever: Lever) -> dict[str, Any]:
+    errors = [np.inf if f.log.terminated else float(f.error[f.log.t > LATE].mean()) for f in flights]
+    scenario = flights[0].spec.scenario if flights else Scenario()
+    finite = bool(errors) and bool(np.isfinite(errors).all())
+    return {
+        "preset": preset,
+        "lever": lever.label.strip("*"),
+        "method": lever.method,
+        "metric": "late",
+        "disturbance": scenario.disturbance,
+        "reference": scenario.reference,
+        "mean": float(np.mean(errors)) if finite else None,
+        "std": float(np.std(errors)) if finite else None,
+        "n": len(errors),
+        "crashes": sum(f.log.terminated for f in flights),
+    }
+
+
+def _cell(row: dict[str, Any]) -> str:
+    if row["crashes"]:
+        return f"crashed, {row['crashes']} of {row['n']}"
+    return "-" if row["mean"] is None else f"{row['mean']:.4f} ± {row['std']:.4f}"
