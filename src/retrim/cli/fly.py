@@ -12,7 +12,7 @@ from ..config.setup import Latency, Setup
 from ..control.policy import Policy
 from ..errors import ConfigError
 from ..experiments.figures import picture
-from ..experiments.fleet import Fleet
+from ..experiments.fleet import Fleet, told_by
 from ..experiments.flights import Flight
 from ..experiments.interrupts import interrupts_only_set
 from ..experiments.metrics import cell, rows
@@ -103,7 +103,7 @@ def fly(
 def _fly(fleet: Fleet, setup: Setup, scenario: Scenario, run: Run) -> int:
     with run.interruptible(), RichReporter().progress("flying") as advance:
         advance(0.0, "compiling the programs of a flight (kept in a cache for the next time)")
-        flights = fleet.run(stop=run.stop, progress=lambda done, n: advance(done / n, f"{done} of {n} flights")).flown
+        flights = fleet.run(stop=run.stop, progress=told_by(advance)).flown
     if not flights:
         console.print("interrupted before the first flight was over; nothing was saved")
         return INTERRUPTED

@@ -4,11 +4,11 @@ import dataclasses
 import secrets
 import threading
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from functools import partial
+from typing import Any
 
-import jax
 from jax import random
 
 from ..adapt.learner import LearnerState
@@ -25,12 +25,17 @@ from .flying import fly_lot, fly_one, program_of
 from .interrupts import interrupts_only_set
 from .jobs import Job, fly_job
 from .limits import check_flights, check_seeds
+from .lots import Lot, in_lots, lanes
 from .metrics import Rows, rows
-from .provenance import cores
 
-LOT = 64  # flights of one program
-Progress = Callable[[int, int], None]
-"""Called with the number of flights that are over, and of all flights."""
+OFTEN = 1.0  # [s]: progress is told so often while flights are in the air
+Progress = Callable[[float, int], None]
+"""Called with the number of flights that are over, one in the air by the share that was flown, and of all flights."""
+
+
+def told_by(advance: Callable[[float, str], None]) -> Progress:
+    """Return the progress of a fleet for a bar: ``advance`` takes a share and a text."""
+    return lambda done, n: advance(done / n, f"{done:.0f} of {n} flights")
 
 
 @dataclass(frozen=True)
@@ -44,16 +49,6 @@ class Flights:
     def rows(self) -> Rows:
         """Return one row of results per scenario, method and seed."""
         return rows(self.flown)
-
-
-class Lot(NamedTuple):
-    """Flights that are flown at once."""
-
-    specs: list[FlightSpec]
-    compiled: threading.Event | None
-    """Set when the first lot of its program has landed; None for a flight by itself."""
-    compiles: bool = False
-    """It is the first lot of its program."""
 
 
 class Fleet:
@@ -114,27 +109,16 @@ class Fleet:
         ]
 
     def lots(self, specs: Sequence[FlightSpec]) -> list[Lot]:
-        """Return specifications in lots: those that are flown together as one program, each other one by itself.
-
-        The first lot of each program comes first: while it compiles, another program's does.
-        """
+        """Return specifications in lots: those that are flown together as one program, each other one by itself."""
         groups: dict[tuple[Scenario, str], list[FlightSpec]] = {}
         for spec in specs:
             groups.setdefault((spec.scenario, spec.method), []).append(spec)
-        first, others = dict[Hashable, Lot](), list[Lot]()
-        for group in groups.values():
+
+        def program(group: list[FlightSpec]) -> Hashable | None:
             setup, policy = self.setups[group[0].scenario.reference], self.policies[group[0].seed]
-            program = program_of(setup, policy, group) if self._latency == "fixed" else None
-            size = 1 if program is None else min(LOT, -(-len(group) // lanes()))
-            for i in range(0, len(group), size):
-                part = group[i : i + size]
-                if len(part) == 1:
-                    others.append(Lot(part, None))
-                elif (program, len(part)) in first:
-                    others.append(Lot(part, first[program, len(part)].compiled))
-                else:
-                    first[program, len(part)] = Lot(part, threading.Event(), compiles=True)
-        return [*first.values(), *others]
+            return program_of(setup, policy, group) if self._latency == "fixed" else None
+
+        return in_lots(groups.values(), program)
 
     def warm_up(self, specs: Sequence[FlightSpec] | None = None) -> None:
         """Compile the programs of flights that are flown one by one before their take-off, in this process.
@@ -170,7 +154,7 @@ class Fleet:
             executor: Any executor, which then flies one flight at a time; one with other processes builds its own
                 programs. By default flights of a simulated plant are flown in lots, each as one program, and the others
                 one by one, on one thread per core.
-            progress: Called in this thread when flights are over.
+            progress: Called in this thread when flights are over, and now and then before.
             landed: Receives flights that were flown to their end, in this thread.
             stop: Gives up what is flying. Ctrl-C does the same, and sets it.
             only: Fly these specifications, a part of ``specs``.
@@ -204,23 +188,28 @@ class Fleet:
         local: bool,
     ) -> Flights:
         futures: list[Future[list[Flight]]] = []
-        done, flown = 0, dict[FlightSpec, Flight]()
+        aloft, flown = dict[int, float](), dict[FlightSpec, Flight]()
         try:
-            for lot in lots:
+            for i, lot in enumerate(lots):
                 futures.append(
-                    executor.submit(self._fly, lot, stop)
+                    executor.submit(self._fly, lot, partial(aloft.__setitem__, i), stop)
                     if local
                     else executor.submit(fly_job, self._job(lot.specs[0]))
                 )
-            for future in as_completed(futures):
-                flights = future.result()
-                flown |= {flight.spec: flight for flight in flights}
-                if landed is not None:
-                    with interrupts_only_set(stop):
-                        landed(flights)
-                done += len(flights)
-                if progress is not None:
-                    progress(done, len(specs))
+            waiting = set(futures)
+            while waiting:
+                over, waiting = wait(waiting, OFTEN, FIRST_COMPLETED)
+                for future in over:
+                    flights = future.result()
+                    flown |= {flight.spec: flight for flight in flights}
+                    if landed is not None:
+                        with interrupts_only_set(stop):
+                            landed(flights)
+                    if progress is not None:
+                        progress(len(flown), len(specs))
+                shares = [len(lots[i].specs) * aloft.get(i, 0.0) for i, each in enumerate(futures) if each in waiting]
+                if progress is not None and not over and any(shares):
+                    progress(len(flown) + sum(shares), len(specs))
         except (KeyboardInterrupt, FlightStopped):
             stop.set()
         except BaseException:
@@ -238,8 +227,8 @@ class Fleet:
                     landed(new)
         return Flights([flown[spec] for spec in specs if spec in flown], interrupted=len(flown) < len(specs))
 
-    def _fly(self, lot: Lot, stop: threading.Event) -> list[Flight]:
-        """Fly a lot in this process."""
+    def _fly(self, lot: Lot, aloft: Callable[[float], None], stop: threading.Event) -> list[Flight]:
+        """Fly a lot in this process; ``aloft`` is told the share that was flown."""
         first = lot.specs[0]
         setup = self.setups[first.scenario.reference]
         policies = [self.policies[spec.seed] for spec in lot.specs]
@@ -253,7 +242,10 @@ class Fleet:
         try:
             if not lot.compiles:
                 lot.compiled.wait()
-            return fly_lot(setup, policies, lot.specs, starts, seconds, state=state, stop=stop, cold=lot.compiles)
+            cold = lot.compiles
+            return fly_lot(
+                setup, policies, lot.specs, starts, seconds, state=state, progress=aloft, stop=stop, cold=cold
+            )
         finally:
             lot.compiled.set()
 
@@ -261,8 +253,3 @@ class Fleet:
         x0 = self._starts[spec.scenario.reference, spec.seed][spec.start]
         policy, preset = self.policies[spec.seed], dump(self.preset)
         return Job(self._id, preset, policy, spec, x0, self.seconds, self._latency, self._state)
-
-
-def lanes() -> int:
-    """Return how many lots fly at once: one for each core, and one on an accelerator, which likes them large."""
-    return cores() if jax.default_backend() == "cpu" else 1

@@ -21,7 +21,7 @@ from ..io.files import write_whole
 from ..io.trained import load_policy, save_policy
 from ..viz.panels import bars
 from ..viz.plots import save
-from .fleet import Fleet
+from .fleet import Fleet, told_by
 from .flights import Flight, FlightSpec
 from .limits import check_seeds
 from .metrics import Rows, cell, record, summary
@@ -125,8 +125,7 @@ def _fly(fleet: Fleet, kept: "_Kept", run: Run, reporter: Reporter) -> None:
 
     with reporter.progress(f"flying {fleet.preset.name}") as advance:
         advance(0.0, "compiling the programs of a flight")
-        count = lambda done, n: advance(done / n, f"{done} of {n} flights")  # noqa: E731
-        fleet.run(stop=run.stop, only=missing, landed=keep, progress=count)
+        fleet.run(stop=run.stop, only=missing, landed=keep, progress=told_by(advance))
 
 
 def _trained(preset: Preset, sweep: Sweep, run: Run, reporter: Reporter) -> dict[int, Policy]:

@@ -11,7 +11,7 @@ from ...config.scenario import Scenario
 from ...config.setup import Setup
 from ...control.policy import Policy
 from ..figures import picture
-from ..fleet import Fleet, Flights
+from ..fleet import Fleet, Flights, told_by
 from ..limits import check_flights, check_seeds
 from ..metrics import cell, rows
 from ..reporter import Reporter
@@ -88,7 +88,7 @@ def fly_all(
     fleet = Fleet(study.preset, study.policies, scenarios, methods=methods, starts=starts, seconds=seconds)
     with run.interruptible(), reporter.progress("flying") as advance:
         advance(0.0, "compiling the programs of a flight (kept in a cache for the next time)")
-        return fleet.run(stop=run.stop, progress=lambda done, n: advance(done / n, f"{done} of {n} flights"))
+        return fleet.run(stop=run.stop, progress=told_by(advance))
     return Flights([], interrupted=True)
 
 

@@ -1,0 +1,51 @@
+"""Flights that are flown at once, as one program."""
+
+import threading
+from collections.abc import Callable, Hashable, Iterable
+from typing import NamedTuple
+
+import jax
+
+from .flights import FlightSpec
+from .provenance import cores
+
+LOT = 64  # flights of one program
+
+
+class Lot(NamedTuple):
+    """Flights that are flown at once."""
+
+    specs: list[FlightSpec]
+    compiled: threading.Event | None
+    """Set when the first lot of its program has landed; None for a flight by itself."""
+    compiles: bool = False
+    """It is the first lot of its program."""
+
+
+def in_lots(groups: Iterable[list[FlightSpec]], program: Callable[[list[FlightSpec]], Hashable | None]) -> list[Lot]:
+    """Divide flights into lots: those that are flown together, each other one by itself.
+
+    The first lot of each program comes first: while it compiles, another program's does.
+
+    Args:
+        groups: Flights that differ in start and seed only.
+        program: It tells the program of a group apart; None if its flights are flown one by one.
+    """
+    first, others = dict[Hashable, Lot](), list[Lot]()
+    for group in groups:
+        of_group = program(group)
+        size = 1 if of_group is None else min(LOT, -(-len(group) // lanes()))
+        for i in range(0, len(group), size):
+            part = group[i : i + size]
+            if len(part) == 1:
+                others.append(Lot(part, None))
+            elif (of_group, len(part)) in first:
+                others.append(Lot(part, first[of_group, len(part)].compiled))
+            else:
+                first[of_group, len(part)] = Lot(part, threading.Event(), compiles=True)
+    return [*first.values(), *others]
+
+
+def lanes() -> int:
+    """Return how many lots fly at once: one for each core, and one on an accelerator, which likes them large."""
+    return cores() if jax.default_backend() == "cpu" else 1
