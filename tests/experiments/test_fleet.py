@@ -98,7 +98,7 @@ def test_lots_fly_the_same_to_rounding_and_land_once(fleet, flights, monkeypatch
     assert [flight.spec for flight in together.flown] == fleet.specs
     assert sorted(flight.spec.start for part in landed for flight in part) == [0] * 8
     assert told == sorted(told)
-    assert {2, 4, 6, 8} <= set(told)
+    assert told[-1] == 8
     for flight, other in zip(together.flown, flights.flown, strict=True):
         np.testing.assert_allclose(flight.log.p, other.log.p, atol=2e-4)
         assert [(e.t, e.kind) for e in flight.events] == [(e.t, e.kind) for e in other.events]

@@ -196,20 +196,25 @@ class Fleet:
                     if local
                     else executor.submit(fly_job, self._job(lot.specs[0]))
                 )
-            waiting = set(futures)
+            waiting = {future: i for i, future in enumerate(futures)}
+
+            def told() -> None:
+                in_air = sum(len(lots[i].specs) * aloft.get(i, 0.0) for i in waiting.values())
+                if progress is not None:
+                    progress(len(flown) + in_air, len(specs))
+
             while waiting:
-                over, waiting = wait(waiting, OFTEN, FIRST_COMPLETED)
+                over = wait(waiting, OFTEN, FIRST_COMPLETED).done
                 for future in over:
                     flights = future.result()
                     flown |= {flight.spec: flight for flight in flights}
                     if landed is not None:
                         with interrupts_only_set(stop):
                             landed(flights)
-                    if progress is not None:
-                        progress(len(flown), len(specs))
-                shares = [len(lots[i].specs) * aloft.get(i, 0.0) for i, each in enumerate(futures) if each in waiting]
-                if progress is not None and not over and any(shares):
-                    progress(len(flown) + sum(shares), len(specs))
+                    del waiting[future]
+                    told()
+                if not over and aloft:
+                    told()
         except (KeyboardInterrupt, FlightStopped):
             stop.set()
         except BaseException:
