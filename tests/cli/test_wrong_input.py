@@ -165,7 +165,7 @@ WRONG = [
     (("sweep", "size.toml"), "'abc' is not a number"),
     (
         ("sweep", "method.toml"),
-        "task 'vision' has no frame for a disturbance observer: Keypoints cannot be turned into another frame",
+        "task 'vision' has no frame for a disturbance observer: it sees the state at every tick",
     ),
     (("sweep", "ranks.toml"), "LoRA: 3 ranks (4, 10, 1) for 2 layers"),
     (("sweep", "overlay.toml"), "nonsense: unknown key"),

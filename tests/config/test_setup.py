@@ -13,7 +13,7 @@ from helpers import tiny_preset
 from retrim import ConfigError
 from retrim.adapt.optimisers import CarriedAdam, FreshAdam
 from retrim.adapt.starts import TaskStarts
-from retrim.adapt.views import GravityView, WorldView
+from retrim.adapt.views import GravityView, RestView, WorldView
 from retrim.config import PRESETS, Scenario, Setup, changed, load, setup
 from retrim.config.learners import check_frame
 from retrim.config.vehicles import make_vehicle
@@ -287,7 +287,7 @@ def test_flight_starts_follow_from_seed_and_home_alone():
 
 
 def test_a_frame_is_refused_for_what_cannot_be_turned():
-    """A goal that moves, and keypoints on the ground."""
+    """A goal that moves; and an observer, which sees the state, for a policy that sees keypoints."""
 
     class Moving(Hover):
         def target(self, t):
@@ -298,8 +298,9 @@ def test_a_frame_is_refused_for_what_cannot_be_turned():
     check_frame(fixed.preset, f)
     with pytest.raises(ConfigError, match="Moving moves its target: it must say how that is turned"):
         check_frame(fixed.preset, Moving(f.goal, f.observation, f.box, f.heading, f.dt, f.horizon))
-    with pytest.raises(ConfigError, match=r"'vision' has no frame .*: Keypoints cannot be turned into another frame"):
+    with pytest.raises(ConfigError, match=r"'vision' has no frame .*: it sees the state at every tick"):
         Setup.of(changed(load("vision/ideal"), adapt={"frame": "gravity"}))
+    assert isinstance(Setup.of(changed(load("vision/ideal"), adapt={"frame": "rest"})).learner.view, RestView)
 
 
 def test_training_follows_references_as_they_are_felt():

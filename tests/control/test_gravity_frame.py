@@ -8,10 +8,10 @@ import pytest
 from jax import random
 
 from helpers import GOAL, hover_env, random_command, random_state, replaced
-from retrim.adapt.views import GravityView, WorldView
+from retrim.adapt.views import GravityView, RestView, WorldView
 from retrim.control import Policy
 from retrim.control.controller import PolicyController
-from retrim.control.gravity_frame import GravityFrame, Unsteady
+from retrim.control.gravity_frame import GravityFrame, RestFrame, Unsteady, at_rest
 from retrim.estimation.disturbance_observer import DisturbanceObserver
 from retrim.learn import Env, rollout
 from retrim.physics import Command, Hybrid, PointMass, State, small, so3
@@ -192,6 +192,21 @@ def test_the_frame_is_capped_and_defined_near_free_fall():
     frame = FeltFrame.of(s.d_hat)
     assert np.isfinite(frame.Q).all()
     assert 0.0 < float(frame.scale) < 3.0
+
+
+def test_the_frame_of_what_was_learnt_needs_no_observer(key):
+    """Under the push that was learnt, the command is that of the calm flight; training sees the same frame."""
+    d, env = jnp.array([1.5, -1.0, 2.0]), hover_env(horizon=3)
+    frame, x = FeltFrame.of(d), random_state(key)
+    inner = PolicyController(env.task.observation, Policy.of(15, small(), key=key, hidden=(8, 8)))
+    controller = RestFrame(inner, d)
+    u, memory = controller(controller.init(x), jnp.array(0.0), x)
+    calm, _ = inner.in_frame(frame)(inner.init(x), jnp.array(0.0), frame.state(x))
+    close(frame.command(u), calm)
+    close(controller.accepted(memory, u)[1], calm)
+    seen = RestView(LIMIT)(env, lambda x, u: d - 0.5 * x.v)
+    close(seen.frame(x, Command.hover()), frame)
+    np.testing.assert_allclose(jnp.linalg.norm(at_rest(lambda x, u: 9.0 * d, HOME, LIMIT)), LIMIT, rtol=1e-6)
 
 
 @pytest.mark.parametrize("d", [(1.0, 0.5, -1.0), (-2.0, 2.0, 2.0)])

@@ -12,6 +12,7 @@ from retrim.control import Policy, PolicyController
 from retrim.learn import Env, rollout
 from retrim.learn.encoder import pretrain_encoder
 from retrim.physics import Command, PointMass, State, small, so3
+from retrim.physics.felt_frame import FeltFrame
 from retrim.plants import Measurement
 from retrim.runtime import ControllerPilot
 from retrim.tasks import Hover, Keypoints, Start
@@ -331,3 +332,22 @@ def test_simulation_and_flight_see_the_same(occlusion, white, key):
         u = pilot.act(Measurement(k * 0.02, x))
         np.testing.assert_allclose(u.vector(), Command(simulated.u.c[k], simulated.u.omega[k]).vector(), rtol=1e-7)
     assert np.ptp(np.asarray(simulated.u.c)) > 1e-3
+
+
+@pytest.mark.parametrize("d", [(0.0, 0.0, 0.0), (1.0, -0.5, 1.5)])
+def test_in_a_frame_the_camera_sees_level_ground(d):
+    """A camera in the world, with a pose estimate that is right, shows what one in the frame would: in all frames."""
+    frame, before = FeltFrame.of(jnp.array(d)), near()
+    x = step(before, Command.hover())
+    inside = keypoints(occlusion=False).in_frame(frame)
+    goal, _ = inside.pixels(frame.state(State(jnp.array(GOAL), frame.Q.T, jnp.zeros(3))))
+    np.testing.assert_allclose(goal, PUBLISHED, atol=6e-4)  # at rest, level in the frame
+    hovering = frame.command(Command.hover())
+    expected, _ = see(inside, begin(inside, frame.state(before)), frame.state(x), hovering)
+    hidden = keypoints(occlusion=True)
+    memory = begin(hidden, before)
+    memory = memory._replace(pose=replaced(memory.pose, x=before, P=1e-12 * jnp.eye(9)))
+    found, after = see(hidden.in_frame(frame), memory, frame.state(x), hovering)
+    np.testing.assert_allclose(found[:70], expected[:70], atol=1e-5)
+    np.testing.assert_allclose(found[77:], expected[77:], atol=1e-9)  # commands, as the policy gave them
+    np.testing.assert_allclose(after.pose.x.p, x.p, atol=1e-5)  # the filter is in the world

@@ -5,9 +5,10 @@ import abc
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from ..control.gravity_frame import Capped
+from ..control.gravity_frame import Capped, at_rest
 from ..learn.env import Env
 from ..physics.dynamics import Residual
+from ..physics.state import Command, State
 
 
 class AbstractView(eqx.Module):
@@ -41,3 +42,26 @@ class GravityView(AbstractView):
         """Add the residual to the model, and let the frame answer it."""
         corrected = env.with_residual(residual)
         return Env(corrected.dynamics, corrected.task, corrected.delay_ticks, Capped(residual, self.limit))
+
+
+class AtRest(eqx.Module):
+    """A residual that is the same everywhere."""
+
+    d: Float[Array, "3"]
+
+    def __call__(self, x: State, u: Command) -> Float[Array, "3"]:
+        """Return it, world frame [m/s^2]."""
+        return self.d
+
+
+class RestView(AbstractView):
+    """The frame of the gravity that the vehicle feels at rest; see :class:`retrim.control.gravity_frame.RestFrame`."""
+
+    limit: Float[Array, ""]
+    """Largest norm of the disturbance that turns the frame [m/s^2]."""
+
+    def __call__(self, env: Env, residual: Residual) -> Env:
+        """Add the residual to the model, and let the frame answer what it says at rest."""
+        corrected = env.with_residual(residual)
+        felt = AtRest(at_rest(residual, env.task.home(), self.limit))
+        return Env(corrected.dynamics, corrected.task, corrected.delay_ticks, felt)

@@ -1,22 +1,25 @@
 """The learner of a preset, and the frame that its policy is flown in."""
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from ..adapt.learner import OnlineLearner
 from ..adapt.optimisers import CarriedAdam, FreshAdam
 from ..adapt.starts import FlownStarts, TaskStarts
-from ..adapt.views import GravityView, WorldView
+from ..adapt.views import AbstractView, GravityView, RestView, WorldView
 from ..control.controller import AbstractController
-from ..control.gravity_frame import GravityFrame
+from ..control.gravity_frame import GravityFrame, RestFrame, at_rest
 from ..errors import ConfigError
 from ..estimation.disturbance_observer import DisturbanceObserver
 from ..learn.env import Env
 from ..learn.residuals.model import ResidualModel
 from ..physics.dynamics import PointMass, Residual
 from ..physics.felt_frame import FeltFrame
+from ..tasks.keypoints import Keypoints
 from ..tasks.task import AbstractTask
 from .presets import Preset
 
@@ -37,8 +40,8 @@ def make_learner(preset: Preset, model: ResidualModel, env: Env) -> OnlineLearne
         ConfigError: The preset turns the frame of a task that cannot be turned.
     """
     a = preset.adapt
-    if a.frame == "gravity":
-        check_frame(preset, env.task)
+    if a.frame != "world":
+        check_frame(preset, env.task, observer=a.frame == "gravity")
     adam = CarriedAdam if a.optimiser == "carried" else FreshAdam
     return OnlineLearner(
         env,
@@ -48,16 +51,28 @@ def make_learner(preset: Preset, model: ResidualModel, env: Env) -> OnlineLearne
         num_updates=a.num_updates,
         num_envs=a.num_envs,
         starts=TaskStarts() if a.task_starts is None else FlownStarts(jnp.array(a.start_noise), a.task_starts),
-        view=GravityView(jnp.array(TILT_LIMIT)) if a.frame == "gravity" else WorldView(),
+        view=VIEWS[a.frame](),
     )
 
 
-def check_frame(preset: Preset, task: AbstractTask) -> None:
-    """Refuse a frame for a task that cannot be turned.
+VIEWS: dict[str, Callable[[], AbstractView]] = {
+    "world": WorldView,
+    "gravity": lambda: GravityView(jnp.array(TILT_LIMIT)),
+    "rest": lambda: RestView(jnp.array(TILT_LIMIT)),
+}
+
+
+def check_frame(preset: Preset, task: AbstractTask, *, observer: bool = True) -> None:
+    """Refuse a frame for a task that cannot be turned, and an observer for a policy that sees no state.
 
     Raises:
         ConfigError: It names the task, and what cannot be turned.
     """
+    if observer and isinstance(task.observation, Keypoints):
+        raise ConfigError(
+            f"task {preset.task!r} has no frame for a disturbance observer: it sees the state at every tick, which a "
+            "policy that sees keypoints is not shown"
+        )
     try:
         task.in_frame(FeltFrame.of(jnp.zeros(3)))
     except NotImplementedError as error:
@@ -80,3 +95,8 @@ def gravity_frame(controller: AbstractController[Any], preset: Preset, known: Re
         delay_ticks=preset.plant_delay_ticks,
     )
     return GravityFrame(controller, observer, known)
+
+
+def rest_frame(controller: AbstractController[Any], known: Residual, home: Float[Array, "3"]) -> RestFrame:
+    """Return a controller, flown in the gravity that ``known`` predicts at rest at ``home``, world [m]."""
+    return RestFrame(controller, at_rest(known, home, jnp.array(TILT_LIMIT)))

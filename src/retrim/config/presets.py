@@ -79,8 +79,9 @@ class Adapt:
     """Starts of a step that the task draws; the others lie where the vehicle has just been. By default all of them."""
     start_noise: float = Field(default=0.1, ge=0, le=10.0, strict=True)
     """Standard deviation that is added to flown starts, position [m] and velocity [m/s]."""
-    frame: Literal["world", "gravity"] = "world"
-    """gravity: fly and train in the frame of the gravity that a disturbance observer feels; for hover on the state."""
+    frame: Literal["world", "gravity", "rest"] = "world"
+    """gravity: fly and train in the frame of the gravity that a disturbance observer feels, and the residual predicts;
+    rest: in that of the gravity that the last fitted residual predicts at rest, which needs no state in between."""
     fit_latency: Seconds = 0.2
     """Flight time until a fitted residual is used [s]."""
     update_latency: Seconds = 1.0

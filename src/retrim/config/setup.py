@@ -35,7 +35,7 @@ from ..tasks.hover import TILT, Hover
 from ..tasks.keypoints import Keypoints
 from ..tasks.reference import Reference
 from ..tasks.task import AbstractTask
-from .learners import check_frame, gravity_frame, make_learner
+from .learners import check_frame, gravity_frame, make_learner, rest_frame
 from .presets import Preset
 from .presets import Track as TrackTable
 from .residuals import ResidualRequest, make_residual
@@ -183,7 +183,10 @@ class Setup:
         plain = PolicyController(self.flown.observation_in_flight, state.policy.policy.merged())
         if self.preset.adapt.frame == "world":
             return plain
-        return gravity_frame(plain, self.preset, FittedResidual(self.learner.residual_model, state.residual))
+        known = FittedResidual(self.learner.residual_model, state.residual)
+        if self.preset.adapt.frame == "rest":
+            return rest_frame(plain, known, self.flown.home())
+        return gravity_frame(plain, self.preset, known)
 
     def in_gravity_frame(self, controller: AbstractController[Any]) -> GravityFrame:
         """Return a controller flown in the gravity that a disturbance observer feels.

@@ -61,6 +61,33 @@ class GravityFrame(AbstractController[GravityFrameState]):
         return GravityFrameState(observer, self.inner.accepted(memory.inner, memory.frame.command(u)), memory.frame)
 
 
+class RestFrame(AbstractController[Any]):
+    """Any controller that can be turned, in the gravity that has been learnt: no state is needed between two fits."""
+
+    inner: AbstractController[Any]
+    d: Float[Array, "3"]
+    """Disturbance that is felt at rest, world [m/s^2]."""
+
+    def init(self, x: State) -> Any:
+        """Return the memory at the start of a flight."""
+        return self.inner.init(x)
+
+    def __call__(self, memory: Any, t: Float[Array, ""], x: State) -> tuple[Command, Any]:
+        """Return the inner controller's command in the frame."""
+        frame = FeltFrame.of(self.d)
+        u, memory = self.inner.in_frame(frame)(memory, t, frame.state(x))
+        return frame.world_command(u), memory
+
+    def accepted(self, memory: Any, u: Command) -> Any:
+        """Pass the accepted command on, as the frame has it."""
+        return self.inner.accepted(memory, FeltFrame.of(self.d).command(u))
+
+
+def at_rest(residual: Residual, home: Float[Array, "3"], limit: Float[Array, ""]) -> Float[Array, "3"]:
+    """Return what ``residual`` predicts for a vehicle that hovers at ``home``, its norm limited [m/s^2]."""
+    return capped(residual(State.at(home), Command.hover(home.dtype)), limit)
+
+
 class Unsteady(eqx.Module):
     """What a residual predicts beyond what it predicts at rest: that part depends on state and command."""
 

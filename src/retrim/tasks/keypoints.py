@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Key
 from ..estimation.camera import Camera, in_camera
 from ..estimation.pose_filter import PoseFilter
 from ..physics import so3
+from ..physics.felt_frame import FeltFrame
 from ..physics.state import STANDARD_GRAVITY, Command, State
 from .observation import AbstractObservation
 
@@ -32,6 +33,8 @@ class KeypointMemory(NamedTuple):
     commands: Float[Array, "3 4"]
     pose: PoseFilter
     """Estimated pose, to predict occluded keypoints."""
+    poses: State
+    """Estimated poses of the frames."""
     key: Key[Array, ""]
 
 
@@ -57,6 +60,8 @@ class Keypoints(AbstractObservation[KeypointMemory]):
     dt: float = eqx.field(static=True, default=0.02)
     delay_ticks: int = eqx.field(static=True, default=0)
     """Declared command delay of the plant [ticks]: the filter predicts under the command that acted."""
+    frame: FeltFrame | None = None
+    """With occlusion: what is observed is what a camera would show in this frame; ``goal`` stays in the world."""
 
     def __check_init__(self) -> None:
         """Raise ``ValueError`` if frames are no whole number of ticks apart, or the delay outlasts the memory."""
@@ -120,7 +125,7 @@ class Keypoints(AbstractObservation[KeypointMemory]):
         bits = lax.bitcast_convert_type(jnp.sum(x.p + x.v).astype(jnp.float32), jnp.int32)
         commands = jnp.zeros((COMMANDS, 4), dtype=x.p.dtype)
         key, k_pose = random.split(random.key(bits))
-        return KeypointMemory(frames, commands, PoseFilter.near(x, k_pose), key)
+        return KeypointMemory(frames, commands, PoseFilter.near(x, k_pose), self._past(x), key)
 
     def history(self, x: State, omega: Float[Array, "3"]) -> Float[Array, "depth 14"]:
         """Return the frames of a motion with constant velocity and body rates that ends in ``x``, oldest first."""
@@ -130,6 +135,33 @@ class Keypoints(AbstractObservation[KeypointMemory]):
             return self.pixels(State(x.p - s * x.v, x.R @ so3.exp(-s * omega), x.v))[0].reshape(14)
 
         return jax.vmap(frame)(ago)
+
+    def _past(self, x: State) -> State:
+        """Return the poses of a motion with constant velocity that ends in ``x``, oldest first; the last one only if
+        nothing is occluded, for none is needed then."""
+        ago = self.dt * jnp.arange(self.depth - 1 if self.occlusion else 0, -1, -1, dtype=x.p.dtype)
+        return jax.vmap(lambda s: State(x.p - s * x.v, x.R, x.v))(ago)
+
+    def in_frame(self, frame: FeltFrame) -> "Keypoints":
+        """Return what a camera would show in ``frame``, in which the ground is level.
+
+        Where points are occluded, the picture is moved by what an estimated pose says of it; else by the true one.
+        """
+        if self.occlusion:
+            return dataclasses.replace(self, frame=frame)
+        return dataclasses.replace(self, goal=frame.vector(self.goal))
+
+    def _moved_to(self, frame: FeltFrame, frames: Float[Array, "depth 14"], poses: State) -> Float[Array, "depth 14"]:
+        """Return frames of the world as they would be in ``frame``; those that are not observed stay."""
+        inside = dataclasses.replace(self, goal=frame.vector(self.goal), frame=None)
+
+        def move(pixels: Float[Array, "14"], x: State) -> Float[Array, "14"]:
+            by = inside.pixels(frame.state(x))[0] - self.pixels(x)[0]
+            return jnp.clip(pixels + by.reshape(14), -FAR, FAR)
+
+        at = jnp.arange(self.depth - 1, -1, -self.stride)
+        moved = jax.vmap(move)(frames[at], jax.tree.map(lambda leaf: leaf[at], poses))
+        return frames.at[at].set(moved)
 
     def stacked(self, frames: Float[Array, "depth 14"]) -> Float[Array, "70"]:
         """Return the five frames of the observation, newest first."""
@@ -154,26 +186,33 @@ class Keypoints(AbstractObservation[KeypointMemory]):
     ) -> tuple[Float[Array, " o"], KeypointMemory]:
         """Return the observation after one more frame."""
         key, k_noise, k_drop = random.split(memory.key, 3)
+        frame, issued = self.frame, last
+        if frame is not None:  # the camera is in the world
+            x, issued = frame.world_state(x), frame.world_command(last)
         true, visible = self.pixels(x)
         noise = (2.0 * self.noise / self.camera.size)[None] * random.normal(k_noise, (7, 2), true.dtype)
         shown = true + lax.stop_gradient(noise)
-        pose = memory.pose
+        pose, poses = memory.pose, memory.poses
         if self.occlusion:
             visible = visible & (random.uniform(k_drop, (7,), true.dtype) >= self.dropout)
             sharpness = 2.0 * jnp.maximum(self.noise, 0.5) / self.camera.size
-            acted = last if self.delay_ticks == 0 else self._command(memory.commands[-self.delay_ticks])
+            acted = issued
+            if self.delay_ticks > 0:
+                acted = self._command(memory.commands[-self.delay_ticks])
+                acted = acted if frame is None else frame.world_command(acted)
             pose = lax.stop_gradient(memory.pose).predicted(lax.stop_gradient(acted), self.dt)
             pose = pose.corrected(self.camera, self.ground(), lax.stop_gradient(shown), visible, sharpness)
             pose = lax.stop_gradient(pose)
             filled, _ = self.pixels(pose.x)
             # The value is the predicted pixel, the gradient that of the true one.
             shown = jnp.where(visible[:, None], shown, true + lax.stop_gradient(filled - true))
+            poses = jax.tree.map(lambda old, new: jnp.concatenate([old, new[None]])[1:], poses, pose.x)
         scaled = jnp.concatenate([(last.c / STANDARD_GRAVITY - 1.0)[None], last.omega / self.omega_max])
         frames = jnp.concatenate([memory.frames, shown.reshape(1, 14)])[1:]
         commands = jnp.concatenate([memory.commands, scaled[None]])[1:]
-        features = self.features(frames)
+        features = self.features(frames if frame is None else self._moved_to(frame, frames, poses))
         o = jnp.concatenate([features, visible.astype(true.dtype), commands.reshape(-1)])
-        return o, KeypointMemory(frames, commands, pose, key)
+        return o, KeypointMemory(frames, commands, pose, poses, key)
 
     def _command(self, scaled: Float[Array, "4"]) -> Command:
         """Return the command that was remembered as ``scaled``."""
