@@ -422,9 +422,8 @@ def test_no_distance_on_the_lap(name, tables):
     rows, times = np.asarray(reference.rows), row_times(reference)
     on = rows[times >= RAMP][::37, :3]
     np.testing.assert_allclose(jax.vmap(reference.distance)(jnp.asarray(on)), 0.0, atol=1e-12)
-    spacing = np.linalg.norm(np.diff(rows[:, :3], axis=0), axis=1).max()
     between = at(reference, RAMP + PERIODS[name] * np.linspace(0.0, 1.0, 333)).p
-    assert float(jax.vmap(reference.distance)(between).max()) <= 0.51 * spacing  # rows are what it knows
+    assert float(jax.vmap(reference.distance)(between).max()) < 1e-9
 
 
 def test_distance_from_a_circle_is_the_radial_offset(tables, key):
@@ -432,9 +431,9 @@ def test_distance_from_a_circle_is_the_radial_offset(tables, key):
     for a, d in zip(6.28 * np.asarray(angle), 0.9 * np.asarray(offset) + 0.05, strict=True):
         for way in (1.0 + d, 1.0 - 0.9 * d):
             p = jnp.array([1.0 + way * math.cos(a), way * math.sin(a), 1.0])
-            assert float(tables["circle"].distance(p)) == pytest.approx(abs(way - 1.0), abs=1e-3)
+            assert float(tables["circle"].distance(p)) == pytest.approx(abs(way - 1.0), abs=2e-5)
     above = jnp.array([2.0, 0.0, 1.7])
-    assert float(tables["circle"].distance(above)) == pytest.approx(0.7, abs=1e-3)
+    assert float(tables["circle"].distance(above)) == pytest.approx(0.7, abs=2e-5)
 
 
 def test_distance_knows_the_lap_only(tables):

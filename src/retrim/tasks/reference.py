@@ -163,14 +163,18 @@ class Reference(AbstractReference):
         return Point(row[:3], v, u, row[10], moving[:3], moving[3:6], moving[6])
 
     def distance(self, p: Float[Array, "3"]) -> Float[Array, ""]:
-        """Return the cross-track error: from ``p`` to the nearest row of the lap, or of all without a lap [m].
+        """Return the cross-track error: from ``p`` to the polygon of rows of the lap, or of all without a lap [m].
 
         Args:
             p: Position, world [m].
         """
-        times = self.every * jnp.arange(self.rows.shape[0], dtype=self.every.dtype)
-        on_lap = (times >= self.lap[0] - 1e-6) | (self.lap[0] == self.lap[1])
-        away = jnp.sqrt(jnp.sum((self.rows[:, :3] - p[None]) ** 2, axis=1))
+        times = self.every * jnp.arange(self.rows.shape[0] - 1, dtype=self.every.dtype)
+        on_lap = (times >= self.lap[0] - self.every) | (self.lap[0] == self.lap[1])
+        begin, along = self.rows[:-1, :3], jnp.diff(self.rows[:, :3], axis=0)
+        length = jnp.sum(along * along, axis=1)
+        part = jnp.sum((p[None] - begin) * along, axis=1) / jnp.where(length > 0.0, length, 1.0)
+        nearest = begin + jnp.clip(part, 0.0, 1.0)[:, None] * along
+        away = jnp.sqrt(jnp.sum((nearest - p[None]) ** 2, axis=1))
         return jnp.min(jnp.where(on_lap, away, jnp.inf))
 
     def in_frame(self, frame: FeltFrame) -> TurnedReference:
