@@ -7,11 +7,10 @@ import pytest
 
 from commands import retrim
 from helpers import tiny_preset
-from retrim.config import Setup, changed
+from retrim.config import Setup, changed, levers
 from retrim.config import named_presets as presets
+from retrim.config.levers import CONTROL, OFF, ON
 from retrim.config.methods import find_method
-from retrim.experiments import levers
-from retrim.experiments.levers import CONTROL, OFF, ON
 
 
 @pytest.mark.parametrize(("task", "kind"), [(task, kind) for task in OFF for kind in ("retrim", "paper")])

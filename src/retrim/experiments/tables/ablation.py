@@ -6,11 +6,11 @@ from typing import Any, Literal
 
 import numpy as np
 
+from ...config.levers import CONTROL, OFF, ON, Lever
 from ...config.loading import changed, dump, load
 from ...config.presets import Adapt, Preset
 from ...config.scenario import Scenario
 from ..flights import Flight
-from ..levers import CONTROL, OFF, ON, Lever
 from ..limits import check_flights, check_seeds
 from ..reporter import Reporter
 from ..run import Run
