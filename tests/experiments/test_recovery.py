@@ -10,7 +10,7 @@ from commands import retrim
 from helpers import tiny_preset
 from retrim.config import changed
 from retrim.config import named_presets as presets
-from retrim.experiments.conditions import conditions
+from retrim.config.conditions import conditions
 from retrim.experiments.recovery import change_times, recoveries
 from retrim.experiments.tables.gauntlet import METRICS
 

@@ -5,13 +5,13 @@ from typing import Any
 
 import numpy as np
 
+from ...config.conditions import conditions
 from ...config.loading import load
 from ...config.methods import find_method
 from ...config.setup import Setup
 from ...errors import ConfigError, PlantError
 from ...viz import plots
 from ...viz.panels import Curve, Panel, heat_map, panel_figure
-from ..conditions import conditions
 from ..flights import Flight
 from ..recovery import change_times, recoveries
 from ..reporter import Reporter

@@ -3,11 +3,11 @@
 import numpy as np
 from jaxtyping import Array
 
-from ..config.presets import Preset, Track
-from ..config.scenario import Scenario
-from ..config.vehicle_file import VehicleSpec
-from ..config.vehicles import make_vehicle
 from ..physics.vehicle import Vehicle, small
+from .presets import Preset, Track
+from .scenario import Scenario
+from .vehicle_file import VehicleSpec
+from .vehicles import make_vehicle
 
 
 def conditions(preset: Preset) -> dict[str, Scenario]:
