@@ -9,6 +9,10 @@ class ConfigError(RetrimError, ValueError):
     """A preset, scenario, vehicle, task or reference that does not exist or cannot be used."""
 
 
+class FrameError(ConfigError):
+    """A task, observation or controller that cannot be turned into another frame."""
+
+
 class PlantError(RetrimError, RuntimeError):
     """A plant refused what it was asked for, or it is gone."""
 

@@ -11,7 +11,7 @@ from helpers import GOAL, hover_env, random_command, random_state, replaced
 from retrim.adapt.views import GravityView, RestView, WorldView
 from retrim.control import Policy
 from retrim.control.controller import PolicyController
-from retrim.control.gravity_frame import GravityFrame, RestFrame, Unsteady, at_rest
+from retrim.control.gravity_frame import AtRest, GravityFrame, RestFrame, Unsteady
 from retrim.estimation.disturbance_observer import DisturbanceObserver
 from retrim.learn import Env, rollout
 from retrim.physics import Command, Hybrid, PointMass, State, small, so3
@@ -199,14 +199,14 @@ def test_the_frame_of_what_was_learnt_needs_no_observer(key):
     d, env = jnp.array([1.5, -1.0, 2.0]), hover_env(horizon=3)
     frame, x = FeltFrame.of(d), random_state(key)
     inner = PolicyController(env.task.observation, Policy.of(15, small(), key=key, hidden=(8, 8)))
-    controller = RestFrame(inner, d)
+    controller = RestFrame(inner, AtRest(lambda x, u: d - 0.5 * x.v, HOME, LIMIT))
     u, memory = controller(controller.init(x), jnp.array(0.0), x)
     calm, _ = inner.in_frame(frame)(inner.init(x), jnp.array(0.0), frame.state(x))
     close(frame.command(u), calm)
     close(controller.accepted(memory, u)[1], calm)
     seen = RestView(LIMIT)(env, lambda x, u: d - 0.5 * x.v)
     close(seen.frame(x, Command.hover()), frame)
-    np.testing.assert_allclose(jnp.linalg.norm(at_rest(lambda x, u: 9.0 * d, HOME, LIMIT)), LIMIT, rtol=1e-6)
+    np.testing.assert_allclose(jnp.linalg.norm(AtRest(lambda x, u: 9.0 * d, HOME, LIMIT).d), LIMIT, rtol=1e-6)
 
 
 @pytest.mark.parametrize("d", [(1.0, 0.5, -1.0), (-2.0, 2.0, 2.0)])

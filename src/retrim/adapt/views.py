@@ -1,14 +1,14 @@
 """How a learner looks at the world it trains in: as it is, or in the frame of the gravity that is felt there."""
 
 import abc
+import dataclasses
 
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from ..control.gravity_frame import Capped, at_rest
+from ..control.gravity_frame import AtRest, Capped
 from ..learn.env import Env
 from ..physics.dynamics import Residual
-from ..physics.state import Command, State
 
 
 class AbstractView(eqx.Module):
@@ -40,18 +40,7 @@ class GravityView(AbstractView):
 
     def __call__(self, env: Env, residual: Residual) -> Env:
         """Add the residual to the model, and let the frame answer it."""
-        corrected = env.with_residual(residual)
-        return Env(corrected.dynamics, corrected.task, corrected.delay_ticks, Capped(residual, self.limit))
-
-
-class AtRest(eqx.Module):
-    """A residual that is the same everywhere."""
-
-    d: Float[Array, "3"]
-
-    def __call__(self, x: State, u: Command) -> Float[Array, "3"]:
-        """Return it, world frame [m/s^2]."""
-        return self.d
+        return dataclasses.replace(env.with_residual(residual), felt=Capped(residual, self.limit))
 
 
 class RestView(AbstractView):
@@ -62,6 +51,4 @@ class RestView(AbstractView):
 
     def __call__(self, env: Env, residual: Residual) -> Env:
         """Add the residual to the model, and let the frame answer what it says at rest."""
-        corrected = env.with_residual(residual)
-        felt = AtRest(at_rest(residual, env.task.home(), self.limit))
-        return Env(corrected.dynamics, corrected.task, corrected.delay_ticks, felt)
+        return dataclasses.replace(env.with_residual(residual), felt=AtRest(residual, env.task.home(), self.limit))

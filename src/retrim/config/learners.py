@@ -12,8 +12,8 @@ from ..adapt.optimisers import CarriedAdam, FreshAdam
 from ..adapt.starts import FlownStarts, TaskStarts
 from ..adapt.views import AbstractView, GravityView, RestView, WorldView
 from ..control.controller import AbstractController
-from ..control.gravity_frame import GravityFrame, RestFrame, at_rest
-from ..errors import ConfigError
+from ..control.gravity_frame import AtRest, GravityFrame, RestFrame
+from ..errors import ConfigError, FrameError
 from ..estimation.disturbance_observer import DisturbanceObserver
 from ..learn.env import Env
 from ..learn.residuals.model import ResidualModel
@@ -75,7 +75,7 @@ def check_frame(preset: Preset, task: AbstractTask, *, observer: bool = True) ->
         )
     try:
         task.in_frame(FeltFrame.of(jnp.zeros(3)))
-    except NotImplementedError as error:
+    except FrameError as error:
         raise ConfigError(f"task {preset.task!r} has no frame for a disturbance observer: {error}") from error
 
 
@@ -99,4 +99,4 @@ def gravity_frame(controller: AbstractController[Any], preset: Preset, known: Re
 
 def rest_frame(controller: AbstractController[Any], known: Residual, home: Float[Array, "3"]) -> RestFrame:
     """Return a controller, flown in the gravity that ``known`` predicts at rest at ``home``, world [m]."""
-    return RestFrame(controller, at_rest(known, home, jnp.array(TILT_LIMIT)))
+    return RestFrame(controller, AtRest(known, home, jnp.array(TILT_LIMIT)))

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 from jaxtyping import Array, Float
 
+from ..errors import FrameError
 from ..physics.felt_frame import FeltFrame
 from ..physics.state import Command, State
 from ..tasks.observation import AbstractObservation
@@ -44,9 +45,9 @@ class AbstractController(eqx.Module, Generic[M]):
         """Return the same controller for states and commands of ``frame``.
 
         Raises:
-            NotImplementedError: It cannot be turned.
+            FrameError: It cannot be turned.
         """
-        raise NotImplementedError(f"{type(self).__name__} cannot be flown in another frame")
+        raise FrameError(f"{type(self).__name__} cannot be flown in another frame")
 
 
 class PolicyController(AbstractController[tuple[Any, Command]]):

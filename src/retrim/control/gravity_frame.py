@@ -5,6 +5,7 @@ the vehicle, so a controller needs no other input, and no other training, to do 
 changes with state and command is answered as if it stayed as it is now.
 """
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -48,7 +49,7 @@ class GravityFrame(AbstractController[GravityFrameState]):
         if self.known is not None:
             unsteady = Unsteady(self.known)
             felt = unsteady(x, memory.observer.commands[-1])
-            observer = eqx.tree_at(lambda o: o.nominal, observer, Hybrid(observer.nominal, unsteady))
+            observer = dataclasses.replace(observer, nominal=Hybrid(observer.nominal, unsteady))
         observed = observer(memory.observer, x)
         frame = FeltFrame.of(capped(observed.d_hat + felt, observer.limit))
         u, inner = self.inner.in_frame(frame)(memory.inner, t, frame.state(x))
@@ -65,8 +66,7 @@ class RestFrame(AbstractController[Any]):
     """Any controller that can be turned, in the gravity that has been learnt: no state is needed between two fits."""
 
     inner: AbstractController[Any]
-    d: Float[Array, "3"]
-    """Disturbance that is felt at rest, world [m/s^2]."""
+    felt: "AtRest"
 
     def init(self, x: State) -> Any:
         """Return the memory at the start of a flight."""
@@ -74,18 +74,35 @@ class RestFrame(AbstractController[Any]):
 
     def __call__(self, memory: Any, t: Float[Array, ""], x: State) -> tuple[Command, Any]:
         """Return the inner controller's command in the frame."""
-        frame = FeltFrame.of(self.d)
+        frame = self._frame()
         u, memory = self.inner.in_frame(frame)(memory, t, frame.state(x))
         return frame.world_command(u), memory
 
     def accepted(self, memory: Any, u: Command) -> Any:
         """Pass the accepted command on, as the frame has it."""
-        return self.inner.accepted(memory, FeltFrame.of(self.d).command(u))
+        return self.inner.accepted(memory, self._frame().command(u))
+
+    def _frame(self) -> FeltFrame:
+        return FeltFrame.of(self.felt.d)
 
 
-def at_rest(residual: Residual, home: Float[Array, "3"], limit: Float[Array, ""]) -> Float[Array, "3"]:
-    """Return what ``residual`` predicts for a vehicle that hovers at ``home``, its norm limited [m/s^2]."""
-    return capped(residual(State.at(home), Command.hover(home.dtype)), limit)
+class AtRest(eqx.Module):
+    """What a residual predicts for a vehicle that rests at home, everywhere; its norm is limited."""
+
+    residual: Residual
+    home: Float[Array, "3"]
+    """World [m]."""
+    limit: Float[Array, ""]
+    """[m/s^2]"""
+
+    @property
+    def d(self) -> Float[Array, "3"]:
+        """The disturbance, world frame [m/s^2]."""
+        return capped(self.residual(State.at(self.home), Command.hover(self.home.dtype)), self.limit)
+
+    def __call__(self, x: State, u: Command) -> Float[Array, "3"]:
+        """Return the disturbance, wherever the vehicle is, world frame [m/s^2]."""
+        return self.d
 
 
 class Unsteady(eqx.Module):

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import random
 from jaxtyping import Array, Bool, Float, Key
 
+from ..errors import FrameError
 from ..physics import so3
 from ..physics.felt_frame import FeltFrame
 from ..physics.state import Command, State
@@ -70,10 +71,10 @@ class AbstractHover(AbstractTask):
         """Return hover at the same goal.
 
         Raises:
-            NotImplementedError: A subclass moves the target, or the observation cannot be turned.
+            FrameError: A subclass moves the target, or the observation cannot be turned.
         """
         if type(self).target is not AbstractHover.target:
-            raise NotImplementedError(f"{type(self).__name__} moves its target: it must say how that is turned")
+            raise FrameError(f"{type(self).__name__} moves its target: it must say how that is turned")
         return dataclasses.replace(
             self,
             goal=frame.vector(self.goal),

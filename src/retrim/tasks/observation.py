@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..errors import FrameError
 from ..physics.felt_frame import FeltFrame
 from ..physics.state import STANDARD_GRAVITY, Command, State
 
@@ -46,9 +47,9 @@ class AbstractObservation(eqx.Module, Generic[M]):
         """Return the same observation for states and commands of ``frame``.
 
         Raises:
-            NotImplementedError: It cannot be turned.
+            FrameError: It cannot be turned.
         """
-        raise NotImplementedError(f"{type(self).__name__} cannot be turned into another frame")
+        raise FrameError(f"{type(self).__name__} cannot be turned into another frame")
 
 
 class StateObs(AbstractObservation[Float[Array, "history 4"]]):

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
+from ..errors import FrameError
 from ..physics.felt_frame import FeltFrame
 from ..physics.state import Command, State
 from .observation import AbstractObservation
@@ -96,9 +97,9 @@ class AbstractTask(eqx.Module):
         """Return the same task for states and commands of ``frame``.
 
         Raises:
-            NotImplementedError: It cannot be turned.
+            FrameError: It cannot be turned.
         """
-        raise NotImplementedError(f"{type(self).__name__} cannot be turned into another frame")
+        raise FrameError(f"{type(self).__name__} cannot be turned into another frame")
 
     def cross_track(self, x: State) -> Float[Array, ""] | None:
         """Return the distance from the nearest point of the reference [m]; None for a task without one."""
