@@ -105,10 +105,10 @@ class AdaptivePilot(Pilot):
                 self._new_events.append(self.events[-1])
 
     def _publish(self, update: Update) -> None:
-        if isinstance(update, ResidualUpdate):
-            self.state = LearnerState(self.state.policy, update.state)
-        elif isinstance(update, PolicyUpdate):
-            self.state = LearnerState(update.state, self.state.residual)
-        self._pilot.controller = self.controller_of(self.state)
+        if isinstance(update, ResidualUpdate | PolicyUpdate):
+            fitted = isinstance(update, ResidualUpdate)
+            policy, residual = (self.state.policy, update.state) if fitted else (update.state, self.state.residual)
+            self.state = LearnerState(policy, residual)
+            self._pilot.controller = self.controller_of(self.state)
         for learner, _ in self.learners:
             learner.receive(update)
