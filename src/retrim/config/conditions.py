@@ -1,10 +1,12 @@
 """The conditions of the gauntlet: everything that changes, and everything that differs from training."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Array
 
 from ..physics.vehicle import Vehicle, small
-from .presets import Preset, Track
+from .presets import Preset
 from .scenario import Scenario
 from .vehicle_file import VehicleSpec
 from .vehicles import make_vehicle
@@ -12,11 +14,10 @@ from .vehicles import make_vehicle
 
 def conditions(preset: Preset) -> dict[str, Scenario]:
     """Return what is flown with a preset, by name: at hover, or on every reference that it was trained on."""
-    return _on_references(preset) if preset.track else _at_hover()
+    return _at_hover() if preset.track is None else _on_references(preset, preset.track.reference.split("+"))
 
 
-def _on_references(preset: Preset) -> dict[str, Scenario]:
-    references = (preset.track or Track()).reference.split("+")
+def _on_references(preset: Preset, references: Sequence[str]) -> dict[str, Scenario]:
     found = {
         f"{reference}/{name}": Scenario(disturbance, sensors=sensors, reference=reference)
         for reference in references

@@ -26,28 +26,27 @@ CONTROL = (
 )
 """What no learning does."""
 
+LAYERS_OFF = (
+    Lever("**all levers**"),
+    Lever("disturbance observer alone", method="base-do"),
+    Lever("observer and regression, no bursts", {"adapt": NEVER}),
+    Lever("bursts alone: no frame", {"adapt": {"frame": "world"}}),
+    Lever("ensemble instead of regression", {"adapt": ENSEMBLE}),
+    Lever("long updates instead of bursts", {"adapt": LONG}),
+    Lever("all starts from the task", {"adapt": {"task_starts": None}}),
+    Lever("a new Adam for each burst", {"adapt": {"optimiser": "fresh"}}),
+)
+"""The same for every task."""
+
 OFF: dict[str, tuple[Lever, ...]] = {
     "hover": (
-        Lever("**all levers**"),
-        Lever("disturbance observer alone", method="base-do"),
-        Lever("observer and regression, no bursts", {"adapt": NEVER}),
-        Lever("bursts alone: no frame", {"adapt": {"frame": "world"}}),
-        Lever("ensemble instead of regression", {"adapt": ENSEMBLE}),
-        Lever("long updates instead of bursts", {"adapt": LONG}),
-        Lever("all starts from the task", {"adapt": {"task_starts": None}}),
-        Lever("a new Adam for each burst", {"adapt": {"optimiser": "fresh"}}),
+        *LAYERS_OFF,
         Lever("the paper's reward", {"reward": "paper"}),
         Lever("no past commands", {"command_history": 0}),
         Lever("no delay in the model", {"delay_ticks": 0}),
     ),
     "track": (
-        Lever("**all levers**"),
-        Lever("disturbance observer alone", method="base-do"),
-        Lever("observer and regression, no bursts", {"adapt": NEVER}),
-        Lever("bursts alone: no frame", {"adapt": {"frame": "world"}}),
-        Lever("ensemble instead of regression", {"adapt": ENSEMBLE}),
-        Lever("long updates instead of bursts", {"adapt": LONG}),
-        Lever("all starts from the task", {"adapt": {"task_starts": None}}),
+        *LAYERS_OFF,
         Lever("references as they are only", {"track": {"felt_copies": 0}}),
         Lever("no acceleration and jerk seen", {"track": {"observation": "preview"}}),
         Lever("no tip in the reward", {"reward": "l2"}),

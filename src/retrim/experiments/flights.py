@@ -63,8 +63,12 @@ class Flight:
     @property
     def peak(self) -> float:
         """Largest error after the first 5 s [m]; infinite for a flight that was terminated."""
-        late = self.error[self.log.t >= min(5.0, self.log.t[-1] / 2)]
-        return float("inf") if self.log.terminated else float(late.max())
+        return float("inf") if self.log.terminated else float(self.error[self._after_start()].max())
+
+    @property
+    def late(self) -> float:
+        """Mean error after the first 5 s [m]; infinite for a flight that was terminated."""
+        return float("inf") if self.log.terminated else float(self.error[self._after_start()].mean())
 
     @property
     def settle_s(self) -> float:
@@ -88,6 +92,11 @@ class Flight:
     def events(self) -> tuple[Event, ...]:
         """What adaptation did."""
         return self.log.events
+
+    def _after_start(self) -> np.ndarray:
+        """Rows after the flight to the goal; a short flight is halved."""
+        rows: np.ndarray = self.log.t >= min(5.0, self.log.t[-1] / 2)
+        return rows
 
     def _last(self, error: np.ndarray) -> float:
         late = self.log.t > self.log.t[-1] - self.steady_seconds + 0.5 * self.log.dt  # by time: a tick may be missed

@@ -95,11 +95,11 @@ def _column(records: Sequence[Mapping[str, Any]], name: str) -> np.ndarray:
     return np.array([np.inf if each[name] is None else each[name] for each in records])
 
 
-def cell(row: dict[str, Any]) -> str:
+def cell(row: dict[str, Any], digits: int = 3) -> str:
     """Return mean +- standard deviation [m], with the flights that were terminated."""
     if row["mean"] is None:
         return f"crashed, {row['crashes']} of {row['n']}"
-    text = f"{row['mean']:.3f}" + (f" ± {row['std']:.3f}" if row["std"] is not None else "")
+    text = f"{row['mean']:.{digits}f}" + (f" ± {row['std']:.{digits}f}" if row["std"] is not None else "")
     return text + (f", {row['crashes']} of {row['n']} crashed" if row["crashes"] else "")
 
 

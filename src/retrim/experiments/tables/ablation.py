@@ -12,13 +12,13 @@ from ...config.presets import Adapt, Preset
 from ...config.scenario import Scenario
 from ..flights import Flight
 from ..limits import check_flights, check_seeds
+from ..metrics import cell
 from ..reporter import Reporter
 from ..run import Run
 from .document import Document, TableSection
 from .study import Study, fly_all, train_all
 
 Task = Literal["hover", "track"]
-LATE = 5.0  # [s]: what happens before is the flight to the goal
 DISTURBANCES = {"hover": ("none", "large", "step", "gusts", "pickup"), "track": ("none", "large", "gusts")}
 REFERENCES: dict[str, tuple[str | None, ...]] = {"hover": (None,), "track": ("circle", "figure8")}
 INTRO = """\
@@ -65,9 +65,10 @@ def ablation(
                 methods = (lever.method,)
                 flights = fly_all(study, scenarios, run, reporter, methods=methods, starts=starts, seconds=seconds)
                 for scenario in scenarios:
-                    row = _row([f for f in flights.flown if f.spec.scenario == scenario], name, lever)
-                    found += [row] if row["n"] else []
-                    cells.append(_cell(row))
+                    group = [flight for flight in flights.flown if flight.spec.scenario == scenario]
+                    if group:
+                        found.append(_row(group, name, lever))
+                        cells.append(cell(found[-1], digits=4))
             if not run.interrupted:
                 lines.append((lever.label, *cells))
         columns = tuple(
@@ -95,9 +96,8 @@ def _study(preset: Preset, studies: dict[str, Study], seeds: Sequence[int], run:
 
 
 def _row(flights: Sequence[Flight], preset: str, lever: Lever) -> dict[str, Any]:
-    errors = [np.inf if f.log.terminated else float(f.error[f.log.t > LATE].mean()) for f in flights]
-    scenario = flights[0].spec.scenario if flights else Scenario()
-    finite = bool(errors) and bool(np.isfinite(errors).all())
+    errors = np.array([flight.late for flight in flights])
+    whole, scenario = errors[np.isfinite(errors)], flights[0].spec.scenario
     return {
         "preset": preset,
         "lever": lever.label.strip("*"),
@@ -105,14 +105,8 @@ def _row(flights: Sequence[Flight], preset: str, lever: Lever) -> dict[str, Any]
         "metric": "late",
         "disturbance": scenario.disturbance,
         "reference": scenario.reference,
-        "mean": float(np.mean(errors)) if finite else None,
-        "std": float(np.std(errors)) if finite else None,
+        "mean": float(whole.mean()) if len(whole) else None,
+        "std": float(whole.std(ddof=1)) if len(whole) > 1 else None,
         "n": len(errors),
-        "crashes": sum(f.log.terminated for f in flights),
+        "crashes": len(errors) - len(whole),
     }
-
-
-def _cell(row: dict[str, Any]) -> str:
-    if row["crashes"]:
-        return f"crashed, {row['crashes']} of {row['n']}"
-    return "-" if row["mean"] is None else f"{row['mean']:.4f} ± {row['std']:.4f}"

@@ -20,7 +20,6 @@ from .document import Document, TableSection
 from .study import fly_all, table_presets, train_all
 
 METRICS = {"steady": "[m]", "late": "[m]", "peak": "[m]", "recovery_5cm": "[s]", "recovery_2cm": "[s]"}
-LATE = 5.0  # [s]: what happens before is the flight to the goal
 INTRO = """\
 Made by `retrim gauntlet`. The preset's own vehicle on plant `bem` unless the row says otherwise, at hover or on the
 reference that the row names. steady: mean error over the last 2 s of hover, or the last 10 s of tracking; late: mean
@@ -98,7 +97,7 @@ def rows_of(name: str, flights: Sequence[Flight], changes: Sequence[float]) -> l
         group = [flight for flight in flights if flight.spec.method == method]
         values = {
             "steady": [np.inf if f.log.terminated else f.steady for f in group],
-            "late": [np.inf if f.log.terminated else float(f.error[f.log.t > LATE].mean()) for f in group],
+            "late": [f.late for f in group],
             "peak": [f.peak for f in group],
             "recovery_5cm": [each for f in group for each in _recoveries(f, changes, 0.05)],
             "recovery_2cm": [each for f in group for each in _recoveries(f, changes, 0.02)],
