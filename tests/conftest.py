@@ -1,17 +1,20 @@
 """Strict everywhere: double precision, no silent promotion of types or ranks; shapes are checked by the import hook."""
 
+import gc
 import os
 import signal
 from pathlib import Path
 
-# Nearly all of the suite's time is compiling, and half of that is optimisation that a short test never earns back. The
-# commands that tests start inherit this. What users run, optimised, is what `make demo` and `make wheel` fly.
+# Nearly all of the suite's time is compiling, and half of that is optimisation that a short test never earns back. A
+# program in one piece takes fewer memory maps. The commands that tests start inherit this. What users run, optimised,
+# is what `make demo` and `make wheel` fly.
 os.environ["XLA_FLAGS"] = " ".join(
     dict.fromkeys(
         [
             *os.environ.get("XLA_FLAGS", "").split(),
             "--xla_backend_optimization_level=0",
             "--xla_cpu_use_fusion_emitters=false",
+            "--xla_cpu_parallel_codegen_split_count=1",
         ]
     )
 )
@@ -44,12 +47,18 @@ def optax_promotion():
 
 
 @pytest.fixture(scope="module", autouse=True)
-def forget_programs():
-    """Free compiled programs before they are too many: each holds memory maps, of which a process has 65,530."""
+def keep_programs():
+    """Share compiled programs between files, but free them before they are too many.
+
+    Each program holds memory maps, of which a process has 65,530. What stays is not looked through for garbage again.
+    """
     yield
     maps = Path("/proc/self/maps")
-    if not maps.exists() or maps.read_text().count("\n") > 25_000:
+    if maps.exists() and maps.read_text().count("\n") > 45_000:
+        gc.unfreeze()
         jax.clear_caches()
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture

@@ -5,6 +5,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from ..control.policy import Policy
@@ -49,8 +50,8 @@ def judge(candidate: Policy, incumbent: Policy, env: Env, x0: Start) -> Verdict:
     Returns:
         The verdict; the candidate is admitted if it is finite and its cost is not higher.
     """
-    new = policy_loss(candidate, env, x0)
-    old = policy_loss(incumbent, env, x0)
+    both = jax.tree.map(lambda a, b: jnp.stack([a, b]), candidate, incumbent)
+    new, old = lax.map(lambda policy: policy_loss(policy, env, x0), both)  # one after the other, as one program
     sound = all_finite(candidate.layers)
     better = (new <= old) | ~jnp.isfinite(old)
     return Verdict(sound & jnp.isfinite(new) & better, sound, new, old)
