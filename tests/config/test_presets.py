@@ -61,7 +61,8 @@ def test_a_hundred_hertz_has_the_same_times():
         ({"pretrain": {"max_grad_norm": 0.0}}, r"pretrain\.max_grad_norm: Input should be greater than 0"),
         ({"actuator_tau": -0.1}, r"actuator_tau: Input should be greater than 0"),
         ({"reward": "sharp"}, r"reward = 'sharp' is for task = 'track', not for 'hover'"),
-        ({"reward": "l3"}, r"reward: Input should be 'paper', 'l2' or 'sharp'"),
+        ({"reward": "view"}, r"reward = 'view' is for task = 'vision', not for 'hover'"),
+        ({"reward": "l3"}, r"reward: Input should be 'paper', 'l2', 'sharp' or 'view'"),
     ],
 )
 def test_what_does_not_fit_together(tables, message):
@@ -184,6 +185,11 @@ OURS["track/fast"] = OURS["track/retrim"] | {
 }
 OURS["vision/occluded"] = OURS["vision/ideal"] | {
     "vision": {"occlusion": True, "pixel_noise": 1.0, "dropout": 0.05, "whiten_pixels": True, "encoder_steps": 3000}
+}
+OURS["vision/retrim"] = OURS["vision/occluded"] | {
+    "reward": "view",
+    "actuator_tau": 0.033,
+    "adapt": OURS["hover/retrim"]["adapt"],
 }
 OURS["hover/100hz"] = OURS["hover/fast"] | {
     "dt": 0.01,

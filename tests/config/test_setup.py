@@ -18,12 +18,13 @@ from retrim.config import PRESETS, Scenario, Setup, changed, load, setup
 from retrim.config.learners import check_frame
 from retrim.config.vehicles import make_vehicle
 from retrim.control.controller import PolicyController
-from retrim.control.gravity_frame import GravityFrame
+from retrim.control.gravity_frame import GravityFrame, SeenFrame
 from retrim.learn import policy_loss
 from retrim.physics.actuators import Lagged
 from retrim.physics.dynamics import PointMass
 from retrim.runtime import fly
-from retrim.tasks import Hover, Keypoints, L2Hover, L2Track, Preview, SharpTrack, StateObs, Track
+from retrim.tasks import Hover, Keypoints, L2Hover, L2Track, OccludedKeypoints, Preview, SharpTrack, StateObs, Track
+from retrim.tasks.view import ViewHover
 
 pytestmark = pytest.mark.usefixtures("optax_promotion")
 
@@ -54,7 +55,7 @@ def test_the_model_has_the_presets_delay_and_lag(built):
     )
     for env in (made.env, made.learner.env):
         assert env.delay_ticks == preset.delay_ticks
-        if preset.name in ("track/preview", "track/retrim", "track/fast"):
+        if preset.name in ("track/preview", "track/retrim", "track/fast", "vision/retrim"):
             assert isinstance(env.dynamics, Lagged)
             assert float(env.dynamics.tau) == preset.actuator_tau == 0.033
             assert isinstance(env.dynamics.base, PointMass)
@@ -66,7 +67,12 @@ def test_the_model_has_the_presets_delay_and_lag(built):
 def test_the_task_has_the_presets_numbers(built):
     preset, made = built
     kinds = {("hover", "paper"): Hover, ("hover", "l2"): L2Hover, ("vision", "paper"): Hover, ("vision", "l2"): L2Hover}
-    kinds |= {("track", "paper"): Track, ("track", "l2"): L2Track, ("track", "sharp"): SharpTrack}
+    kinds |= {
+        ("vision", "view"): ViewHover,
+        ("track", "paper"): Track,
+        ("track", "l2"): L2Track,
+        ("track", "sharp"): SharpTrack,
+    }
     for task in (made.env.task, made.flown):
         assert type(task) is kinds[preset.task, preset.reward]
         assert task.horizon == preset.pretrain.horizon
@@ -87,11 +93,9 @@ def test_the_observation_has_the_presets_numbers(built):
     np.testing.assert_array_equal(seen.omega_max, vehicle.omega_max)
     if preset.task == "vision":
         assert isinstance(seen, Keypoints)
-        assert not seen.occlusion  # never in training
         assert float(seen.noise) == preset.vision.pixel_noise
         assert bool(jnp.all(seen.whiten == jnp.eye(70))) == (not preset.vision.whiten_pixels)
         assert seen.dt == preset.dt
-        assert seen.delay_ticks == preset.plant_delay_ticks
     else:
         assert type(seen) is (Preview if preset.name in ("track/preview", "track/retrim", "track/fast") else StateObs)
         if preset.task == "track" and preset.track.observation != "state":
@@ -102,12 +106,14 @@ def test_the_observation_has_the_presets_numbers(built):
 def test_occlusion_is_switched_on_in_flight_alone(built):
     preset, made = built
     flown = made.flown.observation_in_flight
-    if preset.name == "vision/occluded":
-        assert flown.occlusion
+    if preset.name in ("vision/occluded", "vision/retrim"):
+        assert isinstance(flown, OccludedKeypoints)
         assert float(flown.dropout) == preset.vision.dropout == 0.05
-        assert float(flown.noise) == preset.vision.pixel_noise == 1.0
-        np.testing.assert_array_equal(flown.whiten, made.env.task.observation.whiten)
-        assert not made.learner.env.task.observation.occlusion  # nor in updates
+        assert float(flown.full.noise) == preset.vision.pixel_noise == 1.0
+        assert (flown.lag is None) == (preset.actuator_tau is None)
+        assert flown.delay_ticks == preset.plant_delay_ticks
+        np.testing.assert_array_equal(flown.full.whiten, made.env.task.observation.whiten)
+        assert isinstance(made.learner.env.task.observation, Keypoints)  # nor in updates
     else:
         assert flown is made.flown.observation
 
@@ -142,7 +148,7 @@ def test_the_learner_has_the_presets_numbers(built):
     else:
         assert (learner.starts.from_task, float(learner.starts.spread)) == (a.task_starts, a.start_noise)
     if a.frame == "gravity":
-        assert isinstance(learner.view, GravityView)
+        assert isinstance(learner.view, RestView if preset.task == "vision" else GravityView)
     else:
         assert isinstance(learner.view, WorldView)
     assert learner.env.task is made.flown
@@ -184,7 +190,10 @@ def test_the_pilot_has_the_presets_schedule(built, latency, monkeypatch):
     ((controller, *numbers),) = pilots
     assert numbers == [[a.fit_every, a.update_every], preset.dt, a.window]
     flown = controller(made.learner.init(made.new_policy(random.key(0)), random.key(2)))
-    if a.frame == "gravity":
+    if a.frame == "gravity" and preset.task == "vision":
+        assert isinstance(flown, SeenFrame)
+        flown = flown.inner
+    elif a.frame == "gravity":
         assert isinstance(flown, GravityFrame)
         assert flown.observer.delay_ticks == preset.plant_delay_ticks
         assert flown.known.model is made.learner.residual_model
@@ -287,7 +296,7 @@ def test_flight_starts_follow_from_seed_and_home_alone():
 
 
 def test_a_frame_is_refused_for_what_cannot_be_turned():
-    """A goal that moves; and an observer, which sees the state, for a policy that sees keypoints."""
+    """A goal that moves; and keypoints without occlusion, for there is no filter that feels."""
 
     class Moving(Hover):
         def target(self, t):
@@ -298,9 +307,14 @@ def test_a_frame_is_refused_for_what_cannot_be_turned():
     check_frame(fixed.preset, f)
     with pytest.raises(ConfigError, match="Moving moves its target: it must say how that is turned"):
         check_frame(fixed.preset, Moving(f.goal, f.observation, f.box, f.heading, f.dt, f.horizon))
-    with pytest.raises(ConfigError, match=r"'vision' has no frame .*: it sees the state at every tick"):
+    with pytest.raises(ConfigError, match=r"'vision/ideal' has no frame of felt gravity: .* occlusion = true"):
         Setup.of(changed(load("vision/ideal"), adapt={"frame": "gravity"}))
-    assert isinstance(Setup.of(changed(load("vision/ideal"), adapt={"frame": "rest"})).learner.view, RestView)
+    seeing = Setup.of(load("vision/retrim"))
+    assert isinstance(seeing.learner.view, RestView)
+    assert isinstance(
+        seeing.in_gravity_frame(PolicyController(seeing.flown.observation_in_flight, seeing.new_policy(random.key(0)))),
+        SeenFrame,
+    )
 
 
 def test_training_follows_references_as_they_are_felt():

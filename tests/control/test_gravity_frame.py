@@ -11,13 +11,13 @@ from helpers import GOAL, hover_env, random_command, random_state, replaced
 from retrim.adapt.views import GravityView, RestView, WorldView
 from retrim.control import Policy
 from retrim.control.controller import PolicyController
-from retrim.control.gravity_frame import AtRest, GravityFrame, RestFrame, Unsteady
+from retrim.control.gravity_frame import AtRest, GravityFrame, SeenFrame, Unsteady
 from retrim.estimation.disturbance_observer import DisturbanceObserver
 from retrim.learn import Env, rollout
 from retrim.physics import Command, Hybrid, PointMass, State, small, so3
 from retrim.physics.actuators import Lagged
 from retrim.physics.felt_frame import FeltFrame
-from retrim.tasks import L2Track, Preview, Start, Track
+from retrim.tasks import Keypoints, L2Track, OccludedKeypoints, Preview, Start, Track
 from retrim.tasks.shapes import circle, figure8, star
 
 HOME = jnp.array(GOAL)
@@ -194,18 +194,36 @@ def test_the_frame_is_capped_and_defined_near_free_fall():
     assert 0.0 < float(frame.scale) < 3.0
 
 
-def test_the_frame_of_what_was_learnt_needs_no_observer(key):
-    """Under the push that was learnt, the command is that of the calm flight; training sees the same frame."""
+def test_what_a_pose_filter_feels_turns_the_picture(key):
+    """With an estimate that is right, the command under a push is that of the calm flight; the last one is kept."""
+    d, x = jnp.array([1.5, -1.0, 2.0]), State(HOME + jnp.array([0.1, -0.1, 0.1]), jnp.eye(3), jnp.zeros(3))
+    frame = FeltFrame.of(d)
+    full = Keypoints.of(HOME, small().omega_max, whitened=False)
+    policy = Policy.of(full.size, small(), key=key, hidden=(8, 8))
+    policy = jax.tree.map(lambda leaf: leaf + 0.02, policy)
+    controller = SeenFrame(PolicyController(OccludedKeypoints(full, jnp.array(1.0)), policy), LIMIT)
+    memory, last = controller.init(x)
+    back = PointMass(0.02).step(State(x.p, x.R, -x.v), Command.hover(), jnp.zeros(3))
+    close(back.p, x.p)  # it hovers: a tick ago it was here
+    sure = replaced(memory.pose, x=replaced(x, v=-0.02 * d), d=d, P=1e-12 * jnp.eye(12))
+    calmly = jnp.zeros((3, 4)).at[:, 0].set(1.0 / frame.scale - 1.0)  # what has been hover in the frame
+    memory = memory._replace(
+        commands=calmly, pose=sure, poses=jax.tree.map(lambda leaf: jnp.repeat(leaf[None], 13, axis=0), x)
+    )
+    u, after = eqx.filter_jit(controller)((memory, last), jnp.array(0.0), x)
+    calm = PolicyController(full.in_frame(frame), policy)
+    start = calm.init(frame.state(x))
+    wanted, _ = eqx.filter_jit(calm)((start[0], frame.command(last)), jnp.array(0.0), frame.state(x))
+    np.testing.assert_allclose(frame.command(u).vector(), wanted.vector(), atol=1e-4)
+    close(after[1], u)
+    close(controller.accepted(after, last)[1], last)
+
+
+def test_training_on_keypoints_sees_one_frame(key):
+    """That of what was learnt, at rest; its norm is limited."""
     d, env = jnp.array([1.5, -1.0, 2.0]), hover_env(horizon=3)
-    frame, x = FeltFrame.of(d), random_state(key)
-    inner = PolicyController(env.task.observation, Policy.of(15, small(), key=key, hidden=(8, 8)))
-    controller = RestFrame(inner, AtRest(lambda x, u: d - 0.5 * x.v, HOME, LIMIT))
-    u, memory = controller(controller.init(x), jnp.array(0.0), x)
-    calm, _ = inner.in_frame(frame)(inner.init(x), jnp.array(0.0), frame.state(x))
-    close(frame.command(u), calm)
-    close(controller.accepted(memory, u)[1], calm)
     seen = RestView(LIMIT)(env, lambda x, u: d - 0.5 * x.v)
-    close(seen.frame(x, Command.hover()), frame)
+    close(seen.frame(random_state(key), Command.hover()), FeltFrame.of(d))
     np.testing.assert_allclose(jnp.linalg.norm(AtRest(lambda x, u: 9.0 * d, HOME, LIMIT).d), LIMIT, rtol=1e-6)
 
 

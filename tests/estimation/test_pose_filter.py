@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from jax import lax, random
 
-from helpers import GOAL, random_command, stacked
+from helpers import GOAL, random_command, replaced, stacked
 from retrim.estimation import Camera, PoseFilter
 from retrim.estimation.camera import in_camera
-from retrim.physics import Command, PointMass, State, so3
+from retrim.physics import Command, Lagged, PointMass, State, so3
 from retrim.tasks.keypoints import PATTERN
 
 DT = 0.02
@@ -70,7 +70,8 @@ def test_hand_over_is_as_uncertain_as_it_says():
     np.testing.assert_allclose((starts.x.p - x.p[None]).std(axis=0), 0.1, rtol=0.08)
     np.testing.assert_allclose(jax.vmap(so3.log)(starts.x.R).std(axis=0), 0.05, rtol=0.08)
     np.testing.assert_allclose(starts.x.v.std(axis=0), 0.2, rtol=0.08)
-    np.testing.assert_allclose(np.diag(starts.P[0]), np.repeat([0.01, 0.0025, 0.04], 3))
+    np.testing.assert_allclose(np.diag(starts.P[0]), np.repeat([0.01, 0.0025, 0.04, 1.0], 3))
+    np.testing.assert_array_equal(starts.d, 0.0)  # nobody has felt anything yet
 
 
 def test_predicts_through_the_dark(key):
@@ -120,3 +121,52 @@ def test_a_stray_point_does_not_throw_it(key):
     pixels = pixels_at(x).at[2].set(jnp.array([-0.9, -0.9]))
     after = corrected(estimate, pixels, jnp.ones(7, dtype=bool))
     assert float(jnp.linalg.norm(after.x.p - x.p)) < 0.02
+
+
+@pytest.mark.parametrize("push", [(2.0, 2.0, 2.0), (-3.0, 1.0, -0.5)])
+def test_a_push_is_felt(push, key):
+    """A constant acceleration that no command explains is told from tilt, within a second."""
+    x, estimate, noise = State.at(jnp.array(GOAL)), PoseFilter.near(State.at(jnp.array(GOAL)), key), 1.0 / CAMERA.size
+    hold = Command.hover()
+
+    @jax.jit
+    def tick(estimate, x):
+        x = PointMass(DT).step(x, hold, jnp.array(push))
+        seen = jnp.ones(7, dtype=bool)
+        return estimate.predicted(hold, DT).corrected(CAMERA, GROUND, pixels_at(x), seen, noise), x
+
+    for _ in range(30):
+        estimate, x = tick(estimate, x)
+    np.testing.assert_allclose(estimate.d, push, atol=0.1)
+    assert float(jnp.linalg.norm(estimate.x.v - x.v)) < 0.05
+
+
+def test_a_first_look_may_be_far_off():
+    """One look at seven points mends a pose that is 25 cm and 8 degrees off, to what a linear look would leave."""
+    x = State.at(jnp.array([0.1, 0.2, 1.2]))
+    estimate = PoseFilter.near(x, random.key(0))
+    off = State(x.p + jnp.array([0.2, -0.1, 0.15]), so3.exp(jnp.array([0.1, -0.05, 0.08])), x.v)
+    after = corrected(replaced(estimate, x=off), pixels_at(x), jnp.ones(7, dtype=bool))
+    assert float(jnp.linalg.norm(after.x.p - x.p)) < 0.01
+    assert float(jnp.linalg.norm(so3.log(x.R.T @ after.x.R))) < 0.01
+
+
+@pytest.mark.parametrize("tau", [0.03, 0.06])
+def test_it_knows_of_lag(tau, key):
+    """In the dark, under a command that jumps, it follows a vehicle with such actuators, and without them it does not."""
+    plant = Lagged(PointMass(DT), jnp.array(tau))
+    x0 = State.at(jnp.array(GOAL))
+    start = replaced(PoseFilter.near(x0, key), x=x0)
+    jumps = [Command(jnp.array(15.0), jnp.array([3.0, -2.0, 1.0]))] * 6
+
+    @eqx.filter_jit
+    def flown(us, lag):
+        def tick(carry, u):
+            s, estimate = carry
+            return (plant.step(s, u, jnp.zeros(3)), estimate.predicted(u, DT, lag)), None
+
+        (s, estimate), _ = lax.scan(tick, (plant.init(x0), start), us)
+        return jnp.linalg.norm(plant.state(s).v - estimate.x.v)
+
+    assert float(flown(stacked(jumps), jnp.array(tau))) < 1e-9
+    assert float(flown(stacked(jumps), None)) > 0.1

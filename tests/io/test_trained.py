@@ -83,6 +83,7 @@ SIZES |= {
     "track/fast": 49,
     "vision/ideal": 89,
     "vision/occluded": 89,
+    "vision/retrim": 89,
     "vision/paper": 89,
 }
 

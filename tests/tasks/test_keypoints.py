@@ -1,4 +1,4 @@
-"""Keypoints: as published, whitened, out of sight, under the command that acted; learning to see."""
+"""Keypoints: as published, whitened; learning to see."""
 
 import equinox as eqx
 import jax
@@ -12,10 +12,9 @@ from retrim.control import Policy, PolicyController
 from retrim.learn import Env, rollout
 from retrim.learn.encoder import pretrain_encoder
 from retrim.physics import Command, PointMass, State, small, so3
-from retrim.physics.felt_frame import FeltFrame
 from retrim.plants import Measurement
 from retrim.runtime import ControllerPilot
-from retrim.tasks import Hover, Keypoints, Start
+from retrim.tasks import Hover, Keypoints, OccludedKeypoints, Start
 from retrim.tasks.keypoints import FEATURE_LIMIT, random_motion
 
 PUBLISHED = [
@@ -89,7 +88,7 @@ def test_layout(plain, key):
 
 
 def test_the_same_start_sees_the_same(key):
-    noisy, us = keypoints(noise=2.0, dropout=0.2), gentle(key, 4)
+    noisy, us = keypoints(noise=2.0), gentle(key, 4)
     first, again = watched(noisy, near(), us)[0], watched(noisy, near(), us)[0]
     np.testing.assert_array_equal(first, again)
     elsewhere = replaced(near(), v=near().v + 0.01)
@@ -100,7 +99,7 @@ def test_the_same_start_sees_the_same(key):
 def test_without_noise_it_shows_the_projection_and_with_noise_its_deviation(plain):
     """In pixels: of 1280 and 720 across an image that is 2 wide and high."""
     exact = np.asarray(plain.pixels(near())[0])
-    noisy = keypoints(noise=3.0, occlusion=False)
+    noisy = keypoints(noise=3.0)
     starts = jax.vmap(lambda k: State(near().p, near().R, 0.1 * random.normal(k, (3,))))(
         random.split(random.key(4), 600)
     )
@@ -109,38 +108,14 @@ def test_without_noise_it_shows_the_projection_and_with_noise_its_deviation(plai
     def first(o, xs):
         return jax.vmap(lambda x: o(o.init(x), jnp.array(0.0), x, Command.hover())[0][:14])(xs)
 
-    np.testing.assert_allclose(first(keypoints(occlusion=False), starts)[0].reshape(7, 2), exact, atol=1e-12)
+    np.testing.assert_allclose(first(keypoints(), starts)[0].reshape(7, 2), exact, atol=1e-12)
     off = (np.asarray(first(noisy, starts)).reshape(-1, 7, 2) - exact) * np.array([640.0, 360.0])
     np.testing.assert_allclose(off.reshape(-1, 2).std(axis=0), 3.0, rtol=0.05)
     np.testing.assert_allclose(off.reshape(-1, 2).mean(axis=0), 0.0, atol=0.15)
 
 
-@pytest.mark.parametrize("noise", [0.0, 1.0])
-def test_occlusion_costs_nothing_while_everything_is_seen(noise, key):
-    us = gentle(key, 8)
-    every, occluded = (watched(keypoints(noise=noise, occlusion=o), near(), us)[0] for o in (False, True))
-    np.testing.assert_array_equal(occluded[:, 70:77], 1.0)
-    np.testing.assert_allclose(occluded, every, atol=1e-12)
-
-
-def test_what_is_out_of_sight_is_not_observed(plain):
-    """Its flag is down, and what is shown is the filter's, not the truth; without occlusion it is the truth."""
-    aside = State(jnp.array([0.9, 0.0, 1.0]), jnp.eye(3), jnp.zeros(3))
-    pixels, visible = (np.asarray(a) for a in plain.pixels(aside))
-    assert 0 < visible.sum() < 7
-    (o,), _, _ = watched(plain, aside, [Command.hover()])
-    np.testing.assert_array_equal(o[70:77], visible)
-    wrong = np.abs(o[:14].reshape(7, 2) - pixels).max(axis=1)
-    np.testing.assert_allclose(wrong[visible], 0.0, atol=1e-12)
-    assert (wrong[~visible] > 1e-6).all()
-    (o,), _, _ = watched(keypoints(occlusion=False), aside, [Command.hover()])
-    np.testing.assert_allclose(o[:14].reshape(7, 2), pixels, atol=1e-12)
-
-
 @pytest.mark.parametrize("place", [(0.05, -0.1, 1.1), (0.9, 0.0, 1.0), (4.0, 0.0, 0.3)])
-@pytest.mark.parametrize("occlusion", [True, False])
-def test_gradient_of_the_observation_is_finite(place, occlusion, white):
-    observation = replaced(white, occlusion=occlusion)
+def test_gradient_of_the_observation_is_finite(place, white):
     x = State(jnp.array(place), so3.exp(jnp.array([0.1, 0.5, 0.0])), jnp.array([0.3, 0.0, 0.0]))
 
     @eqx.filter_jit
@@ -148,7 +123,7 @@ def test_gradient_of_the_observation_is_finite(place, occlusion, white):
         memory = o.init(x)
         return jax.jacobian(lambda x: o(memory, jnp.array(0.0), x, Command.hover())[0])(x)
 
-    leaves = jax.tree.leaves(slope(observation, x))
+    leaves = jax.tree.leaves(slope(white, x))
     assert all(np.isfinite(leaf).all() for leaf in leaves)
     if place[0] < 1.0:
         assert float(jnp.abs(leaves[0]).max()) > 0.01
@@ -203,75 +178,11 @@ def test_features_of_other_motions_are_white(white, motions):
 
 
 def test_features_are_cut_off(white):
-    wild = 2.5 * random.normal(random.key(3), (13, 14))
+    wild = 2.5 * random.normal(random.key(3), (70,))
     features = white.features(wild)
-    raw = white.whiten @ (white.stacked(wild) - white.mean)
+    raw = white.whiten @ (wild - white.mean)
     assert float(jnp.abs(raw).max()) > 10.0
     np.testing.assert_array_equal(features, jnp.clip(raw, -5.0, 5.0))
-
-
-# ---- delay, occlusion, rate
-
-
-def blind(observation, us, delay):
-    """Fly a point mass that hears commands ``delay`` ticks late, for the last half without any visible point.
-
-    Returns the error of the filter's velocity after each tick [m/s].
-    """
-    x, last, errors = State.at(jnp.array(GOAL)), Command.hover(), []
-    memory, acting = begin(observation, x), [Command.hover()] * delay
-    # The filter starts from the truth, so that nothing but its prediction can make an error.
-    memory = memory._replace(pose=replaced(memory.pose, x=x, P=1e-12 * jnp.eye(9)))
-    for u in us:
-        _, memory = see(observation, memory, x, last)
-        errors.append(float(jnp.linalg.norm(memory.pose.x.v - x.v)))
-        acting.append(u)
-        x, last = step(x, acting.pop(0)), u
-    return np.array(errors)
-
-
-@pytest.mark.parametrize("delay", [0, 1, 2, 3])
-def test_the_filter_predicts_under_the_command_that_acted(delay):
-    """No point is ever visible: the declared delay follows the true velocity exactly, any other does not.
-
-    After a step of thrust and roll the wrong command is in force for as many ticks as the delay is off by.
-    """
-    us = [Command.hover()] * 6 + [Command(jnp.array(13.0), jnp.array([1.5, 0.0, 0.0]))] * 6
-    never = keypoints(dropout=1.0)
-    found = {d: blind(replaced(never, delay_ticks=d), us, delay) for d in {max(delay - 1, 0), delay, min(delay + 1, 3)}}
-    assert found[delay].max() < 1e-9
-    for declared, errors in found.items():
-        assert errors[:6].max() < 1e-9  # in hover every delay is the same
-        if declared != delay:
-            assert errors[-1] > 0.05
-
-
-def test_a_wrong_delay_shows_even_while_points_are_seen():
-    """With points in sight the filter is corrected, and still follows a step of commands less well."""
-    us = [Command.hover()] * 6 + [Command(jnp.array(14.0), jnp.zeros(3)), Command(jnp.array(6.0), jnp.zeros(3))] * 5
-    right, wrong = (blind(keypoints(delay_ticks=d), us, delay=1).max() for d in (1, 0))
-    assert right < 1e-3
-    assert wrong > 20.0 * right
-
-
-def test_occluded_hides_what_is_outside_the_image(plain):
-    """The observation of flight, made from that of training: only its flags, its dropout and hidden points differ."""
-    training = keypoints(occlusion=False)
-    flown = training.occluded(0.0)
-    assert (training.occlusion, flown.occlusion) == (False, True)
-    aside = State(jnp.array([0.9, 0.0, 1.0]), jnp.eye(3), jnp.zeros(3))
-    true, visible = (np.asarray(a) for a in plain.pixels(aside))
-    outside = (np.abs(true) > 1.0).any(axis=1)
-    assert outside.any()
-    np.testing.assert_array_equal(visible, ~outside)
-    all_shown, shown = (watched(o, aside, [Command.hover()])[0][0, :14].reshape(7, 2) for o in (training, flown))
-    np.testing.assert_allclose(all_shown, true, atol=1e-12)
-    np.testing.assert_allclose(shown[~outside], true[~outside], atol=1e-12)
-    assert (np.abs(shown - true).max(axis=1)[outside] > 1e-6).all()
-    half = training.occluded(0.5)
-    flags = np.concatenate([watched(half, State(near().p, near().R, 0.01 * k * jnp.ones(3)), gentle(random.key(k), 10))
-                            [0][:, 70:77] for k in range(4)])  # fmt: skip
-    assert 0.3 < flags.mean() < 0.7
 
 
 @pytest.mark.parametrize(("dt", "depth", "stride"), [(0.02, 13, 3), (0.01, 25, 6), (0.06, 5, 1)])
@@ -287,12 +198,9 @@ def test_frames_are_60_ms_apart_at_every_rate(dt, depth, stride):
         np.testing.assert_allclose(shown, np.reshape(observation.pixels(then)[0], 14), atol=1e-12)
 
 
-def test_impossible_rates_and_delays():
+def test_impossible_rates():
     with pytest.raises(ValueError, match=r"dt = 0\.05 s must divide the frame time"):
         keypoints(dt=0.05)
-    for delay in (-1, 4):
-        with pytest.raises(ValueError, match=rf"delay_ticks = {delay} must be 0 to 3"):
-            keypoints(delay_ticks=delay)
 
 
 # ---- learning, and flying
@@ -316,10 +224,11 @@ def test_learns_to_see(white, key):
         assert float(jnp.abs(after.weight - before.weight).max()) > 0.01
 
 
-@pytest.mark.parametrize("occlusion", [True, False])
-def test_simulation_and_flight_see_the_same(occlusion, white, key):
+@pytest.mark.parametrize("occluded", [True, False])
+def test_simulation_and_flight_see_the_same(occluded, white, key):
     """Noise and lost points included: the pilot, given the states of a roll-out, issues its very commands."""
-    seen = replaced(white, occlusion=occlusion, noise=jnp.array(1.0), dropout=jnp.array(0.1))
+    seen = replaced(white, noise=jnp.array(1.0))
+    seen = OccludedKeypoints(seen, jnp.array(0.1)) if occluded else seen
     task = Hover(jnp.array(GOAL), seen, jnp.array(5.0), jnp.array(0.3), 0.02, 12)
     policy = Policy.of(seen.size, small(), key=key, hidden=(8,))
     policy = jax.tree.map(lambda leaf: leaf + 0.02, policy)
@@ -332,22 +241,3 @@ def test_simulation_and_flight_see_the_same(occlusion, white, key):
         u = pilot.act(Measurement(k * 0.02, x))
         np.testing.assert_allclose(u.vector(), Command(simulated.u.c[k], simulated.u.omega[k]).vector(), rtol=1e-7)
     assert np.ptp(np.asarray(simulated.u.c)) > 1e-3
-
-
-@pytest.mark.parametrize("d", [(0.0, 0.0, 0.0), (1.0, -0.5, 1.5)])
-def test_in_a_frame_the_camera_sees_level_ground(d):
-    """A camera in the world, with a pose estimate that is right, shows what one in the frame would: in all frames."""
-    frame, before = FeltFrame.of(jnp.array(d)), near()
-    x = step(before, Command.hover())
-    inside = keypoints(occlusion=False).in_frame(frame)
-    goal, _ = inside.pixels(frame.state(State(jnp.array(GOAL), frame.Q.T, jnp.zeros(3))))
-    np.testing.assert_allclose(goal, PUBLISHED, atol=6e-4)  # at rest, level in the frame
-    hovering = frame.command(Command.hover())
-    expected, _ = see(inside, begin(inside, frame.state(before)), frame.state(x), hovering)
-    hidden = keypoints(occlusion=True)
-    memory = begin(hidden, before)
-    memory = memory._replace(pose=replaced(memory.pose, x=before, P=1e-12 * jnp.eye(9)))
-    found, after = see(hidden.in_frame(frame), memory, frame.state(x), hovering)
-    np.testing.assert_allclose(found[:70], expected[:70], atol=1e-5)
-    np.testing.assert_allclose(found[77:], expected[77:], atol=1e-9)  # commands, as the policy gave them
-    np.testing.assert_allclose(after.pose.x.p, x.p, atol=1e-5)  # the filter is in the world

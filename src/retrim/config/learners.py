@@ -1,18 +1,16 @@
 """The learner of a preset, and the frame that its policy is flown in."""
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from ..adapt.learner import OnlineLearner
 from ..adapt.optimisers import CarriedAdam, FreshAdam
 from ..adapt.starts import FlownStarts, TaskStarts
 from ..adapt.views import AbstractView, GravityView, RestView, WorldView
-from ..control.controller import AbstractController
-from ..control.gravity_frame import AtRest, GravityFrame, RestFrame
+from ..control.controller import AbstractController, PolicyController
+from ..control.gravity_frame import GravityFrame, SeenFrame
 from ..errors import ConfigError, FrameError
 from ..estimation.disturbance_observer import DisturbanceObserver
 from ..learn.env import Env
@@ -20,6 +18,7 @@ from ..learn.residuals.model import ResidualModel
 from ..physics.dynamics import PointMass, Residual
 from ..physics.felt_frame import FeltFrame
 from ..tasks.keypoints import Keypoints
+from ..tasks.occluded import OccludedKeypoints
 from ..tasks.task import AbstractTask
 from .presets import Preset
 
@@ -41,7 +40,7 @@ def make_learner(preset: Preset, model: ResidualModel, env: Env) -> OnlineLearne
     """
     a = preset.adapt
     if a.frame != "world":
-        check_frame(preset, env.task, observer=a.frame == "gravity")
+        check_frame(preset, env.task)
     adam = CarriedAdam if a.optimiser == "carried" else FreshAdam
     return OnlineLearner(
         env,
@@ -51,52 +50,49 @@ def make_learner(preset: Preset, model: ResidualModel, env: Env) -> OnlineLearne
         num_updates=a.num_updates,
         num_envs=a.num_envs,
         starts=TaskStarts() if a.task_starts is None else FlownStarts(jnp.array(a.start_noise), a.task_starts),
-        view=VIEWS[a.frame](),
+        view=_view(preset, env.task),
     )
 
 
-VIEWS: dict[str, Callable[[], AbstractView]] = {
-    "world": WorldView,
-    "gravity": lambda: GravityView(jnp.array(TILT_LIMIT)),
-    "rest": lambda: RestView(jnp.array(TILT_LIMIT)),
-}
+def _view(preset: Preset, task: AbstractTask) -> AbstractView:
+    if preset.adapt.frame == "world":
+        return WorldView()
+    limit = jnp.array(TILT_LIMIT)  # frames of a picture's memory are of one gravity
+    return RestView(limit) if isinstance(task.observation, Keypoints) else GravityView(limit)
 
 
-def check_frame(preset: Preset, task: AbstractTask, *, observer: bool = True) -> None:
-    """Refuse a frame for a task that cannot be turned, and an observer for a policy that sees no state.
+def check_frame(preset: Preset, task: AbstractTask) -> None:
+    """Refuse the frame of felt gravity for a task that cannot be turned, and where nothing feels it.
 
     Raises:
         ConfigError: It names the task, and what cannot be turned.
     """
-    if observer and isinstance(task.observation, Keypoints):
+    seen = task.observation_in_flight
+    if isinstance(seen, Keypoints):
         raise ConfigError(
-            f"task {preset.task!r} has no frame for a disturbance observer: it sees the state at every tick, which a "
-            "policy that sees keypoints is not shown"
+            f"preset {preset.name!r} has no frame of felt gravity: a policy that sees keypoints feels it by its pose "
+            "filter, which [vision] occlusion = true has"
         )
     try:
         task.in_frame(FeltFrame.of(jnp.zeros(3)))
     except FrameError as error:
-        raise ConfigError(f"task {preset.task!r} has no frame for a disturbance observer: {error}") from error
+        raise ConfigError(f"task {preset.task!r} has no frame of felt gravity: {error}") from error
 
 
-def gravity_frame(controller: AbstractController[Any], preset: Preset, known: Residual | None = None) -> GravityFrame:
-    """Return a controller, flown in the gravity that a disturbance observer feels.
+def felt_frame(
+    controller: AbstractController[Any], preset: Preset, known: Residual | None = None
+) -> GravityFrame | SeenFrame:
+    """Return a controller, flown in the gravity that is felt: by a disturbance observer, or by its own pose filter.
 
     Args:
         controller: It can be turned.
         preset: Its control period and declared delay are those of the observer.
-        known: What is known of the residual; the observer sees the rest.
+        known: What is known of the residual; the observer sees the rest. A pose filter sees it all.
     """
+    limit = jnp.array(TILT_LIMIT)
+    if isinstance(controller, PolicyController) and isinstance(controller.observation, OccludedKeypoints):
+        return SeenFrame(controller, limit)
     observer = DisturbanceObserver(
-        PointMass(preset.dt),
-        jnp.array(OBSERVER_TAU),
-        jnp.array(TILT_LIMIT),
-        jnp.array(WANDER),
-        delay_ticks=preset.plant_delay_ticks,
+        PointMass(preset.dt), jnp.array(OBSERVER_TAU), limit, jnp.array(WANDER), delay_ticks=preset.plant_delay_ticks
     )
     return GravityFrame(controller, observer, known)
-
-
-def rest_frame(controller: AbstractController[Any], known: Residual, home: Float[Array, "3"]) -> RestFrame:
-    """Return a controller, flown in the gravity that ``known`` predicts at rest at ``home``, world [m]."""
-    return RestFrame(controller, AtRest(known, home, jnp.array(TILT_LIMIT)))

@@ -68,6 +68,16 @@ TRACK_FAST = dataclasses.replace(
     track=dataclasses.replace(FELT, reference="circle=8+figure8=8+circle=4+figure8=4+star=1.5"),
 )
 
+OCCLUDED = dataclasses.replace(
+    VISION,
+    name="vision/occluded",
+    vision=Vision(occlusion=True, pixel_noise=1.0, dropout=0.05, whiten_pixels=True, encoder_steps=3000),
+)
+
+VISION_RETRIM = dataclasses.replace(
+    OCCLUDED, name="vision/retrim", reward="view", actuator_tau=0.033, adapt=RETRIM.adapt
+)
+
 PRESETS: dict[str, Preset] = {
     # Ours: the frame of the gravity that is felt answers in a second, short bursts of learning take what it leaves.
     "hover/retrim": RETRIM,
@@ -101,11 +111,9 @@ PRESETS: dict[str, Preset] = {
     # Seven points on the ground, five frames, three commands, no state; every point is observed, as in the paper.
     "vision/ideal": VISION,
     # The same, but points outside the image are not observed; pixels are noisy and some points are missed.
-    "vision/occluded": dataclasses.replace(
-        VISION,
-        name="vision/occluded",
-        vision=Vision(occlusion=True, pixel_noise=1.0, dropout=0.05, whiten_pixels=True, encoder_steps=3000),
-    ),
+    "vision/occluded": OCCLUDED,
+    # The same in the frame of the gravity that its pose filter feels, with short bursts of learning.
+    "vision/retrim": VISION_RETRIM,
     # The paper's sizes: raw pixels, 500 x 300, updates of 50 steps x 30 environments.
     "vision/paper": Preset(
         name="vision/paper",

@@ -79,9 +79,9 @@ class Adapt:
     """Starts of a step that the task draws; the others lie where the vehicle has just been. By default all of them."""
     start_noise: float = Field(default=0.1, ge=0, le=10.0, strict=True)
     """Standard deviation that is added to flown starts, position [m] and velocity [m/s]."""
-    frame: Literal["world", "gravity", "rest"] = "world"
-    """gravity: fly and train in the frame of the gravity that a disturbance observer feels, and the residual predicts;
-    rest: in that of the gravity that the last fitted residual predicts at rest, which needs no state in between."""
+    frame: Literal["world", "gravity"] = "world"
+    """gravity: fly and train in the frame of the gravity that is felt. A disturbance observer feels it, beside what the
+    residual predicts; for a policy that sees occluded keypoints, the pose filter does, which needs no state."""
     fit_latency: Seconds = 0.2
     """Flight time until a fitted residual is used [s]."""
     update_latency: Seconds = 1.0
@@ -128,8 +128,9 @@ class Preset:
     name: str = "hover/paper"
     task: str = "hover"
     """hover, track, vision, or module:name."""
-    reward: Literal["paper", "l2", "sharp"] = "paper"
-    """paper: as printed; l2: ours, with a tip at the goal in hover; sharp: l2 with a tip at the reference, too."""
+    reward: Literal["paper", "l2", "sharp", "view"] = "paper"
+    """paper: as printed; l2: ours, with a tip at the goal in hover; sharp: l2 with a tip at the reference, too;
+    view: l2 that keeps keypoints in the image."""
     vehicle: str | VehicleSpec = "small"
     """Vehicle of training: small, large, kingfisher, module:name, or a vehicle file."""
     dt: float = Field(default=0.02, ge=0.002, le=0.1, strict=True)
@@ -159,8 +160,9 @@ class Preset:
         for name in ("track", "vision"):
             if getattr(self, name) is not None and self.task != name:
                 raise ValueError(f"a table [{name}] needs task = {name!r}, not {self.task!r}")
-        if self.reward == "sharp" and self.task != "track":
-            raise ValueError(f"reward = 'sharp' is for task = 'track', not for {self.task!r}")
+        for reward, task in (("sharp", "track"), ("view", "vision")):
+            if self.reward == reward and self.task != task:
+                raise ValueError(f"reward = {reward!r} is for task = {task!r}, not for {self.task!r}")
         if self.options and self.task in BUILT_IN_TASKS:
             raise ValueError(f"a table [options] is for a task of one's own, not for {self.task!r}")
         if abs(1000 * self.dt - round(1000 * self.dt)) > 1e-6:

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Key
 from ..adapt.learner import LearnerState, OnlineLearner
 from ..adapt.workers import PolicyWorker, ResidualWorker
 from ..control.controller import AbstractController, PolicyController
-from ..control.gravity_frame import GravityFrame
+from ..control.gravity_frame import GravityFrame, SeenFrame
 from ..control.lora import LoraPolicy
 from ..control.policy import Policy
 from ..errors import ConfigError
@@ -35,7 +35,7 @@ from ..tasks.hover import TILT, Hover
 from ..tasks.keypoints import Keypoints
 from ..tasks.reference import Reference
 from ..tasks.task import AbstractTask
-from .learners import check_frame, gravity_frame, make_learner, rest_frame
+from .learners import check_frame, felt_frame, make_learner
 from .presets import Preset
 from .presets import Track as TrackTable
 from .residuals import ResidualRequest, make_residual
@@ -184,18 +184,16 @@ class Setup:
         if self.preset.adapt.frame == "world":
             return plain
         known = FittedResidual(self.learner.residual_model, state.residual)
-        if self.preset.adapt.frame == "rest":
-            return rest_frame(plain, known, self.flown.home())
-        return gravity_frame(plain, self.preset, known)
+        return felt_frame(plain, self.preset, known)
 
-    def in_gravity_frame(self, controller: AbstractController[Any]) -> GravityFrame:
-        """Return a controller flown in the gravity that a disturbance observer feels.
+    def in_gravity_frame(self, controller: AbstractController[Any]) -> GravityFrame | SeenFrame:
+        """Return a controller flown in the gravity that is felt, by a disturbance observer or by its pose filter.
 
         Raises:
-            ConfigError: The task cannot be turned, or its policy does not see its state.
+            ConfigError: The task cannot be turned, or nothing feels gravity.
         """
         check_frame(self.preset, self.env.task)
-        return gravity_frame(controller, self.preset)
+        return felt_frame(controller, self.preset)
 
     def low_rank(self, policy: Policy | LoraPolicy, key: Key[Array, ""]) -> LoraPolicy:
         """Return ``policy`` with a fresh low-rank delta (ranks 4, 10, 1 and scale 4, as in the paper).

@@ -14,9 +14,10 @@ import numpy as np
 from ..errors import ConfigError
 from ..physics.felt_frame import FeltFrame
 from ..physics.vehicle import Vehicle
-from ..tasks.hover import Hover, L2Hover
+from ..tasks.hover import AbstractHover, Hover, L2Hover
 from ..tasks.keypoints import Keypoints
 from ..tasks.observation import AbstractObservation, StateObs
+from ..tasks.occluded import OccludedKeypoints
 from ..tasks.preview import Preview
 from ..tasks.reference import Reference, joined
 from ..tasks.shapes import AT_SPEED, FASTEST
@@ -25,6 +26,7 @@ from ..tasks.task import AbstractTask
 from ..tasks.track import AbstractTrack, L2Track, SharpTrack
 from ..tasks.track import Track as PaperTrack
 from ..tasks.trajectory_csv import from_csv
+from ..tasks.view import ViewHover
 from .presets import Preset
 from .presets import Track as TrackTable
 from .presets import Vision as VisionTable
@@ -41,6 +43,7 @@ FELT_SEED = 0
 """Of the pushes under which references are felt in training; the same for every seed of a policy."""
 
 LEAD = 0.04  # [s]: about as late as commands act, behind a delay and motors
+VISION_REWARDS: dict[str, type[AbstractHover]] = {"paper": Hover, "l2": L2Hover, "view": ViewHover}
 TRACKS: dict[str, type[AbstractTrack]] = {"paper": PaperTrack, "l2": L2Track, "sharp": SharpTrack}
 
 LAPS = {"": None, "laps": True, "once": False}
@@ -188,18 +191,14 @@ def _hover(request: TaskRequest) -> AbstractTask:
 
 def _vision(request: TaskRequest) -> AbstractTask:
     p, table = request.preset, request.preset.vision or VisionTable()
+    omega_max = request.vehicle.omega_max
     training = Keypoints.of(
-        jnp.array(p.goal),
-        request.vehicle.omega_max,
-        occlusion=False,
-        noise=table.pixel_noise,
-        whitened=table.whiten_pixels,
-        dt=p.dt,
-        delay_ticks=p.plant_delay_ticks,
+        jnp.array(p.goal), omega_max, noise=table.pixel_noise, whitened=table.whiten_pixels, dt=p.dt
     )
-    # Occluded points are predicted by a pose filter so well that training need not know of it.
-    flown = training.occluded(table.dropout) if table.occlusion else None
-    kind = L2Hover if p.reward == "l2" else Hover
+    # A filter estimates the pose so well that training need not know of it.
+    lag = None if p.actuator_tau is None else jnp.array(p.actuator_tau)
+    flown = OccludedKeypoints(training, jnp.array(table.dropout), lag, delay_ticks=p.plant_delay_ticks)
+    kind = VISION_REWARDS[p.reward]
     return kind(
         jnp.array(p.goal),
         training,
@@ -207,7 +206,7 @@ def _vision(request: TaskRequest) -> AbstractTask:
         jnp.array(p.pretrain.max_start_yaw),
         p.dt,
         p.pretrain.horizon,
-        flown,
+        flown if table.occlusion else None,
     )
 
 
@@ -231,5 +230,5 @@ def _track(request: TaskRequest) -> AbstractTask:
 
 
 register_task("hover", TaskEntry(_hover, "hover/retrim"))
-register_task("vision", TaskEntry(_vision, "vision/ideal"))
+register_task("vision", TaskEntry(_vision, "vision/retrim"))
 register_task("track", TaskEntry(_track, "track/retrim", has_reference=True))

@@ -16,7 +16,8 @@ from ..estimation.disturbance_observer import DisturbanceObserver, ObserverState
 from ..physics.dynamics import Hybrid, Residual
 from ..physics.felt_frame import FeltFrame
 from ..physics.state import Command, State
-from .controller import AbstractController
+from ..tasks.occluded import OccludedMemory
+from .controller import AbstractController, PolicyController
 
 
 class GravityFrameState(eqx.Module):
@@ -62,28 +63,30 @@ class GravityFrame(AbstractController[GravityFrameState]):
         return GravityFrameState(observer, self.inner.accepted(memory.inner, memory.frame.command(u)), memory.frame)
 
 
-class RestFrame(AbstractController[Any]):
-    """Any controller that can be turned, in the gravity that has been learnt: no state is needed between two fits."""
+class SeenFrame(AbstractController[tuple[OccludedMemory, Command]]):
+    """A policy behind :class:`OccludedKeypoints`, in the gravity that its pose filter estimates; it needs no state."""
 
-    inner: AbstractController[Any]
-    felt: "AtRest"
+    inner: PolicyController
+    limit: Float[Array, ""]
+    """Largest norm of the disturbance that turns the frame [m/s^2]."""
 
-    def init(self, x: State) -> Any:
+    def init(self, x: State) -> tuple[OccludedMemory, Command]:
         """Return the memory at the start of a flight."""
         return self.inner.init(x)
 
-    def __call__(self, memory: Any, t: Float[Array, ""], x: State) -> tuple[Command, Any]:
-        """Return the inner controller's command in the frame."""
-        frame = self._frame()
-        u, memory = self.inner.in_frame(frame)(memory, t, frame.state(x))
-        return frame.world_command(u), memory
+    def __call__(
+        self, memory: tuple[OccludedMemory, Command], t: Float[Array, ""], x: State
+    ) -> tuple[Command, tuple[OccludedMemory, Command]]:
+        """Return the inner controller's command in the frame of what was felt a tick ago."""
+        seen, last = memory
+        frame = FeltFrame.of(capped(seen.pose.d, self.limit))
+        u, (seen, _) = self.inner.in_frame(frame)((seen, frame.command(last)), t, frame.state(x))
+        u = frame.world_command(u)
+        return u, (seen, u)
 
-    def accepted(self, memory: Any, u: Command) -> Any:
-        """Pass the accepted command on, as the frame has it."""
-        return self.inner.accepted(memory, self._frame().command(u))
-
-    def _frame(self) -> FeltFrame:
-        return FeltFrame.of(self.felt.d)
+    def accepted(self, memory: tuple[OccludedMemory, Command], u: Command) -> tuple[OccludedMemory, Command]:
+        """Remember the accepted command."""
+        return memory[0], u
 
 
 class AtRest(eqx.Module):

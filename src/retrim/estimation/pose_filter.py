@@ -1,7 +1,7 @@
-"""Error-state extended Kalman filter of the camera's pose, used to predict occluded keypoints.
+"""Error-state extended Kalman filter of the camera's pose, and of the disturbance that is felt there.
 
 The filter knows the ground pattern, the commands and Eq. (1) of the paper; it never sees the state. While no point is
-visible it predicts; one visible point already corrects it.
+visible it predicts; one visible point already corrects it. What Eq. (1) misses, it takes for a slow acceleration.
 """
 
 import equinox as eqx
@@ -15,37 +15,61 @@ from ..physics.state import Command, State
 from .camera import Camera, in_camera
 
 START = (0.1, 0.05, 0.2)  # uncertainty of the pose at hand-over: m, rad, m/s
-DRIFT = (0.0, 0.5, 3.0)  # what Eq. (1) misses: rates [rad/s] and acceleration [m/s^2], held over a tick
+PUSH = 1.0  # [m/s^2]: uncertainty of the disturbance at hand-over
+DRIFT = (0.0, 0.5, 1.0)  # what Eq. (1) misses beside it: rates [rad/s] and acceleration [m/s^2], held over a tick
+WANDER = 1.0  # [m/s^2] in a second: the random walk of the disturbance
+ITERATIONS = 3  # a first look may be far off: the projection is linearised anew where the last one ended
 GATE = 4.0  # a point farther off than so many standard deviations corrects no more than one there
 
 
 class PoseFilter(eqx.Module):
-    """Estimated state, and the covariance of its error: position (world), attitude (body), velocity (world)."""
+    """Estimate, and covariance of its error: position (world), attitude (body), velocity and disturbance (world)."""
 
     x: State
-    P: Float[Array, "9 9"]
+    d: Float[Array, "3"]
+    """Disturbance, world [m/s^2]."""
+    P: Float[Array, "12 12"]
+    acting: Command
+    """Command at the actuators."""
 
     @classmethod
     def near(cls, x: State, key: Key[Array, ""]) -> "PoseFilter":
         """Return a filter initialised near ``x``, to 10 cm, 3 degrees and 0.2 m/s; the key is consumed."""
         std = jnp.repeat(jnp.array(START, dtype=x.p.dtype), 3)
         off = std * jax.random.normal(key, (9,), x.p.dtype)
-        return cls(_moved(x, off), jnp.diag(std**2))
+        push = jnp.full(3, PUSH, dtype=x.p.dtype)
+        return cls(
+            _moved(x, off), jnp.zeros_like(x.p), jnp.diag(jnp.concatenate([std, push]) ** 2), Command.hover(x.p.dtype)
+        )
 
-    def predicted(self, u: Command, dt: float) -> "PoseFilter":
-        """Return the filter ``dt`` seconds later; ``u`` is the command that acted during that time."""
-        x, zero = self.x, jnp.zeros((3, 3), dtype=self.P.dtype)
-        eye = jnp.eye(3, dtype=self.P.dtype)
-        lean = -dt * u.c * x.R @ so3.hat(jnp.array([0.0, 0.0, 1.0], dtype=self.P.dtype))
-        F = jnp.concatenate(
+    def predicted(self, u: Command, dt: float, tau: Float[Array, ""] | None = None) -> "PoseFilter":
+        """Return the filter ``dt`` seconds later.
+
+        Args:
+            u: Command that reached the actuators during that time.
+            dt: [s]
+            tau: Time constant of the actuators [s]; None for none.
+        """
+        x, dtype, end = self.x, self.P.dtype, u
+        if tau is not None:
+            decay = jnp.exp(-dt / tau)
+            left = tau / dt * (1.0 - decay)
+            end = jax.tree.map(lambda old, new: new + decay * (old - new), self.acting, u)
+            u = jax.tree.map(lambda old, new: new + left * (old - new), self.acting, u)
+        zero, eye = jnp.zeros((3, 3), dtype=dtype), jnp.eye(3, dtype=dtype)
+        lean = -dt * u.c * x.R @ so3.hat(jnp.array([0.0, 0.0, 1.0], dtype=dtype))
+        F = jnp.block(
             [
-                jnp.concatenate([eye, zero, dt * eye], axis=1),
-                jnp.concatenate([zero, so3.exp(-dt * u.omega), zero], axis=1),
-                jnp.concatenate([zero, lean, eye], axis=1),
+                [eye, zero, dt * eye, zero],
+                [zero, so3.exp(-dt * u.omega), zero, zero],
+                [zero, lean, eye, dt * eye],
+                [zero, zero, zero, eye],
             ]
         )
-        drift = dt * jnp.repeat(jnp.array(DRIFT, dtype=self.P.dtype), 3)
-        return PoseFilter(PointMass(dt).step(x, u, jnp.zeros_like(x.p)), F @ self.P @ F.T + jnp.diag(drift**2))
+        drift = dt * jnp.repeat(jnp.array(DRIFT, dtype=dtype), 3)
+        walk = jnp.full(3, dt**0.5 * WANDER, dtype=dtype)
+        Q = jnp.diag(jnp.concatenate([drift, walk]) ** 2)
+        return PoseFilter(PointMass(dt).step(x, u, self.d), self.d, F @ self.P @ F.T + Q, end)
 
     def corrected(
         self,
@@ -65,24 +89,26 @@ class PoseFilter(eqx.Module):
             noise: Their standard deviation per axis (normalised).
         """
 
-        def expected(off: Float[Array, "9"]) -> Float[Array, "14"]:
+        def expected(off: Float[Array, "12"]) -> Float[Array, "14"]:
             here = in_camera(_moved(self.x, off), ground)
             return jax.vmap(lambda P: camera.project(P).pixel)(here).reshape(14)
 
-        zero = jnp.zeros(9, dtype=self.P.dtype)
-        H, z = jax.jacfwd(expected)(zero), (pixels.reshape(14) - expected(zero))
-        seen = jnp.repeat(visible, 2).astype(z.dtype)
+        seen = jnp.repeat(visible, 2).astype(pixels.dtype)
         r = jnp.tile(noise**2, 7)
-        off, P = zero, self.P
-        for i in range(14):  # scalar updates need no matrix inverse
-            Ph = P @ H[i]
-            s = H[i] @ Ph + r[i]
-            miss = z[i] - H[i] @ off
-            miss = jnp.clip(miss, -GATE * jnp.sqrt(s), GATE * jnp.sqrt(s))
-            gain = seen[i] * Ph / s
-            off, P = off + gain * miss, P - jnp.outer(gain, Ph)
-        return PoseFilter(_moved(self.x, off), 0.5 * (P + P.T))
+        off = jnp.zeros(12, dtype=self.P.dtype)
+        for _ in range(ITERATIONS):
+            H = jax.jacfwd(expected)(off)
+            level = pixels.reshape(14) - expected(off) + H @ off
+            off, P = jnp.zeros_like(off), self.P
+            for i in range(14):  # scalar updates need no matrix inverse
+                Ph = P @ H[i]
+                s = H[i] @ Ph + r[i]
+                miss = level[i] - H[i] @ off
+                miss = jnp.clip(miss, -GATE * jnp.sqrt(s), GATE * jnp.sqrt(s))
+                gain = seen[i] * Ph / s
+                off, P = off + gain * miss, P - jnp.outer(gain, Ph)
+        return PoseFilter(_moved(self.x, off), self.d + off[9:], 0.5 * (P + P.T), self.acting)
 
 
-def _moved(x: State, off: Float[Array, "9"]) -> State:
-    return State(x.p + off[:3], x.R @ so3.exp(off[3:6]), x.v + off[6:])
+def _moved(x: State, off: Float[Array, " n"]) -> State:
+    return State(x.p + off[:3], x.R @ so3.exp(off[3:6]), x.v + off[6:9])

@@ -43,8 +43,7 @@ def pretrain_encoder(
 
     def sample(key: Key[Array, ""]) -> tuple[Float[Array, " o"], Float[Array, "15"]]:
         x, omega = random_motion(key, observation.goal)
-        frames = observation.history(x, omega)
-        features = observation.features(frames)
+        features = observation.features(observation.stacked(observation.history(x, omega)))
         _, visible = observation.pixels(x)
         still = jnp.zeros(observation.size - features.shape[0] - 7, dtype=x.p.dtype)
         state = jnp.concatenate([(x.p - observation.goal) / POSITION_SCALE, x.R.reshape(9), x.v / VELOCITY_SCALE])

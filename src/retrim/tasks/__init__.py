@@ -6,6 +6,7 @@ from .hover import L2Hover as L2Hover
 from .keypoints import Keypoints as Keypoints
 from .observation import AbstractObservation as AbstractObservation
 from .observation import StateObs as StateObs
+from .occluded import OccludedKeypoints as OccludedKeypoints
 from .preview import Preview as Preview
 from .reference import AbstractReference as AbstractReference
 from .reference import Reference as Reference

@@ -1,7 +1,7 @@
 """Observation from a camera: pixels of seven keypoints on the ground in five frames, and the last commands."""
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -10,7 +10,6 @@ from jax import lax, random
 from jaxtyping import Array, Bool, Float, Key
 
 from ..estimation.camera import Camera, in_camera
-from ..estimation.pose_filter import PoseFilter
 from ..physics import so3
 from ..physics.felt_frame import FeltFrame
 from ..physics.state import STANDARD_GRAVITY, Command, State
@@ -31,18 +30,14 @@ class KeypointMemory(NamedTuple):
     frames: Float[Array, "depth 14"]
     """Newest last."""
     commands: Float[Array, "3 4"]
-    pose: PoseFilter
-    """Estimated pose, to predict occluded keypoints."""
-    poses: State
-    """Estimated poses of the frames."""
     key: Key[Array, ""]
 
 
 class Keypoints(AbstractObservation[KeypointMemory]):
     """o = [whitened pixels of five frames, which points are visible now, the last three commands]: 89 numbers.
 
-    Without ``occlusion`` every point is observed, wherever it is, as in the paper's code. With it, a point outside the
-    image is not observed; it is predicted by :class:`retrim.estimation.PoseFilter` from visible points and commands.
+    Every point is observed, wherever it is, as in the paper's code; :class:`retrim.tasks.OccludedKeypoints` is what a
+    camera can see of it.
 
     ``noise`` is the standard deviation of a pixel coordinate [px]. It is drawn from a key that follows from the start,
     so that roll-outs repeat.
@@ -52,23 +47,14 @@ class Keypoints(AbstractObservation[KeypointMemory]):
     goal: Float[Array, "3"]
     omega_max: Float[Array, "3"]
     noise: Float[Array, ""]
-    dropout: Float[Array, ""]
-    """Probability that a visible point is missed in a frame."""
     mean: Float[Array, "70"]
     whiten: Float[Array, "70 70"]
-    occlusion: bool = eqx.field(static=True, default=True)
     dt: float = eqx.field(static=True, default=0.02)
-    delay_ticks: int = eqx.field(static=True, default=0)
-    """Declared command delay of the plant [ticks]: the filter predicts under the command that acted."""
-    frame: FeltFrame | None = None
-    """With occlusion: what is observed is what a camera would show in this frame; ``goal`` stays in the world."""
 
     def __check_init__(self) -> None:
-        """Raise ``ValueError`` if frames are no whole number of ticks apart, or the delay outlasts the memory."""
+        """Raise ``ValueError`` if frames are no whole number of ticks apart."""
         if abs(FRAME_TIME / self.dt - round(FRAME_TIME / self.dt)) > 1e-6:
             raise ValueError(f"Keypoints: dt = {self.dt} s must divide the frame time, {FRAME_TIME} s")
-        if not 0 <= self.delay_ticks <= COMMANDS:
-            raise ValueError(f"Keypoints: delay_ticks = {self.delay_ticks} must be 0 to {COMMANDS}")
 
     @property
     def stride(self) -> int:
@@ -86,18 +72,12 @@ class Keypoints(AbstractObservation[KeypointMemory]):
         goal: Float[Array, "3"],
         omega_max: Float[Array, "3"],
         *,
-        occlusion: bool = True,
         noise: float = 0.0,
-        dropout: float = 0.0,
         whitened: bool = True,
         dt: float = 0.02,
-        delay_ticks: int = 0,
     ) -> "Keypoints":
         """Build the observation, by default with pixels whitened over random short motions (always the same ones)."""
-        plain = cls(
-            Camera.published(), goal, omega_max, jnp.array(noise), jnp.array(dropout),
-            jnp.zeros(70), jnp.eye(70), occlusion, dt, delay_ticks,
-        )  # fmt: skip
+        plain = cls(Camera.published(), goal, omega_max, jnp.array(noise), jnp.zeros(70), jnp.eye(70), dt)
         if not whitened:
             return plain
         key = random.key(0)
@@ -115,17 +95,10 @@ class Keypoints(AbstractObservation[KeypointMemory]):
         """Length of the observation: 89."""
         return 14 * FRAMES + 7 + 4 * COMMANDS
 
-    def occluded(self, dropout: float) -> "Keypoints":
-        """Return the same observation with occlusion, where visible points are missed with probability ``dropout``."""
-        return dataclasses.replace(self, occlusion=True, dropout=jnp.array(dropout))
-
     def init(self, x: State) -> KeypointMemory:
         """Return the memory of a vehicle that came in a straight line, without turning, under hover commands."""
-        frames = self.history(x, jnp.zeros_like(x.p))
-        bits = lax.bitcast_convert_type(jnp.sum(x.p + x.v).astype(jnp.float32), jnp.int32)
         commands = jnp.zeros((COMMANDS, 4), dtype=x.p.dtype)
-        key, k_pose = random.split(random.key(bits))
-        return KeypointMemory(frames, commands, PoseFilter.near(x, k_pose), self._past(x), key)
+        return KeypointMemory(self.history(x, jnp.zeros_like(x.p)), commands, random.split(key_of(x))[0])
 
     def history(self, x: State, omega: Float[Array, "3"]) -> Float[Array, "depth 14"]:
         """Return the frames of a motion with constant velocity and body rates that ends in ``x``, oldest first."""
@@ -136,40 +109,17 @@ class Keypoints(AbstractObservation[KeypointMemory]):
 
         return jax.vmap(frame)(ago)
 
-    def _past(self, x: State) -> State:
-        """Return the poses of a motion with constant velocity that ends in ``x``, oldest first; the last one only if
-        nothing is occluded, for none is needed then."""
-        ago = self.dt * jnp.arange(self.depth - 1 if self.occlusion else 0, -1, -1, dtype=x.p.dtype)
-        return jax.vmap(lambda s: State(x.p - s * x.v, x.R, x.v))(ago)
-
     def in_frame(self, frame: FeltFrame) -> "Keypoints":
-        """Return what a camera would show in ``frame``, in which the ground is level.
-
-        Where points are occluded, the picture is moved by what an estimated pose says of it; else by the true one.
-        """
-        if self.occlusion:
-            return dataclasses.replace(self, frame=frame)
+        """Return what a camera would show in ``frame``, in which the ground is level."""
         return dataclasses.replace(self, goal=frame.vector(self.goal))
-
-    def _moved_to(self, frame: FeltFrame, frames: Float[Array, "depth 14"], poses: State) -> Float[Array, "depth 14"]:
-        """Return frames of the world as they would be in ``frame``; those that are not observed stay."""
-        inside = dataclasses.replace(self, goal=frame.vector(self.goal), frame=None)
-
-        def move(pixels: Float[Array, "14"], x: State) -> Float[Array, "14"]:
-            by = inside.pixels(frame.state(x))[0] - self.pixels(x)[0]
-            return jnp.clip(pixels + by.reshape(14), -FAR, FAR)
-
-        at = jnp.arange(self.depth - 1, -1, -self.stride)
-        moved = jax.vmap(move)(frames[at], jax.tree.map(lambda leaf: leaf[at], poses))
-        return frames.at[at].set(moved)
 
     def stacked(self, frames: Float[Array, "depth 14"]) -> Float[Array, "70"]:
         """Return the five frames of the observation, newest first."""
         return frames[:: -self.stride].reshape(-1)
 
-    def features(self, frames: Float[Array, "depth 14"]) -> Float[Array, "70"]:
+    def features(self, stacked: Float[Array, "70"]) -> Float[Array, "70"]:
         """Return whitened frames, clipped where they fit no motion, as when points come into sight."""
-        return jnp.clip(self.whiten @ (self.stacked(frames) - self.mean), -FEATURE_LIMIT, FEATURE_LIMIT)
+        return jnp.clip(self.whiten @ (stacked - self.mean), -FEATURE_LIMIT, FEATURE_LIMIT)
 
     def pixels(self, x: State) -> tuple[Float[Array, "7 2"], Bool[Array, " 7"]]:
         """Return the projections of the points, clipped far outside the image, and which are visible."""
@@ -185,38 +135,30 @@ class Keypoints(AbstractObservation[KeypointMemory]):
         self, memory: KeypointMemory, t: Float[Array, ""], x: State, last: Command
     ) -> tuple[Float[Array, " o"], KeypointMemory]:
         """Return the observation after one more frame."""
-        key, k_noise, k_drop = random.split(memory.key, 3)
-        frame, issued = self.frame, last
-        if frame is not None:  # the camera is in the world
-            x, issued = frame.world_state(x), frame.world_command(last)
+        key, k_noise, _ = random.split(memory.key, 3)  # the third is that of dropout
         true, visible = self.pixels(x)
-        noise = (2.0 * self.noise / self.camera.size)[None] * random.normal(k_noise, (7, 2), true.dtype)
-        shown = true + lax.stop_gradient(noise)
-        pose, poses = memory.pose, memory.poses
-        if self.occlusion:
-            visible = visible & (random.uniform(k_drop, (7,), true.dtype) >= self.dropout)
-            sharpness = 2.0 * jnp.maximum(self.noise, 0.5) / self.camera.size
-            acted = issued
-            if self.delay_ticks > 0:
-                acted = self._command(memory.commands[-self.delay_ticks])
-                acted = acted if frame is None else frame.world_command(acted)
-            pose = lax.stop_gradient(memory.pose).predicted(lax.stop_gradient(acted), self.dt)
-            pose = pose.corrected(self.camera, self.ground(), lax.stop_gradient(shown), visible, sharpness)
-            pose = lax.stop_gradient(pose)
-            filled, _ = self.pixels(pose.x)
-            # The value is the predicted pixel, the gradient that of the true one.
-            shown = jnp.where(visible[:, None], shown, true + lax.stop_gradient(filled - true))
-            poses = jax.tree.map(lambda old, new: jnp.concatenate([old, new[None]])[1:], poses, pose.x)
-        scaled = jnp.concatenate([(last.c / STANDARD_GRAVITY - 1.0)[None], last.omega / self.omega_max])
+        shown = true + lax.stop_gradient(self.deviation(k_noise, true.dtype))
         frames = jnp.concatenate([memory.frames, shown.reshape(1, 14)])[1:]
-        commands = jnp.concatenate([memory.commands, scaled[None]])[1:]
-        features = self.features(frames if frame is None else self._moved_to(frame, frames, poses))
-        o = jnp.concatenate([features, visible.astype(true.dtype), commands.reshape(-1)])
-        return o, KeypointMemory(frames, commands, pose, poses, key)
+        commands = jnp.concatenate([memory.commands, self.scaled(last)[None]])[1:]
+        o = jnp.concatenate([self.features(self.stacked(frames)), visible.astype(true.dtype), commands.reshape(-1)])
+        return o, KeypointMemory(frames, commands, key)
 
-    def _command(self, scaled: Float[Array, "4"]) -> Command:
+    def deviation(self, key: Key[Array, ""], dtype: Any) -> Float[Array, "7 2"]:
+        """Return the noise of a frame, normalised; the key is consumed."""
+        return (2.0 * self.noise / self.camera.size)[None] * random.normal(key, (7, 2), dtype)
+
+    def command(self, scaled: Float[Array, "4"]) -> Command:
         """Return the command that was remembered as ``scaled``."""
         return Command((scaled[0] + 1.0) * STANDARD_GRAVITY, scaled[1:] * self.omega_max)
+
+    def scaled(self, u: Command) -> Float[Array, "4"]:
+        """Return a command in units of gravity, relative to hover, and of the largest rates."""
+        return jnp.concatenate([(u.c / STANDARD_GRAVITY - 1.0)[None], u.omega / self.omega_max])
+
+
+def key_of(x: State) -> Key[Array, ""]:
+    """Return the key of the noise of a flight that starts in ``x``."""
+    return random.key(lax.bitcast_convert_type(jnp.sum(x.p + x.v).astype(jnp.float32), jnp.int32))
 
 
 def random_motion(key: Key[Array, ""], goal: Float[Array, "3"]) -> tuple[State, Float[Array, "3"]]:

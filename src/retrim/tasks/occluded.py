@@ -1,0 +1,119 @@
+"""Observation in flight, from keypoints that a camera can see: some are out of the image, noisy, or missed."""
+
+import dataclasses
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax, random
+from jaxtyping import Array, Float, Key
+
+from ..estimation.pose_filter import PoseFilter
+from ..physics.felt_frame import FeltFrame
+from ..physics.state import Command, State
+from .keypoints import COMMANDS, Keypoints, key_of
+from .observation import AbstractObservation
+
+LEAST_NOISE = 0.5  # [px], that the filter takes a camera to have
+
+
+class OccludedMemory(NamedTuple):
+    """Memory of the observation."""
+
+    commands: Float[Array, "3 4"]
+    """Of the world, newest last."""
+    pose: PoseFilter
+    poses: State
+    """Poses of the last ticks, newest last, as they are known now."""
+    key: Key[Array, ""]
+
+
+class OccludedKeypoints(AbstractObservation[OccludedMemory]):
+    """The observation of :class:`Keypoints`, made of what a camera sees.
+
+    A point outside the image is not observed, and one inside is missed with probability ``dropout``. From the others
+    and the commands a filter estimates the pose; the policy is shown the picture that belongs to that estimate, and
+    what it is shown of the past follows each correction, so that a correction does not look like motion.
+
+    It is for flight: no gradient passes through the filter.
+    """
+
+    full: Keypoints
+    """The observation of training; ``noise`` is that of the camera."""
+    dropout: Float[Array, ""]
+    """Probability that a visible point is missed in a frame."""
+    lag: Float[Array, ""] | None = None
+    """Time constant of the actuators that the filter knows of [s]."""
+    frame: FeltFrame | None = None
+    """The picture is what a camera would show in this frame; the filter and ``full`` stay in the world."""
+    delay_ticks: int = eqx.field(static=True, default=0)
+    """Declared command delay of the plant [ticks]: the filter predicts under the command that acted."""
+
+    def __check_init__(self) -> None:
+        """Raise ``ValueError`` if the delay outlasts the memory."""
+        if not 0 <= self.delay_ticks <= COMMANDS:
+            raise ValueError(f"OccludedKeypoints: delay_ticks = {self.delay_ticks} must be 0 to {COMMANDS}")
+
+    @property
+    def size(self) -> int:
+        """Length of the observation: 89."""
+        return self.full.size
+
+    def in_frame(self, frame: FeltFrame) -> "OccludedKeypoints":
+        """Return what a camera would show in ``frame``, in which the ground is level."""
+        return dataclasses.replace(self, frame=frame)
+
+    def init(self, x: State) -> OccludedMemory:
+        """Return the memory of a vehicle that came in a straight line, without turning, under hover commands."""
+        key, k_pose = random.split(key_of(x))
+        pose = PoseFilter.near(x, k_pose)
+        poses = jax.vmap(lambda s: State(pose.x.p - s * pose.x.v, pose.x.R, pose.x.v))(self._ago(x))
+        return OccludedMemory(jnp.zeros((COMMANDS, 4), dtype=x.p.dtype), pose, poses, key)
+
+    def __call__(
+        self, memory: OccludedMemory, t: Float[Array, ""], x: State, last: Command
+    ) -> tuple[Float[Array, " o"], OccludedMemory]:
+        """Return the observation after one more frame."""
+        full, frame = self.full, self.frame
+        if frame is not None:  # the camera is in the world
+            x, last = frame.world_state(x), frame.world_command(last)
+        x, last, memory = lax.stop_gradient((x, last, memory))
+        acted = last if self.delay_ticks == 0 else full.command(memory.commands[-self.delay_ticks])
+        key, k_noise, k_drop = random.split(memory.key, 3)
+        true, inside = full.pixels(x)
+        seen = inside & (random.uniform(k_drop, (7,), true.dtype) >= self.dropout)
+        sharpness = 2.0 * jnp.maximum(full.noise, LEAST_NOISE) / full.camera.size
+        prior = memory.pose.predicted(acted, full.dt, self.lag)
+        pose = prior.corrected(full.camera, full.ground(), true + full.deviation(k_noise, true.dtype), seen, sharpness)
+        poses = self._corrected(memory.poses, prior.x, pose.x)
+        commands = jnp.concatenate([memory.commands, full.scaled(last)[None]])[1:]
+        o = self._shown(poses, commands)
+        return o, OccludedMemory(commands, pose, poses, key)
+
+    def _shown(self, poses: State, commands: Float[Array, "3 4"]) -> Float[Array, " o"]:
+        """Return the observation of these poses and commands, in the frame."""
+        shown, frame = self.full, self.frame
+        there = jax.tree.map(lambda leaf: leaf[:: -shown.stride], poses)  # newest first
+        if frame is not None:
+            shown = shown.in_frame(frame)
+            there = jax.vmap(frame.state)(there)
+            commands = jax.vmap(lambda row: shown.scaled(frame.command(shown.command(row))))(commands)
+        pixels, visible = jax.vmap(shown.pixels)(there)
+        features = shown.features(pixels.reshape(-1))
+        return jnp.concatenate([features, visible[0].astype(features.dtype), commands.reshape(-1)])
+
+    def _corrected(self, poses: State, prior: State, new: State) -> State:
+        """Return the poses of the past as the correction from ``prior`` to ``new`` moves them, and ``new``."""
+        turn, dp, dv = new.R @ prior.R.T, new.p - prior.p, new.v - prior.v
+
+        def moved(x: State, ago: Float[Array, ""]) -> State:
+            return State(x.p + dp - ago * dv, turn @ x.R, x.v + dv)
+
+        before: State = jax.vmap(moved)(poses, self._ago(new) + self.full.dt)
+        poses = jax.tree.map(lambda old, now: jnp.concatenate([old, now[None]])[1:], before, new)
+        return poses
+
+    def _ago(self, x: State) -> Float[Array, " depth"]:
+        """Return how old the poses of the memory are, newest last [s]."""
+        return self.full.dt * jnp.arange(self.full.depth - 1, -1, -1, dtype=x.p.dtype)

@@ -1,0 +1,203 @@
+"""Keypoints that a camera can see: hidden ones are unknown, and corrections are no motion."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import random
+
+from helpers import GOAL, replaced
+from retrim.physics import Command, PointMass, State, small, so3
+from retrim.physics.felt_frame import FeltFrame
+from retrim.tasks import Keypoints, L2Hover, OccludedKeypoints
+from retrim.tasks.view import ViewHover
+
+SURE = 1e-12 * jnp.eye(12)
+begin = eqx.filter_jit(lambda o, x: o.init(x))
+step = eqx.filter_jit(lambda x, u: PointMass(0.02).step(x, u, jnp.zeros(3)))
+see = eqx.filter_jit(lambda o, memory, x, last: o(memory, jnp.array(0.0), x, last))
+
+
+def full(noise=0.0):
+    return Keypoints.of(jnp.array(GOAL), small().omega_max, whitened=False, noise=noise)
+
+
+def seen(noise=0.0, dropout=0.0, **options):
+    return OccludedKeypoints(full(noise), jnp.array(dropout), **options)
+
+
+def near():
+    """Sees everything for a while."""
+    return State(jnp.array([0.05, -0.1, 1.1]), jnp.eye(3), jnp.array([0.1, 0.2, -0.05]))
+
+
+def aside():
+    """Sees some of the points."""
+    return State(jnp.array([0.9, 0.0, 1.0]), jnp.eye(3), jnp.zeros(3))
+
+
+def sure(observation, x):
+    """The memory of a filter that starts from the truth, so that nothing but its prediction makes an error."""
+    memory = begin(observation, x)
+    ago = 0.02 * jnp.arange(12.0, -1.0, -1.0)
+    poses = jax.vmap(lambda s: State(x.p - s * x.v, x.R, x.v))(ago)
+    return memory._replace(pose=replaced(memory.pose, x=x, P=SURE), poses=poses)
+
+
+def gentle(key, n):
+    return [Command(9.81 + 0.5 * random.normal(k, ()), 0.3 * random.normal(k, (3,))) for k in random.split(key, n)]
+
+
+def test_while_everything_is_seen_it_shows_what_training_shows(key):
+    """All five frames, the flags and the commands, of a vehicle that flies as Eq. (1) has it."""
+    x, last, hidden, plain = near(), Command.hover(), seen(), full()
+    memory, known = begin(plain, x), sure(hidden, x)
+    known = known._replace(poses=jax.tree.map(lambda leaf: jnp.concatenate([leaf[:1], leaf[:-1]]), known.poses))
+    known = known._replace(pose=replaced(known.pose, x=State(x.p - 0.02 * x.v, x.R, x.v)))
+    for u in gentle(key, 14):
+        expected, memory = see(plain, memory, x, last)
+        found, known = see(hidden, known, x, last)
+        x, last = step(x, u), u
+    np.testing.assert_array_equal(found[70:77], 1.0)
+    np.testing.assert_allclose(found, expected, atol=2e-4)
+
+
+def test_only_what_is_in_the_image_is_observed():
+    """The estimate is the filter's, of the points inside; those outside can be anywhere."""
+    hidden, x = seen(), aside()
+    pixels, inside = hidden.full.pixels(x)
+    np.testing.assert_array_equal(inside, ~(np.abs(pixels) > 1.0).any(axis=1))
+    assert 0 < int(inside.sum()) < 7
+    memory = begin(hidden, x)
+    _, after = see(hidden, memory, x, Command.hover())
+    prior = memory.pose.predicted(Command.hover(), 0.02)
+    for stray in (0.0, 0.7):
+        shown = jnp.where(inside[:, None], pixels, pixels + stray)
+        by_hand = prior.corrected(
+            hidden.full.camera, hidden.full.ground(), shown, inside, 1.0 / hidden.full.camera.size
+        )
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-9), after.pose, by_hand)
+
+
+def test_what_is_missed_is_not_observed(key):
+    """Where every point is missed, it does not matter where the vehicle is; where half are, more is in doubt."""
+    never, memory = seen(dropout=1.0), begin(seen(dropout=1.0), near())
+    here, _ = see(never, memory, near(), Command.hover())
+    there, _ = see(never, memory, aside(), Command.hover())
+    np.testing.assert_array_equal(here, there)
+    doubt = {}
+    for dropout in (0.0, 0.5):
+        memory = begin(seen(), near())
+        for _ in range(4):
+            _, memory = see(seen(dropout=dropout), memory, near(), Command.hover())
+        doubt[dropout] = float(jnp.trace(memory.pose.P[:3, :3]))
+    assert doubt[0.5] > 1.1 * doubt[0.0]
+
+
+def test_a_correction_is_no_motion():
+    """A hand-over that is 20 cm and 6 degrees off is mended at the first look: in all five frames."""
+    x, hidden = State.at(jnp.array([0.1, 0.1, 1.2])), seen()
+    off = State(x.p + jnp.array([0.15, -0.1, 0.1]), so3.exp(jnp.array([0.05, -0.05, 0.08])), x.v)
+    memory = begin(hidden, off)
+    poses = jax.tree.map(lambda leaf: jnp.repeat(leaf[None], 13, axis=0), off)
+    memory = memory._replace(pose=replaced(memory.pose, x=off, d=jnp.zeros(3)), poses=poses)
+    o, _ = see(hidden, memory, x, Command.hover())
+    frames = np.asarray(o[:70]).reshape(5, 14)
+    np.testing.assert_allclose(frames, np.repeat(np.reshape(full().pixels(x)[0], (1, 14)), 5, axis=0), atol=0.02)
+    assert np.ptp(frames, axis=0).max() < 0.02
+
+
+def blind(observation, us, delay):
+    """Fly a point mass that hears commands ``delay`` ticks late, for the last half without any visible point.
+
+    Returns the error of the filter's velocity after each tick [m/s].
+    """
+    x, last, errors = State.at(jnp.array(GOAL)), Command.hover(), []
+    memory, acting = sure(observation, x), [Command.hover()] * delay
+    for u in us:
+        _, memory = see(observation, memory, x, last)
+        errors.append(float(jnp.linalg.norm(memory.pose.x.v - x.v)))
+        acting.append(u)
+        x, last = step(x, acting.pop(0)), u
+    return np.array(errors)
+
+
+@pytest.mark.parametrize("delay", [0, 1, 2, 3])
+def test_the_filter_predicts_under_the_command_that_acted(delay):
+    """No point is ever visible: the declared delay follows the true velocity exactly, any other does not.
+
+    After a step of thrust and roll the wrong command is in force for as many ticks as the delay is off by.
+    """
+    us = [Command.hover()] * 6 + [Command(jnp.array(13.0), jnp.array([1.5, 0.0, 0.0]))] * 6
+    declared = {max(delay - 1, 0), delay, min(delay + 1, 3)}
+    found = {d: blind(seen(dropout=1.0, delay_ticks=d), us, delay) for d in declared}
+    assert found[delay].max() < 1e-9
+    for d, errors in found.items():
+        assert errors[:6].max() < 1e-9  # in hover every delay is the same
+        if d != delay:
+            assert errors[-1] > 0.05
+
+
+def test_a_wrong_delay_shows_even_while_points_are_seen():
+    """With points in sight the filter is corrected, and still follows a step of commands less well."""
+    us = [Command.hover()] * 6 + [Command(jnp.array(14.0), jnp.zeros(3)), Command(jnp.array(6.0), jnp.zeros(3))] * 5
+    right, wrong = (blind(seen(delay_ticks=d), us, delay=1).max() for d in (1, 0))
+    assert right < 1e-3
+    assert wrong > 20.0 * right
+
+
+def test_impossible_delays():
+    for delay in (-1, 4):
+        with pytest.raises(ValueError, match=rf"delay_ticks = {delay} must be 0 to 3"):
+            seen(delay_ticks=delay)
+
+
+@pytest.mark.parametrize("place", [(0.05, -0.1, 1.1), (4.0, 0.0, 0.3)])
+def test_it_is_for_flight(place):
+    """Finite wherever the vehicle is, and no gradient passes."""
+    x = State(jnp.array(place), so3.exp(jnp.array([0.1, 0.5, 0.0])), jnp.array([0.3, 0.0, 0.0]))
+    hidden = seen(noise=1.0, dropout=0.1)
+    memory = begin(hidden, x)
+    o, slope = eqx.filter_jit(
+        lambda x: (
+            hidden(memory, jnp.array(0.0), x, Command.hover())[0],
+            jax.jacobian(lambda p: hidden(memory, jnp.array(0.0), replaced(x, p=p), Command.hover())[0])(x.p),
+        )
+    )(x)
+    assert np.isfinite(o).all()
+    np.testing.assert_array_equal(slope, 0.0)
+
+
+@pytest.mark.parametrize("d", [(0.0, 0.0, 0.0), (1.0, -0.5, 1.5)])
+def test_in_a_frame_the_camera_sees_level_ground(d):
+    """A camera in the world, with a pose estimate that is right, shows what one in the frame would: in all frames."""
+    frame, before = FeltFrame.of(jnp.array(d)), near()
+    x = step(before, Command.hover())
+    inside = full().in_frame(frame)
+    hovering = frame.command(Command.hover())
+    expected, _ = see(inside, begin(inside, frame.state(before)), frame.state(x), hovering)
+    hidden = seen()
+    found, after = see(hidden.in_frame(frame), sure(hidden, before), frame.state(x), hovering)
+    np.testing.assert_allclose(found[:77], expected[:77], atol=1e-5)
+    np.testing.assert_allclose(found[85:], expected[85:], atol=1e-9)  # the last command, as the policy gave it
+    np.testing.assert_allclose(after.pose.x.p, x.p, atol=1e-5)  # the filter is in the world
+
+
+def test_keeping_points_in_sight_is_rewarded():
+    """Nothing is lost while every point is well inside; the farther one is outside, the more; with a gradient."""
+    plain, task = (
+        kind(jnp.array(GOAL), full(), jnp.array(5.0), jnp.array(0.3), 0.02, 10) for kind in (L2Hover, ViewHover)
+    )
+
+    def lost(x):
+        return plain.reward(jnp.array(0.0), x, Command.hover()) - task.reward(jnp.array(0.0), x, Command.hover())
+
+    tilted = [
+        replaced(State.at(jnp.array([0.0, 0.0, 1.3])), R=so3.exp(jnp.array([a, 0.0, 0.0]))) for a in (0.0, 0.8, 1.1)
+    ]
+    level, some, more = (float(jax.jit(lost)(x)) for x in tilted)
+    assert level == 0.0
+    assert 0.0 < some < more
+    slope = jax.jit(jax.grad(lambda a: lost(replaced(tilted[0], R=so3.exp(a * jnp.array([1.0, 0.0, 0.0]))))))(0.8)
+    assert 0.0 < float(slope) < np.inf
