@@ -153,7 +153,7 @@ def test_a_first_look_may_be_far_off():
 
 @pytest.mark.parametrize("tau", [0.03, 0.06])
 def test_it_knows_of_lag(tau, key):
-    """In the dark, under a command that jumps, it follows a vehicle with such actuators, and without them it does not."""
+    """In the dark, under a command that jumps, it follows a vehicle with such actuators; not without knowing."""
     plant = Lagged(PointMass(DT), jnp.array(tau))
     x0 = State.at(jnp.array(GOAL))
     start = replaced(PoseFilter.near(x0, key), x=x0)
