@@ -15,9 +15,9 @@ from retrim import Reference, Scenario, Setup, changed, fly, from_csv, load
 from retrim.tasks import smooth_start
 
 QUICK = {
-    "track": {"reference": "circle"},
+    "track": {"reference": "circle", "felt_copies": 0},
     "pretrain": {"num_updates": 100, "num_envs": 8, "horizon": 60, "hidden_sizes": [32, 32]},
-    "adapt": {"window": 100, "num_updates": 3, "num_envs": 4, "fit_steps": 20, "fit_every": 1.0, "update_every": 2.0},
+    "adapt": {"window": 50, "num_updates": 2, "num_envs": 3},
 }
 
 
@@ -29,7 +29,7 @@ def climb(t: float) -> list[float]:
 
 def main(*, quick: bool = False) -> None:
     """Train on the family, and fly what is not in it."""
-    preset = changed(load("track/preview"), **(QUICK if quick else {}))
+    preset = changed(load("track/retrim"), **(QUICK if quick else {}))
     mine = Reference.of(climb, seconds=11.0, lap=3.0)  # from 3 s on it repeats
     hasty = Reference.of(lambda t: climb(3.0 * t), seconds=11.0 / 3.0, lap=1.0)
     setup = Setup.of(preset, mine)  # trains on the preset's references, flies mine

@@ -107,7 +107,7 @@ WRONG = [
     (("fly", "--policy", "t", "--reference", "moon"), "no reference 'moon'"),
     ((*FLY, "--plant", "nope"), "no plant 'nope'; there are bem, simple, rotorpy, mujoco, crazyflow"),
     ((*FLY, "--vehicle", "nope"), "no vehicle 'nope'"),
-    ((*FLY, "--sensors", "nope"), "no sensor 'nope'; there are ideal, mocap, rough"),
+    ((*FLY, "--sensors", "nope"), "no sensor 'nope'; there are ideal, mocap, onboard, rough"),
     ((*FLY, "--disturbance", "huge"), "no disturbance 'huge'; there are none, small, large"),
     ((*FLY, "--disturbance", "wind=abc"), "disturbance 'wind=abc': 'abc' is not a number"),
     ((*FLY, "--disturbance", "wind=1e9"), "disturbance 'wind=1e9': a size of 1e+09 m/s must be between 0 and 20"),

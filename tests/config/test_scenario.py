@@ -191,6 +191,7 @@ def test_every_disturbance_is_looked_at_here():
     ("name", "numbers"),
     [
         ("mocap", (0.3e-3, 3e-3, 1e-3, 0.0, 0, 10, 0.01, 0.1)),
+        ("onboard", (0.6e-3, 6e-3, 2e-3, 0.01, 10, 10, 0.02, 0.2)),
         ("rough", (1e-3, 10e-3, 3e-3, 0.05, 10, 10, 0.03, 0.3)),
     ],
 )

@@ -2,11 +2,13 @@
 
 import dataclasses
 import multiprocessing
+import re
 import signal
 import threading
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -16,6 +18,7 @@ from retrim.config.loading import dump
 from retrim.experiments import fleet as module
 from retrim.experiments import flying, lots
 from retrim.experiments.jobs import setup_for
+from retrim.physics import State
 
 pytestmark = pytest.mark.usefixtures("as_a_user")
 
@@ -213,3 +216,25 @@ def test_a_process_builds_a_set_up_once_for_a_fleet():
     assert setup_for(text, None, "a") is setup_for(text, None, "a")
     assert setup_for(text, None, "a") is not setup_for(text, None, "b")
     assert setup_for(text).preset.name == "once"
+
+
+@pytest.mark.parametrize(
+    ("off", "why"),
+    [
+        ((0.0, 0.0, -1.499), r"^below -0\.5 m, under the ground, at \(0\.00, 0\.00, -0\.5\d\) m$"),
+        ((-4.99, 0.0, 0.0), r"^5\.\d\d m off, out of the task's bounds, at \(-5\.\d\d, 0\.00, 1\.00\) m$"),
+    ],
+)
+def test_a_crash_says_why(fleet, off, why):
+    """As the last event of the flight, alone or in a lot."""
+    setup, policy, spec = fleet.setups[None], fleet.policies[0], fleet.specs[0]
+    x0 = State(jnp.array(fleet.preset.goal) + jnp.array(off), jnp.eye(3), 3.0 * jnp.array(off))
+    alone = flying.fly_one(setup, policy, spec, x0, 0.4)
+    for flight in (
+        alone,
+        *flying.fly_lot(setup, [policy] * 2, [spec, dataclasses.replace(spec, start=1)], [x0, x0], 0.4),
+    ):
+        assert flight.log.terminated
+        assert flight.events[-1].kind == "terminated"
+        assert flight.events[-1].t == pytest.approx(flight.log.t[-1])
+        assert re.search(why, flight.events[-1].note)

@@ -63,8 +63,9 @@ def fly(
             my.csv:laps and my.csv:once insist. Another reference than that of training needs a policy that sees it.
         vehicle: Vehicle that the plant simulates: small, large, kingfisher, a vehicle file or module:name; that which
             the policy was trained for by default. rotorpy and crazyflow fly their own.
-        sensors: What the policy is shown of the state: ideal, mocap (0.3 mm, 3 mm/s, 1 mrad), rough (1 mm, 10 mm/s,
-            3 mrad, 10 ms late, 5 % of the samples lost), or module:name.
+        sensors: What the policy is shown of the state: ideal, mocap (0.3 mm, 3 mm/s, 1 mrad), onboard (0.6 mm,
+            6 mm/s, 2 mrad, 10 ms late, 1 % of the samples lost), rough (1 mm, 10 mm/s, 3 mrad, 10 ms late, 5 % of
+            the samples lost), or module:name.
         thrust_error: By how much more than commanded the rotors give, as a share (bem and simple).
         delay: Command delay of the plant [s], in whole milliseconds (bem and simple); the policy does not know of it.
         residual: Residual model: ensemble, regression, or module:name.
@@ -129,7 +130,7 @@ def _notes(flights: Sequence[Flight], preset: Preset) -> None:
     for flight in flights:
         if flight.log.terminated:
             about = f"{flight.spec.method}, start {flight.spec.start}"
-            console.print(f"crashed: {about}, left its bounds at {flight.log.t[-1]:.2f} s", markup=False)
+            console.print(f"crashed: {about}, after {flight.log.t[-1]:.2f} s: {flight.events[-1].note}", markup=False)
     learning = [f for f in flights if f.learnt is not None]
     if learning and not any(f.swaps for f in learning):
         first = preset.adapt.update_every + preset.adapt.update_latency

@@ -69,6 +69,7 @@ def _at_hover() -> dict[str, Scenario]:
         "thrust+20": Scenario("step", thrust_error=0.2),
         "thrust-20": Scenario("step", thrust_error=-0.2),
         "none/mocap": Scenario(sensors="mocap"),
+        "none/onboard": Scenario(sensors="onboard"),
         "none/rough": Scenario(sensors="rough"),
         "step/rough": Scenario("step", sensors="rough"),
         "gusts/rough": Scenario("gusts", sensors="rough"),

@@ -17,7 +17,7 @@ from ..control.policy import Policy
 from ..physics.state import State
 from ..plants.sim import SimPlant
 from ..runtime.adaptive import AdaptivePilot
-from ..runtime.events import Observer
+from ..runtime.events import Event, Observer
 from ..runtime.flight import Log, States, fly
 from ..runtime.pilot import Pilot
 from ..runtime.together import can_fly_together, fly_together
@@ -144,6 +144,9 @@ def _until_terminated(task: AbstractTask, log: Log) -> Log:
 def _scored(setup: Setup, spec: FlightSpec, log: Log, pilot: Pilot) -> Flight:
     task = setup.flown
     error, cross = _errors(task, log.t, log.true.as_state())
+    if log.terminated:
+        why = Event(float(log.t[-1]), "terminated", _why(log, float(error[-1])))
+        log = log._replace(events=(*log.events, why))
     return Flight(
         spec,
         spec.scenario.vehicle_name(setup.preset.vehicle),
@@ -154,6 +157,15 @@ def _scored(setup: Setup, spec: FlightSpec, log: Log, pilot: Pilot) -> Flight:
         None if cross is None else np.asarray(cross),
         pilot.state if isinstance(pilot, AdaptivePilot) else None,
     )
+
+
+def _why(log: Log, error: float) -> str:
+    """Why a flight was terminated, in words."""
+    x, y, z = log.p[-1]
+    if not all(np.isfinite(part[-1]).all() for part in log.true):
+        return "the state is not finite"
+    fell = f"below {FLOOR:g} m, under the ground" if z < FLOOR else f"{error:.2f} m off, out of the task's bounds"
+    return f"{fell}, at ({x:.2f}, {y:.2f}, {z:.2f}) m"
 
 
 def _out_of_bounds(task: AbstractTask, t: Any, x: State) -> Array:

@@ -57,12 +57,14 @@ def clear_outputs(folder: Path) -> None:
 
 
 def write_events(flights: Sequence[Flight], folder: Path) -> None:
-    """Write ``events.jsonl``: what adaptation did, flight by flight."""
+    """Write ``events.jsonl``: what adaptation did, and why a flight was terminated, flight by flight."""
     lines = [
         json.dumps(
             {
                 "event": event.kind,
                 "disturbance": flight.spec.scenario.disturbance,
+                "method": flight.spec.method,
+                "seed": flight.spec.seed,
                 "start": flight.spec.start,
                 "t": round(event.t, 6),
                 "note": event.note,

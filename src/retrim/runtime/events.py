@@ -10,12 +10,13 @@ from ..plants.plant import Measurement
 
 
 class Event(NamedTuple):
-    """Something that adaptation did."""
+    """Something that adaptation did, or the end of a flight that was terminated."""
 
     t: float
     """Time since the start of the flight at which it became visible [s]."""
     kind: str
-    """``residual``, ``policy``, ``rejected`` (a result that must not be used) or ``skipped`` (the learner was busy)."""
+    """``residual``, ``policy``, ``rejected`` (a result that must not be used), ``skipped`` (the learner was busy) or
+    ``terminated``."""
     note: str
     """One line."""
 

@@ -19,6 +19,8 @@ from ..run import Run
 from .document import Document, TableSection
 from .study import fly_all, table_presets, train_all
 
+METHODS: dict[str, tuple[str, ...]] = dict.fromkeys(("hover", "track"), ("base", "base-i", "base-do", "full"))
+METHODS["vision"] = ("base", "base-do", "full")  # integral action shifts a measured position, which it is not shown
 METRICS = {"steady": "[m]", "late": "[m]", "peak": "[m]", "recovery_5cm": "[s]", "recovery_2cm": "[s]"}
 INTRO = """\
 Made by `retrim gauntlet`. The preset's own vehicle on plant `bem` unless the row says otherwise, at hover or on the
@@ -34,26 +36,27 @@ def gauntlet(
     *,
     preset: str = "hover/retrim",
     only: tuple[str, ...] = (),
-    methods: tuple[str, ...] = ("base", "base-i", "base-do", "full"),
+    methods: tuple[str, ...] = (),
     seeds: tuple[int, ...] = (0,),
     seconds: float = 30.0,
     starts: int = 4,
 ) -> None:
-    """Hover or tracking under everything that changes: recovery, steady and worst error, as one heat map.
+    """A policy under everything that changes: recovery, steady and worst error, as one heat map.
 
     Args:
         run: Folder of gauntlet.md, results.json and the pictures.
         reporter: Receives progress and the table.
-        preset: A preset for hover or tracking, to train with.
+        preset: A preset for hover, tracking or vision, to train with.
         only: Conditions to fly; all by default. One whose plant is not installed is left out, with a line.
-        methods: How the policies fly.
+        methods: How the policies fly; by default base, base-i, base-do and full, for vision without base-i.
         seeds: Training seeds; each also seeds the starts, the gusts and the learners of its flights.
         seconds: Length of a flight [s].
         starts: Flights per condition, method and seed.
     """
     task = load(preset).task
-    if task not in ("hover", "track"):
+    if task not in METHODS:
         raise ConfigError(f"preset {preset!r} is for {task}; the gauntlet is flown at hover or on references")
+    methods = methods or METHODS[task]
     (loaded,) = table_presets([preset], task, seeds=seeds, starts=starts, seconds=seconds)
     known = conditions(loaded)
     if unknown := [name for name in only if name not in known]:
