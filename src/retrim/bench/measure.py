@@ -13,12 +13,20 @@ from ..errors import ConfigError
 from ..experiments.reporter import Reporter
 from ..experiments.run import Run
 from ..experiments.tables.document import Document, TableSection
+from .machine import UNIT_FLOP
 from .works import WORKS
 
-COLUMNS = ("work", "run, s", "compile, s", "goal", "paper", "peak, MB", "remarks")
+CORES = ("one", "all") if hasattr(os, "sched_setaffinity") and (os.cpu_count() or 1) > 1 else ("all",)
+COLUMNS = (
+    "work", "one core, s", "units", "all cores, s", "units", "of the limit", "compile, s", "goal", "paper", "peak, MB",
+    "remarks",
+)  # fmt: skip
 INTRO = """\
 Made by `retrim bench`. Each work runs in a process of its own, from an empty compile cache unless the work says
-otherwise. run: median of the runs. paper: reported for an RTX 4090. peak: memory of the process, JAX included."""
+otherwise; where one core is given, the process was kept on one. Times are medians. A unit is what this machine takes,
+on as many cores and in the same seconds, for 1,000 products of 10 rows with a matrix of 512 x 512 in a scan, so units
+compare machines where seconds do not. of the limit: how long the products of an update would take at the rate of a
+unit, as a share of what it took. paper: reported for an RTX 4090. peak: memory of the process, JAX included."""
 
 
 def bench(run: Run, reporter: Reporter, *, works: Sequence[str] = tuple(WORKS)) -> bool:
@@ -32,11 +40,12 @@ def bench(run: Run, reporter: Reporter, *, works: Sequence[str] = tuple(WORKS)) 
     """
     if unknown := [name for name in works if name not in WORKS]:
         raise ConfigError(f"no work {', '.join(unknown)}; there are {', '.join(WORKS)}")
-    rows, failed = list[dict[str, Any]](), False
+    rows, machine, failed = list[dict[str, Any]](), dict[str, dict[str, float]](), False
     with tempfile.TemporaryDirectory() as cache, reporter.progress("bench") as advance:
         for i, name in enumerate(works):
             advance(i / len(works), WORKS[name].title)
             try:
+                machine = machine or {cores: _process("machine", cores, {}) for cores in CORES}
                 if name == "programs-warm" and not any(Path(cache).iterdir()):
                     _measured("programs-cold", Path(cache))
                 rows.append(_measured(name, Path(cache)))
@@ -48,34 +57,57 @@ def bench(run: Run, reporter: Reporter, *, works: Sequence[str] = tuple(WORKS)) 
             if run.interrupted:
                 break
     document = Document(run, "bench", "Bench", INTRO, [0], reporter)
-    document.add(TableSection(COLUMNS, tuple(_cells(row) for row in rows)), rows)
+    document.add(_machine(machine), [{"name": "machine", "cores": cores, **found} for cores, found in machine.items()])
+    document.add(TableSection(COLUMNS, tuple(_cells(row) for row in rows), "Works"), rows)
     return not failed
 
 
+def _machine(found: dict[str, dict[str, float]]) -> TableSection:
+    columns = ("", "product 2048, GFLOP/s", "10 x 512 by 512 x 512 in a scan, GFLOP/s", "memory, GB/s")
+    lines = tuple(
+        (f"{cores} core" if cores == "one" else f"{cores} cores", *(f"{rate:.1f}" for rate in rates.values()))
+        for cores, rates in found.items()
+    )
+    return TableSection(columns, lines, "The machine")
+
+
 def _cells(row: dict[str, Any]) -> tuple[str, ...]:
-    times = _seconds(row["run_s"]), _seconds(row["compile_s"])
-    return row["work"], *times, row["goal"], row["paper"], f"{row['peak_mb']:.0f}", row["remarks"]
+    one = row.get("one_core", {})
+    times = (one.get("run_s"), one.get("units"), row["run_s"], row.get("units"))
+    best = one if one.get("flop") else row
+    limit = f"{100 * best['flop'] / UNIT_FLOP / best['units']:.0f} %" if best.get("flop") else "-"
+    told = _seconds(row["compile_s"]), row["goal"], row["paper"], f"{row['peak_mb']:.0f}", row["remarks"]
+    return row["work"], *map(_seconds, times), limit, *told
 
 
 def _measured(name: str, cache: Path) -> dict[str, Any]:
     """The row of one work, done by a fresh interpreter; ``cache`` starts empty, for the works that ask for one."""
-    environment = {**os.environ, "RETRIM_COMPILE_CACHE": "0", "TF_CPP_MIN_LOG_LEVEL": "3"}
-    environment.pop("JAX_COMPILATION_CACHE_DIR", None)
+    environment = {"RETRIM_COMPILE_CACHE": "0", "TF_CPP_MIN_LOG_LEVEL": "3"}
     if WORKS[name].cached:
         environment |= {
             "JAX_COMPILATION_CACHE_DIR": str(cache),
             "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
         }
+    row = {"name": name, **_process(name, "all", environment)}
+    if WORKS[name].one_core and "one" in CORES:
+        row["one_core"] = _process(name, "one", environment)
+    return row
+
+
+def _process(name: str, cores: str, environment: dict[str, str]) -> dict[str, Any]:
+    """What a process of its own prints."""
+    inherited = {key: value for key, value in os.environ.items() if key != "JAX_COMPILATION_CACHE_DIR"}
     ran = subprocess.run(
-        [sys.executable, "-m", "retrim.bench.works", name],
-        env=environment,
+        [sys.executable, "-m", "retrim.bench.works", name, cores],
+        env=inherited | environment,
         capture_output=True,
         text=True,
         check=False,
     )
     if ran.returncode:
         raise OSError(f"failed: {ran.stderr.strip().splitlines()[-1:]}")
-    return {"name": name, **json.loads(ran.stdout.splitlines()[-1])}
+    found: dict[str, Any] = json.loads(ran.stdout.splitlines()[-1])
+    return found
 
 
 def _seconds(value: float | None) -> str:

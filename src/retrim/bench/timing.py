@@ -4,9 +4,10 @@ import statistics
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
-import jax
+from .machine import seconds, unit
 
 
 @dataclass(frozen=True)
@@ -21,17 +22,24 @@ class Work:
     """What the paper reports, on an RTX 4090."""
     cached: bool = False
     """Uses the bench's own persistent compile cache, empty at first."""
+    one_core: bool = False
+    """Is done on one core, too."""
 
 
 def timed(compile_s: float, run: Callable[[], Any], runs: int) -> dict[str, Any]:
-    """The median of some runs, beside what compiling took."""
-    seconds = []
+    """The median of some runs, beside what compiling took, in seconds and in units of the machine.
+
+    A unit is timed before and after each run, since machines are busy with other things, too.
+    """
+    now = unit()
+    units, took = [now()], []
     for _ in range(runs):
-        began = time.perf_counter()
-        jax.block_until_ready(run())
-        seconds.append(time.perf_counter() - began)
-    spread = f"{min(seconds):.3g} to {max(seconds):.3g} s in {runs} runs" if runs > 1 else "1 run"
-    return {"compile_s": compile_s, "run_s": statistics.median(seconds), "remarks": spread}
+        took.append(seconds(run))
+        units.append(now())
+    ratios = [2.0 * each / (before + after) for each, (before, after) in zip(took, pairwise(units), strict=True)]
+    spread = f"{min(took):.3g} to {max(took):.3g} s in {runs} runs" if runs > 1 else "1 run"
+    about = {"unit_s": statistics.median(units), "units": statistics.median(ratios)}
+    return {"compile_s": compile_s, "run_s": statistics.median(took), **about, "remarks": spread}
 
 
 def compiled(jitted: Any, *arguments: Any) -> tuple[Any, float]:

@@ -32,8 +32,11 @@ from ..plants.sim import SimPlant
 from ..runtime.batch import batch_flight
 from ..runtime.batched import stacked
 from ..runtime.flight import fly
+from .machine import on_one_core, rates
 from .timing import Work, compiled, timed
 from .training import encode_and_pretrain, pretrain
+
+HELD_OUT = 8  # starts of the gate
 
 
 def _learner(name: str = "hover/paper") -> tuple[OnlineLearner, LearnerState, Window]:
@@ -50,6 +53,7 @@ def _learner(name: str = "hover/paper") -> tuple[OnlineLearner, LearnerState, Wi
 
 
 def _update(name: str, *, lora: bool = False) -> dict[str, Any]:
+    """A policy update: its products are three to a step of training and one to a tick of the gate."""
     learner, state, window = _learner(name)
     if lora:
         policy = Setup.of(load(name)).low_rank(state.policy.policy, random.key(2))
@@ -57,11 +61,13 @@ def _update(name: str, *, lora: bool = False) -> dict[str, Any]:
     fitted, _ = learner.fit_residual(state.residual, window)
     arguments = learner, state.policy, fitted, window, random.key(0)
     program, compile_s = compiled(OnlineLearner.update_policy, *arguments)
-    return timed(compile_s, lambda: program(*arguments), 9)
+    weights = sum(layer.weight.size for layer in state.policy.policy.merged().layers)
+    ticks = learner.env.task.horizon * (3 * learner.num_updates * learner.num_envs + 2 * HELD_OUT)
+    return timed(compile_s, lambda: program(*arguments), 9) | {"flop": 2.0 * weights * ticks}
 
 
-def _residual() -> dict[str, Any]:
-    learner, state, window = _learner()
+def _residual(name: str = "hover/paper") -> dict[str, Any]:
+    learner, state, window = _learner(name)
     program, compile_s = compiled(OnlineLearner.fit_residual, learner, state.residual, window)
     return timed(compile_s, lambda: program(learner, state.residual, window), 9)
 
@@ -119,7 +125,8 @@ def _bem_tick() -> dict[str, Any]:
         return measurement.x.p
 
     row = timed(compile_s, ticks, 5)
-    return row | {"run_s": row["run_s"] / 500, "remarks": f"500 ticks: {row['remarks']}"}
+    per_tick = {"run_s": row["run_s"] / 500, "units": row["units"] / 500}
+    return row | per_tick | {"remarks": f"500 ticks: {row['remarks']}"}
 
 
 def _fleet(how: str) -> dict[str, Any]:
@@ -166,39 +173,61 @@ def _with_latency(title: str, name: str) -> Work:
 
 
 WORKS: dict[str, Work] = {
-    "pretrain-paper": Work("pretrain 300 x 100 x 150", "40 s", lambda: pretrain("hover/paper", 1), "15 s"),
-    "pretrain-fast": Work("pretrain 150 x 16 x 150, to 5 mm", "6 s", lambda: pretrain("hover/fast", 3)),
-    "pretrain-track-paper": Work("pretrain tracking 300 x 100 x 150", "45 s", lambda: pretrain("track/paper", 1)),
-    "pretrain-track": Work(
-        "pretrain tracking 600 x 32 x 100, three references", "-", lambda: pretrain("track/preview", 1)
+    "pretrain-retrim": Work(
+        "pretrain hover/retrim, 300 x 16 x 150", "2.5 s, to 5 mm", lambda: pretrain("hover/retrim", 3), one_core=True
+    ),
+    "pretrain-paper": Work("pretrain hover/paper, 300 x 100 x 150", "40 s", lambda: pretrain("hover/paper", 1), "15 s"),
+    "pretrain-fast": Work("pretrain hover/fast, 150 x 16 x 150", "6 s, to 5 mm", lambda: pretrain("hover/fast", 3)),
+    "pretrain-track": Work("pretrain track/retrim, 1200 x 32 x 100", "-", lambda: pretrain("track/retrim", 1)),
+    "pretrain-track-paper": Work(
+        "pretrain track/paper, 300 x 100 x 150", "45 s", lambda: pretrain("track/paper", 1)
     ),
     "pretrain-vision": Work(
-        "encoder, and pretrain 300 x 16 x 150", "30 s, to 0.02 m", lambda: encode_and_pretrain("vision/ideal")
+        "encoder, and pretrain vision/retrim, 300 x 16 x 150", "30 s", lambda: encode_and_pretrain("vision/retrim")
     ),
     "pretrain-vision-paper": Work(
-        "encoder, and pretrain 500 x 300 x 150", "360 s", lambda: encode_and_pretrain("vision/paper")
+        "encoder, and pretrain vision/paper, 500 x 300 x 150", "360 s", lambda: encode_and_pretrain("vision/paper")
     ),
-    "update": Work("policy update 30 x 10 x 150, with residual", "0.8 s", lambda: _update("hover/paper"), "1.5 s"),
-    "update-fast": _with_latency("policy update 30 x 10 x 150, preset hover/fast", "hover/fast"),
+    "update-retrim": Work(
+        "burst 5 x 10 x 150, hover/retrim", "0.05 s on one core", lambda: _update("hover/retrim"), one_core=True
+    ),
+    "update-track-retrim": Work(
+        "burst 5 x 10 x 100, track/retrim", "0.1 s, its latency", lambda: _update("track/retrim"), one_core=True
+    ),
+    "update-vision-retrim": Work(
+        "burst 5 x 10 x 150, vision/retrim", "0.1 s, its latency", lambda: _update("vision/retrim"), one_core=True
+    ),
+    "update": Work(
+        "policy update 30 x 10 x 150, hover/paper", "0.85 s on one core", lambda: _update("hover/paper"), "1.5 s",
+        one_core=True,
+    ),
     "update-lora": Work("policy update 30 x 10 x 150, LoRA", "-", lambda: _update("hover/fast", lora=True)),
-    "update-track": _with_latency("policy update 30 x 10 x 100, preset track/preview", "track/preview"),
-    "update-vision": _with_latency("policy update 30 x 10 x 150, preset vision/ideal", "vision/ideal"),
-    "update-vision-paper": _with_latency("policy update 50 x 30 x 150, preset vision/paper", "vision/paper"),
-    "residual": Work("residual, 3 nets x 100 steps x 100 samples", "0.1 s", _residual, "2 s"),
+    "update-track": _with_latency("policy update 30 x 10 x 100, track/preview", "track/preview"),
+    "update-vision": _with_latency("policy update 30 x 10 x 150, vision/ideal", "vision/ideal"),
+    "update-vision-paper": _with_latency("policy update 50 x 30 x 150, vision/paper", "vision/paper"),
+    "residual": Work("residual, 3 nets x 100 steps x 100 samples", "0.1 s", _residual, "2 s", one_core=True),
+    "residual-retrim": Work(
+        "residual, regression on 100 samples", "0.01 s", lambda: _residual("hover/retrim"), one_core=True
+    ),
     "programs-cold": Work("all programs of a flight, empty cache", "compile 60 s", _programs, cached=True),
     "programs-warm": Work("all programs of a flight, from the cache", "compile 5 s", _programs, cached=True),
-    "bem-tick": Work("one tick of the plant bem", "0.002 s", _bem_tick),
-    "bem-eight": Work("8 flights of 30 s on bem, one program", "10 s (goal 3 s)", _eight),
-    "flight": Work("30 s of flight, not adapting", "-", _tick),
+    "bem-tick": Work("one tick of the plant bem", "0.002 s", _bem_tick, one_core=True),
+    "bem-eight": Work("8 flights of 30 s on bem, one program", "3 s", _eight, one_core=True),
+    "flight": Work("30 s of flight, not adapting", "-", _tick, one_core=True),
     "fleet-map": Work("8 policy updates, lax.map", "-", lambda: _fleet("map")),
     "fleet-vmap": Work("8 policy updates, vmap", "-", lambda: _fleet("vmap")),
     "fleet-threads": Work("8 policy updates, 2 threads", "-", lambda: _fleet("threads")),
-    "demo": Work("retrim demo", "180 s in all, 2000 MB", _demo),
-}
+    "demo": Work("retrim demo", "75 s in all, 2000 MB", _demo),
+}  # fmt: skip
 
 
 def main() -> None:
-    """Do the work named on the command line and print its row."""
+    """Do the work named on the command line, on one core if a second word says so, and print its row."""
+    if sys.argv[2:] == ["one"]:
+        on_one_core()
+    if sys.argv[1] == "machine":
+        print(json.dumps(rates()))
+        return
     work = WORKS[sys.argv[1]]
     found = work.do()
     peak = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))

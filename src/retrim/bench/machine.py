@@ -1,0 +1,60 @@
+"""The machine's own rate, beside which a figure means the same on every machine."""
+
+import os
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+ROWS, WIDTH, STEPS = 10, 512, 1000
+UNIT_FLOP = 2.0 * ROWS * WIDTH * WIDTH * STEPS
+"""Of a unit: a scan of 1,000 products of 10 rows with a matrix of 512 x 512, which a roll-out is mostly made of."""
+
+
+def on_one_core() -> None:
+    """Keep this process, and the threads that JAX will start, on one core.
+
+    Raises:
+        OSError: The system cannot.
+    """
+    if not hasattr(os, "sched_setaffinity"):
+        raise OSError("this system does not let a process choose its core")
+    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+
+
+def unit() -> Callable[[], float]:
+    """Return a function that takes the time of one unit now [s], the median of five runs."""
+    weight = jnp.full((WIDTH, WIDTH), 1.0 / WIDTH)
+
+    @jax.jit
+    def scanned(x: Any) -> Any:
+        return lax.scan(lambda x, _: (x @ weight, None), x, None, length=STEPS)[0]
+
+    return lambda: _median(lambda: scanned(jnp.ones((ROWS, WIDTH))), 5)
+
+
+def rates() -> dict[str, float]:
+    """Return what the machine does at best: a large product, the product of a roll-out, and copying memory."""
+    large, long = jnp.ones((2048, 2048)), jnp.ones(2**25)
+    product, copy = jax.jit(lambda a: a @ a), jax.jit(lambda a: a + 1.0)
+    return {
+        "product": 2.0 * 2048.0**3 / _median(lambda: product(large), 7) / 1e9,
+        "rows": UNIT_FLOP / unit()() / 1e9,
+        "copy": 2.0 * long.nbytes / _median(lambda: copy(long), 7) / 1e9,
+    }
+
+
+def _median(run: Callable[[], Any], runs: int) -> float:
+    jax.block_until_ready(run())
+    return statistics.median(seconds(run) for _ in range(runs))
+
+
+def seconds(run: Callable[[], Any]) -> float:
+    """Return how long a run took [s]."""
+    began = time.perf_counter()
+    jax.block_until_ready(run())
+    return time.perf_counter() - began

@@ -1,0 +1,59 @@
+"""The bench: times beside the machine's own unit, on one core and on all."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from retrim.bench import measure, timing
+from retrim.bench.machine import UNIT_FLOP
+from retrim.errors import ConfigError
+from retrim.experiments.reporter import Silent
+from retrim.experiments.run import Run
+
+
+def test_a_time_is_told_in_units_of_its_moment(monkeypatch):
+    """On a machine that becomes ten times as slow in the middle of a run, as many units are taken as before."""
+    units, took = iter([0.1, 0.1, 1.0, 1.0, 1.0]), iter([0.3, 1.65, 3.0, 3.0])
+    monkeypatch.setattr(timing, "unit", lambda: lambda: next(units))
+    monkeypatch.setattr(timing, "seconds", lambda run: next(took))
+    found = timing.timed(2.0, lambda: None, 4)
+    assert found["units"] == pytest.approx(3.0)
+    assert found["run_s"] == pytest.approx((1.65 + 3.0) / 2)
+    assert (found["compile_s"], found["remarks"]) == (2.0, "0.3 to 3 s in 4 runs")
+
+
+@pytest.mark.skipif("one" not in measure.CORES, reason="the system does not let a process choose its core")
+def test_one_core_is_one():
+    code = "import os; from retrim.bench.machine import on_one_core; on_one_core(); print(len(os.sched_getaffinity(0)))"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "1\n"
+
+
+def test_a_row_has_both_and_the_share_of_the_limit(tmp_path, monkeypatch):
+    """An update that takes four units for the products of one is at 25 % of the limit; one core goes first."""
+    asked = []
+
+    def process(name, cores, environment):
+        asked.append((name, cores))
+        if name == "machine":
+            return {"product": 100.0, "rows": 50.0, "copy": 9.0}
+        units = 4.0 if cores == "one" else 2.5
+        row = {"work": name, "goal": "-", "paper": "-", "peak_mb": 7.0, "compile_s": 1.0, "remarks": "3 runs"}
+        return row | {"run_s": units / 10, "units": units, "flop": UNIT_FLOP}
+
+    monkeypatch.setattr(measure, "_process", process)
+    monkeypatch.setattr(measure, "CORES", ("one", "all"))
+    assert measure.bench(Run("test", tmp_path), Silent(), works=["update-retrim", "update-lora"])
+    assert asked == [
+        *(("machine", "one"), ("machine", "all")),
+        *(("update-retrim", "all"), ("update-retrim", "one"), ("update-lora", "all")),
+    ]
+    text = (tmp_path / "bench.md").read_text()
+    assert "| one core | 100.0 | 50.0 | 9.0 |" in text
+    assert "| update-retrim | 0.4 | 4 | 0.25 | 2.5 | 25 % | 1 | - | - | 7 | 3 runs |" in text
+    assert "| update-lora | - | - | 0.25 | 2.5 | 40 % | 1 | - | - | 7 | 3 runs |" in text
+    rows = json.loads((tmp_path / "bench.json").read_text())["rows"]
+    assert [row["name"] for row in rows] == ["machine", "machine", "update-retrim", "update-lora"]
+    with pytest.raises(ConfigError, match="no work nap"):
+        measure.bench(Run("test", tmp_path), Silent(), works=["nap"])
