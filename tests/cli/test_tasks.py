@@ -67,7 +67,7 @@ def test_a_family_asks_which_to_fly(folder):
 
 
 def test_vision_learns_to_see_and_flies_with_occlusion(folder):
-    words = "--preset", "occluded", "--config", "see.toml", "--out", "v"
+    words = "--config", "see.toml", "--out", "v"
     assert "vision error in its own model" in retrim("pretrain", "vision", *words, cwd=folder)
     retrim("fly", "--policy", "v", "--seconds", "3", "--disturbance", "none", "--out", "vf", cwd=folder)
     assert (folder / "vf" / "vision_none.png").exists()

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from retrim.config.loading import load
+from retrim.config.references import REFERENCES, make_reference
 from retrim.config.scenario import Scenario
 from retrim.config.setup import Setup
-from retrim.config.tasks import REFERENCES, make_reference
 from retrim.errors import ConfigError
 from retrim.physics import large, small
 from retrim.tasks import Reference

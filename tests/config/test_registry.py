@@ -15,10 +15,11 @@ from retrim import ConfigError
 from retrim.config import Scenario, Setup, changed, disturbance, load, registry
 from retrim.config.disturbances import DISTURBANCES
 from retrim.config.plants import PLANTS
+from retrim.config.references import REFERENCES, make_reference
 from retrim.config.registry import Registry
 from retrim.config.residuals import RESIDUALS
 from retrim.config.sensors import SENSORS
-from retrim.config.tasks import REFERENCES, TASKS, make_reference
+from retrim.config.tasks import TASKS
 from retrim.config.vehicles import VEHICLES
 from retrim.physics import Command, State
 from retrim.runtime import FunctionPilot, fly

@@ -13,6 +13,7 @@ from .plants import PlantEntry as PlantEntry
 from .plants import PlantRequest as PlantRequest
 from .plants import register_plant as register_plant
 from .presets import Preset as Preset
+from .references import register_reference as register_reference
 from .residuals import ResidualRequest as ResidualRequest
 from .residuals import register_residual as register_residual
 from .scenario import Scenario as Scenario
@@ -20,7 +21,6 @@ from .sensors import register_sensor as register_sensor
 from .setup import Setup as Setup
 from .tasks import TaskEntry as TaskEntry
 from .tasks import TaskRequest as TaskRequest
-from .tasks import register_reference as register_reference
 from .tasks import register_task as register_task
 from .vehicle_file import VehicleSpec as VehicleSpec
 from .vehicle_file import read_vehicle as read_vehicle

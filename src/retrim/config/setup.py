@@ -38,8 +38,9 @@ from ..tasks.task import AbstractTask
 from .learners import check_frame, felt_frame, make_learner
 from .presets import Preset
 from .presets import Track as TrackTable
+from .references import make_reference, make_training_reference
 from .residuals import ResidualRequest, make_residual
-from .tasks import TaskRequest, find_task, make_reference, make_training_reference
+from .tasks import TaskRequest, find_task
 from .vehicles import make_vehicle
 
 Latency = Literal["fixed", "measured"]
