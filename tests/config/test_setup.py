@@ -311,10 +311,7 @@ def test_a_frame_is_refused_for_what_cannot_be_turned():
         Setup.of(changed(load("vision/ideal"), adapt={"frame": "gravity"}))
     seeing = Setup.of(load("vision/retrim"))
     assert isinstance(seeing.learner.view, RestView)
-    assert isinstance(
-        seeing.in_gravity_frame(PolicyController(seeing.flown.observation_in_flight, seeing.new_policy(random.key(0)))),
-        SeenFrame,
-    )
+    assert isinstance(seeing.pilot(seeing.new_policy(random.key(0)), "base-do").controller, SeenFrame)
 
 
 def test_training_follows_references_as_they_are_felt():

@@ -15,6 +15,7 @@ from ..control.policy import Policy
 from ..errors import ConfigError
 from ..runtime.pilot import ControllerPilot, Pilot
 from ..tasks.keypoints import Keypoints
+from .learners import check_frame, felt_frame
 from .registry import Registry
 
 if TYPE_CHECKING:
@@ -86,7 +87,8 @@ def _integral(request: MethodRequest) -> Pilot:
 
 
 def _gravity_frame(request: MethodRequest) -> Pilot:
-    return ControllerPilot(request.setup.in_gravity_frame(request.controller()))
+    check_frame(request.setup.preset, request.setup.env.task)
+    return ControllerPilot(felt_frame(request.controller(), request.setup.preset))
 
 
 def _full(request: MethodRequest) -> Pilot:

@@ -16,7 +16,6 @@ from jaxtyping import Array, Float, Key
 from ..adapt.learner import LearnerState, OnlineLearner
 from ..adapt.workers import PolicyWorker, ResidualWorker
 from ..control.controller import AbstractController, PolicyController
-from ..control.gravity_frame import GravityFrame, SeenFrame
 from ..control.lora import LoraPolicy
 from ..control.policy import Policy
 from ..errors import ConfigError
@@ -35,7 +34,7 @@ from ..tasks.hover import TILT, Hover
 from ..tasks.keypoints import Keypoints
 from ..tasks.reference import Reference
 from ..tasks.task import AbstractTask
-from .learners import check_frame, felt_frame, make_learner
+from .learners import felt_frame, make_learner
 from .presets import Preset
 from .presets import Track as TrackTable
 from .references import make_reference, make_training_reference
@@ -186,15 +185,6 @@ class Setup:
             return plain
         known = FittedResidual(self.learner.residual_model, state.residual)
         return felt_frame(plain, self.preset, known)
-
-    def in_gravity_frame(self, controller: AbstractController[Any]) -> GravityFrame | SeenFrame:
-        """Return a controller flown in the gravity that is felt, by a disturbance observer or by its pose filter.
-
-        Raises:
-            ConfigError: The task cannot be turned, or nothing feels gravity.
-        """
-        check_frame(self.preset, self.env.task)
-        return felt_frame(controller, self.preset)
 
     def low_rank(self, policy: Policy | LoraPolicy, key: Key[Array, ""]) -> LoraPolicy:
         """Return ``policy`` with a fresh low-rank delta (ranks 4, 10, 1 and scale 4, as in the paper).
