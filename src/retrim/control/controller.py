@@ -41,6 +41,11 @@ class AbstractController(eqx.Module, Generic[M]):
         del u
         return memory
 
+    def aged(self, age: float) -> "AbstractController[M]":
+        """Return the same controller for measurements ``age`` old [s]; by default they are taken as they are."""
+        del age
+        return self
+
     def in_frame(self, frame: FeltFrame) -> "AbstractController[M]":
         """Return the same controller for states and commands of ``frame``.
 

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..estimation.disturbance_observer import DisturbanceObserver, ObserverState
+from ..estimation.latency import ahead
 from ..physics.dynamics import Hybrid, Residual
 from ..physics.felt_frame import FeltFrame
 from ..physics.state import Command, State
@@ -38,6 +39,12 @@ class GravityFrame(AbstractController[GravityFrameState]):
     known: Residual | None = None
     """Residual that has been learnt, world frame [m/s^2]: what it says beyond what it says at rest needs no estimate,
     which would come late."""
+    age: Float[Array, ""] | None = None
+    """How old measurements are [s]: the controller inside is shown what they say of now; None for not at all."""
+
+    def aged(self, age: float) -> "GravityFrame":
+        """Return the same for measurements that are ``age`` old [s]."""
+        return dataclasses.replace(self, age=jnp.array(age)) if age > 0.0 else self
 
     def init(self, x: State) -> GravityFrameState:
         """Return the memory at the start of a flight."""
@@ -53,6 +60,8 @@ class GravityFrame(AbstractController[GravityFrameState]):
             observer = dataclasses.replace(observer, nominal=Hybrid(observer.nominal, unsteady))
         observed = observer(memory.observer, x)
         frame = FeltFrame.of(capped(observed.d_hat + felt, observer.limit))
+        if self.age is not None:
+            x = ahead(x, memory.observer.commands[0], frame.d, self.age.astype(x.p.dtype))
         u, inner = self.inner.in_frame(frame)(memory.inner, t, frame.state(x))
         u = frame.world_command(u)
         return u, GravityFrameState(observer.issued(observed, u), inner, frame)

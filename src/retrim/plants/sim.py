@@ -61,6 +61,11 @@ class Simulation(eqx.Module):
                 f"SimPlant: a tick of {self.model.dt} s is no multiple of the {self.sensors.period} ms of SensorModel"
             )
 
+    @property
+    def age(self) -> float:
+        """How old measurements are [s]."""
+        return 0.0 if self.sensors is None else 1e-3 * self.sensors.latency
+
     def undisturbed(self) -> "Simulation":
         """Return the same without its disturbance."""
         return dataclasses.replace(self, disturbance=_calm)
@@ -188,7 +193,7 @@ class SimPlant(Plant):
         if omega is not None:
             omega, a = _inertial(sensors, omega, a, random.fold_in(self.simulation.key, self._ticks))
         x = self.simulation.measured(state)
-        return Measurement(t, x, omega, a, speeds, age=1e-3 * sensors.latency, truth=truth)
+        return Measurement(t, x, omega, a, speeds, age=self.simulation.age, truth=truth)
 
     def stop(self) -> None:
         """Forget the flight."""

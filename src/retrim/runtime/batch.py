@@ -66,6 +66,8 @@ def fly_ticks(
         The flight, and what was flown.
     """
 
+    controller = controller.aged(simulation.age)
+
     def tick(flight: InFlight) -> tuple[InFlight, Ticks]:
         s, k = flight.sim, flight.tick
         issued, memory = controller(flight.memory, s.t, simulation.measured(s))

@@ -1,0 +1,30 @@
+"""An old measurement says where the vehicle is now."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import random
+
+from helpers import random_command, random_state
+from retrim.estimation.latency import ahead
+from retrim.physics import Command, PointMass
+
+
+@pytest.mark.parametrize("age", [0.0, 0.005, 0.02])
+def test_it_is_a_tick_of_the_model(age, key):
+    """Without turning exactly, under any command to third order in the age."""
+    kx, ku = random.split(key)
+    x, u, d = random_state(kx), random_command(ku), jnp.array([1.0, -2.0, 0.5])
+    after = jax.jit(lambda u: ahead(x, u, d, jnp.array(age)))
+    if age == 0.0:
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-12), after(u), x)
+        return
+    tick = jax.jit(lambda u: PointMass(age).step(x, u, d))
+    straight = Command(u.c, jnp.zeros(3))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-12), after(straight), tick(straight))
+    found, wanted = after(u), tick(u)
+    np.testing.assert_allclose(found.R, wanted.R, atol=1e-12)
+    turned = float(jnp.linalg.norm(u.omega))
+    np.testing.assert_allclose(found.v, wanted.v, atol=0.5 * age**2 * turned * float(u.c) + 1e-12)
+    np.testing.assert_allclose(found.p, wanted.p, atol=age**3 * turned * float(u.c) + 1e-12)
