@@ -119,7 +119,7 @@ WRONG = [
     ((*FLY, "--plant", "rotorpy", "--sensors", "mocap"), "sensors 'mocap' need bem or simple"),
     (("demo", "--plant", "nope"), "no plant 'nope'"),
     (("demo", "--preset", "track/preview"), "preset 'track/preview' is for track, not for hover"),
-    (("bench", "--works", "nap"), "no work nap; there are pretrain-paper"),
+    (("bench", "--works", "nap"), "no work nap; there are pretrain-retrim"),
     (("reproduce", "hover", "--presets", "vision/ideal"), "preset 'vision/ideal' is for vision, not for hover"),
     (("reproduce", "hover", "--sensors", "nope"), "no sensor 'nope'"),
     (("reproduce", "tracking", "--plant", "nope"), "no plant 'nope'"),
@@ -165,7 +165,7 @@ WRONG = [
     (("sweep", "size.toml"), "'abc' is not a number"),
     (
         ("sweep", "method.toml"),
-        "task 'vision' has no frame for a disturbance observer: it sees the state at every tick",
+        "preset 'vision/ideal' has no frame of felt gravity: a policy that sees keypoints feels it by its pose filter",
     ),
     (("sweep", "ranks.toml"), "LoRA: 3 ranks (4, 10, 1) for 2 layers"),
     (("sweep", "overlay.toml"), "nonsense: unknown key"),

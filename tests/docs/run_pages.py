@@ -12,7 +12,7 @@ from pathlib import Path
 import retrim
 
 BLOCK = re.compile(r'^```(?P<language>python|toml)(?: title="(?P<title>[^"]+)")?\n(?P<code>.*?)^```', re.M | re.S)
-SHORTER = {"ticks=1500": "ticks=4", "seconds=30": "seconds=0.1"}
+SHORTER = {"ticks=1500": "ticks=4", "seconds=30": "seconds=1"}
 
 
 def untrained(setup, seed=0):
