@@ -1,10 +1,10 @@
 """What an old measurement says of now."""
 
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..physics import so3
-from ..physics.state import STANDARD_GRAVITY, Command, State
+from ..physics.dynamics import f_a
+from ..physics.state import Command, State
 
 
 def ahead(x: State, u: Command, d: Float[Array, "3"], age: Float[Array, ""]) -> State:
@@ -16,5 +16,5 @@ def ahead(x: State, u: Command, d: Float[Array, "3"], age: Float[Array, ""]) -> 
         d: Disturbance, world [m/s^2].
         age: How old the measurement is [s].
     """
-    a = u.c * x.R[:, 2] + d - jnp.array([0.0, 0.0, STANDARD_GRAVITY], dtype=d.dtype)
+    a = f_a(x, u, d).v
     return State(x.p + age * x.v + 0.5 * age**2 * a, so3.mul(x.R, so3.exp(age * u.omega)), x.v + age * a)

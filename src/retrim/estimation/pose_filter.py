@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
 from ..physics import so3
+from ..physics.actuators import lagged
 from ..physics.dynamics import PointMass
 from ..physics.state import Command, State
 from .camera import Camera, in_camera
@@ -50,12 +51,8 @@ class PoseFilter(eqx.Module):
             dt: [s]
             tau: Time constant of the actuators [s]; None for none.
         """
-        x, dtype, end = self.x, self.P.dtype, u
-        if tau is not None:
-            decay = jnp.exp(-dt / tau)
-            left = tau / dt * (1.0 - decay)
-            end = jax.tree.map(lambda old, new: new + decay * (old - new), self.acting, u)
-            u = jax.tree.map(lambda old, new: new + left * (old - new), self.acting, u)
+        x, dtype = self.x, self.P.dtype
+        u, end = (u, u) if tau is None else lagged(self.acting, u, dt, tau)
         zero, eye = jnp.zeros((3, 3), dtype=dtype), jnp.eye(3, dtype=dtype)
         lean = -dt * u.c * x.R @ so3.hat(jnp.array([0.0, 0.0, 1.0], dtype=dtype))
         F = jnp.block(

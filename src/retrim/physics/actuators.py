@@ -20,6 +20,26 @@ class LagState(eqx.Module, Generic[X]):
     acting: Command
 
 
+def lagged(acting: Command, u: Command, dt: float, tau: Float[Array, ""]) -> tuple[Command, Command]:
+    """Return what a first-order lag makes of a command over a tick.
+
+    Args:
+        acting: Command at the actuators at the beginning of the tick.
+        u: Command that reaches them.
+        dt: Length of the tick [s].
+        tau: Time constant [s].
+
+    Returns:
+        The mean over the tick, and what acts at its end.
+    """
+    decay = jnp.exp(-dt / tau)
+    left = tau / dt * (1.0 - decay)  # share of the old command in the mean over the tick
+    mean, end = (
+        jax.tree.map(lambda old, new, share=share: new + share * (old - new), acting, u) for share in (left, decay)
+    )
+    return mean, end
+
+
 class Lagged(AbstractDynamics[LagState[X]]):
     """Each command reaches the model through a first-order lag."""
 
@@ -51,8 +71,5 @@ class Lagged(AbstractDynamics[LagState[X]]):
 
     def step(self, s: LagState[X], u: Command, a_ext: Float[Array, "3"]) -> LagState[X]:
         """Advance one tick under the mean of the lagged command over it."""
-        decay = jnp.exp(-self.dt / self.tau)
-        left = self.tau / self.dt * (1.0 - decay)  # share of the old command in the mean over the tick
-        mean = jax.tree.map(lambda old, new: new + left * (old - new), s.acting, u)
-        end = jax.tree.map(lambda old, new: new + decay * (old - new), s.acting, u)
+        mean, end = lagged(s.acting, u, self.dt, self.tau)
         return LagState(self.base.step(s.inner, mean, a_ext), end)
