@@ -6,9 +6,10 @@ import dataclasses
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from ..control.gravity_frame import AtRest, Capped
+from ..control.gravity_frame import Capped, capped
 from ..learn.env import Env
 from ..physics.dynamics import Residual
+from ..physics.state import Command, State
 
 
 class AbstractView(eqx.Module):
@@ -44,11 +45,24 @@ class GravityView(AbstractView):
 
 
 class RestView(AbstractView):
-    """The frame of the gravity that the vehicle feels at rest; see :class:`retrim.control.gravity_frame.RestFrame`."""
+    """The frame of the gravity that the vehicle feels at rest at home, everywhere: pictures of it can be remembered."""
 
     limit: Float[Array, ""]
     """Largest norm of the disturbance that turns the frame [m/s^2]."""
 
     def __call__(self, env: Env, residual: Residual) -> Env:
         """Add the residual to the model, and let the frame answer what it says at rest."""
-        return dataclasses.replace(env.with_residual(residual), felt=AtRest(residual, env.task.home(), self.limit))
+        home = env.task.home()
+        d = capped(residual(State.at(home), Command.hover(home.dtype)), self.limit)
+        return dataclasses.replace(env.with_residual(residual), felt=Same(d))
+
+
+class Same(eqx.Module):
+    """The same disturbance whatever the state and the command."""
+
+    d: Float[Array, "3"]
+    """World [m/s^2]."""
+
+    def __call__(self, x: State, u: Command) -> Float[Array, "3"]:
+        """Return it."""
+        return self.d

@@ -39,8 +39,8 @@ class GravityFrame(AbstractController[GravityFrameState]):
     known: Residual | None = None
     """Residual that has been learnt, world frame [m/s^2]: what it says beyond what it says at rest needs no estimate,
     which would come late."""
-    age: Float[Array, ""] | None = None
-    """How old measurements are [s]: the controller inside is shown what they say of now; None for not at all."""
+    age: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(0.0))
+    """How old measurements are [s]: the controller inside is shown what they say of now."""
 
     def aged(self, age: float) -> "GravityFrame":
         """Return the same for measurements that are ``age`` old [s]."""
@@ -60,8 +60,7 @@ class GravityFrame(AbstractController[GravityFrameState]):
             observer = dataclasses.replace(observer, nominal=Hybrid(observer.nominal, unsteady))
         observed = observer(memory.observer, x)
         frame = FeltFrame.of(capped(observed.d_hat + felt, observer.limit))
-        if self.age is not None:
-            x = ahead(x, memory.observer.commands[0], frame.d, self.age.astype(x.p.dtype))
+        x = ahead(x, memory.observer.commands[0], frame.d, self.age.astype(x.p.dtype))
         u, inner = self.inner.in_frame(frame)(memory.inner, t, frame.state(x))
         u = frame.world_command(u)
         return u, GravityFrameState(observer.issued(observed, u), inner, frame)
@@ -96,25 +95,6 @@ class SeenFrame(AbstractController[tuple[OccludedMemory, Command]]):
     def accepted(self, memory: tuple[OccludedMemory, Command], u: Command) -> tuple[OccludedMemory, Command]:
         """Remember the accepted command."""
         return memory[0], u
-
-
-class AtRest(eqx.Module):
-    """What a residual predicts for a vehicle that rests at home, everywhere; its norm is limited."""
-
-    residual: Residual
-    home: Float[Array, "3"]
-    """World [m]."""
-    limit: Float[Array, ""]
-    """[m/s^2]"""
-
-    @property
-    def d(self) -> Float[Array, "3"]:
-        """The disturbance, world frame [m/s^2]."""
-        return capped(self.residual(State.at(self.home), Command.hover(self.home.dtype)), self.limit)
-
-    def __call__(self, x: State, u: Command) -> Float[Array, "3"]:
-        """Return the disturbance, wherever the vehicle is, world frame [m/s^2]."""
-        return self.d
 
 
 class Unsteady(eqx.Module):
