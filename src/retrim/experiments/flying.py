@@ -164,8 +164,8 @@ def _why(log: Log, error: float) -> str:
     x, y, z = log.p[-1]
     if not all(np.isfinite(part[-1]).all() for part in log.true):
         return "the state is not finite"
-    fell = f"below {FLOOR:g} m, under the ground" if z < FLOOR else f"{error:.2f} m off, out of the task's bounds"
-    return f"{fell}, at ({x:.2f}, {y:.2f}, {z:.2f}) m"
+    left = f"below {FLOOR:g} m, under the ground" if z < FLOOR else f"{error:.2f} m off, out of the task's bounds"
+    return f"{left}, at ({x:.2f}, {y:.2f}, {z:.2f}) m"
 
 
 def _out_of_bounds(task: AbstractTask, t: Any, x: State) -> Array:

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from jax import random
 
 from ...config.conditions import conditions
 from ...config.loading import load
@@ -12,6 +13,7 @@ from ...config.setup import Setup
 from ...errors import ConfigError, PlantError
 from ...viz import plots
 from ...viz.panels import Curve, Panel, heat_map, panel_figure
+from ..fleet import Fleet
 from ..flights import Flight
 from ..recovery import change_times, recoveries
 from ..reporter import Reporter
@@ -19,8 +21,11 @@ from ..run import Run
 from .document import Document, TableSection
 from .study import fly_all, table_presets, train_all
 
-METHODS: dict[str, tuple[str, ...]] = dict.fromkeys(("hover", "track"), ("base", "base-i", "base-do", "full"))
-METHODS["vision"] = ("base", "base-do", "full")  # integral action shifts a measured position, which it is not shown
+METHODS: dict[str, tuple[str, ...]] = {
+    "hover": ("base", "base-i", "base-do", "full"),
+    "track": ("base", "base-i", "base-do", "full"),
+    "vision": ("base", "base-do", "full"),  # integral action shifts a measured position, which it is not shown
+}
 METRICS = {"steady": "[m]", "late": "[m]", "peak": "[m]", "recovery_5cm": "[s]", "recovery_2cm": "[s]"}
 INTRO = """\
 Made by `retrim gauntlet`. The preset's own vehicle on plant `bem` unless the row says otherwise, at hover or on the
@@ -61,8 +66,8 @@ def gauntlet(
     known = conditions(loaded)
     if unknown := [name for name in only if name not in known]:
         raise ConfigError(f"no condition {unknown[0]!r}; there are {', '.join(known)}")
-    for method in methods:
-        find_method(method)
+    untrained = Setup.of(loaded).new_policy(random.key(0))  # what does not fit is refused before anything is trained
+    Fleet(loaded, untrained, [known[name] for name in only or known], methods=methods, starts=starts, seconds=seconds)
     document = Document(run, "gauntlet", "The gauntlet", INTRO, seeds, reporter, data="results")
     study = train_all(loaded, seeds, run, reporter)
     home, flown, left_out = Setup.of(loaded).flown.home(), dict[str, list[Flight]](), list[str]()
