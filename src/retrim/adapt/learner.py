@@ -21,6 +21,8 @@ from .optimisers import AbstractPolicyOptimiser
 from .starts import AbstractStarts, TaskStarts, drawn
 from .views import AbstractView, WorldView
 
+HELD_OUT = 8  # starts that the gate flies
+
 
 class LearnerState(eqx.Module):
     """What has been learnt so far, in two halves, so that two processes can own one each."""
@@ -112,8 +114,8 @@ class OnlineLearner(eqx.Module):
         trained, _ = bptt(begun, corrected, x0, optimiser=self.optimiser.transformation(self.num_updates))
         held_out = jax.tree.map(
             lambda a, b: jnp.concatenate([a, b]),
-            jax.vmap(self.env.task.reset)(random.split(k_gate, 4)),
-            drawn(window, k_window, (4,)),
+            jax.vmap(self.env.task.reset)(random.split(k_gate, HELD_OUT // 2)),
+            drawn(window, k_window, (HELD_OUT // 2,)),
         )
         return trained, judge(trained.policy.merged(), state.policy.merged(), corrected, held_out)
 

@@ -27,14 +27,16 @@ def on_one_core() -> None:
 
 
 def unit() -> Callable[[], float]:
-    """Return a function that takes the time of one unit now [s], the median of five runs."""
+    """Return a function that takes the time of one unit now [s], the median of three runs."""
     weight = jnp.full((WIDTH, WIDTH), 1.0 / WIDTH)
 
     @jax.jit
     def scanned(x: Any) -> Any:
         return lax.scan(lambda x, _: (x @ weight, None), x, None, length=STEPS)[0]
 
-    return lambda: _median(lambda: scanned(jnp.ones((ROWS, WIDTH))), 5)
+    rows = jnp.ones((ROWS, WIDTH))
+    jax.block_until_ready(scanned(rows))
+    return lambda: statistics.median(seconds(lambda: scanned(rows)) for _ in range(3))
 
 
 def rates() -> dict[str, float]:

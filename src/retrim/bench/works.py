@@ -15,7 +15,7 @@ from jaxtyping import Array, Key
 
 from ..adapt.buffer import RollingBuffer
 from ..adapt.gate import Verdict
-from ..adapt.learner import LearnerState, OnlineLearner
+from ..adapt.learner import HELD_OUT, LearnerState, OnlineLearner
 from ..config.disturbances import disturbance
 from ..config.loading import load
 from ..config.scenario import Scenario
@@ -35,8 +35,6 @@ from ..runtime.flight import fly
 from .machine import on_one_core, rates
 from .timing import Work, compiled, timed
 from .training import encode_and_pretrain, pretrain
-
-HELD_OUT = 8  # starts of the gate
 
 
 def _learner(name: str = "hover/paper") -> tuple[OnlineLearner, LearnerState, Window]:

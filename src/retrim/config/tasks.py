@@ -95,9 +95,10 @@ def _vision(request: TaskRequest) -> AbstractTask:
     training = Keypoints.of(
         jnp.array(p.goal), omega_max, noise=table.pixel_noise, whitened=table.whiten_pixels, dt=p.dt
     )
-    # A filter estimates the pose so well that training need not know of it.
-    lag = None if p.actuator_tau is None else jnp.array(p.actuator_tau)
-    flown = OccludedKeypoints(training, jnp.array(table.dropout), lag, delay_ticks=p.plant_delay_ticks)
+    flown: OccludedKeypoints | None = None
+    if table.occlusion:  # a filter estimates the pose so well that training need not know of it
+        lag = None if p.actuator_tau is None else jnp.array(p.actuator_tau)
+        flown = OccludedKeypoints(training, jnp.array(table.dropout), lag, delay_ticks=p.plant_delay_ticks)
     kind = VISION_REWARDS[p.reward]
     return kind(
         jnp.array(p.goal),
@@ -106,7 +107,7 @@ def _vision(request: TaskRequest) -> AbstractTask:
         jnp.array(p.pretrain.max_start_yaw),
         p.dt,
         p.pretrain.horizon,
-        flown if table.occlusion else None,
+        flown,
     )
 
 

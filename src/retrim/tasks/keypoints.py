@@ -135,7 +135,7 @@ class Keypoints(AbstractObservation[KeypointMemory]):
         self, memory: KeypointMemory, t: Float[Array, ""], x: State, last: Command
     ) -> tuple[Float[Array, " o"], KeypointMemory]:
         """Return the observation after one more frame."""
-        key, k_noise, _ = random.split(memory.key, 3)  # the third is that of dropout
+        key, k_noise, _ = random.split(memory.key, 3)  # three, for the noise of OccludedKeypoints
         true, visible = self.pixels(x)
         shown = true + lax.stop_gradient(self.deviation(k_noise, true.dtype))
         frames = jnp.concatenate([memory.frames, shown.reshape(1, 14)])[1:]
