@@ -236,10 +236,10 @@ def test_the_largest_ranks_are_possible(base, key):
 
 def test_a_delta_must_fit(base, lora, key):
     with pytest.raises(ValueError, match="2 deltas for 3 layers"):
-        LoraPolicy(base, lora.delta[:2], lora.scale)
+        LoraPolicy(base, lora.delta[:2], lora.scale, lora.shift)
     wider = LoraPolicy.of(Policy.of(15, small(), key=key, hidden=(9, 8)), key=key, ranks=RANKS)
     with pytest.raises(ValueError, match=r"layer 0 has weights \(8, 15\), the delta \(9, 3\) x \(3, 15\)"):
-        LoraPolicy(base, wider.delta, lora.scale)
+        LoraPolicy(base, wider.delta, lora.scale, lora.shift)
     with pytest.raises(ValueError, match="layer 0"):
         lora.with_params(wider.delta)
     with pytest.raises(TypeError, match="rank"):  # by the shape check, which tests switch on

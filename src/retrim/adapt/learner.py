@@ -19,6 +19,7 @@ from ..physics.state import where
 from .gate import Verdict, all_finite, judge
 from .optimisers import AbstractPolicyOptimiser
 from .starts import AbstractStarts, TaskStarts, drawn
+from .trim import AbstractTrim, Untrimmed
 from .views import AbstractView, WorldView
 
 HELD_OUT = 8  # starts that the gate flies
@@ -59,6 +60,8 @@ class OnlineLearner(eqx.Module):
     """Where they lie."""
     view: AbstractView = WorldView()
     """Coordinates in which the policy is trained, and flown."""
+    trim: AbstractTrim = Untrimmed()
+    """What it commands at rest after an update."""
 
     def __check_init__(self) -> None:
         """Raise ``ValueError`` for sizes that cannot work."""
@@ -111,7 +114,8 @@ class OnlineLearner(eqx.Module):
         k_train, k_gate, k_window = random.split(key, 3)
         x0 = self.starts(self.env.task, window, k_train, self.num_updates, self.num_envs)
         begun = self.optimiser.begin(state, self.num_updates)
-        trained, _ = bptt(begun, corrected, x0, optimiser=self.optimiser.transformation(self.num_updates))
+        stepped, _ = bptt(begun, corrected, x0, optimiser=self.optimiser.transformation(self.num_updates))
+        trained = PolicyState(self.trim(stepped.policy, corrected, window), stepped.optimiser)
         held_out = jax.tree.map(
             lambda a, b: jnp.concatenate([a, b]),
             jax.vmap(self.env.task.reset)(random.split(k_gate, HELD_OUT // 2)),

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from ..adapt.learner import OnlineLearner
 from ..adapt.optimisers import CarriedAdam, FreshAdam
 from ..adapt.starts import FlownStarts, TaskStarts
+from ..adapt.trim import RestTrim, Untrimmed
 from ..adapt.views import AbstractView, GravityView, RestView, WorldView
 from ..control.controller import AbstractController, PolicyController
 from ..control.gravity_frame import GravityFrame, SeenFrame
@@ -51,6 +52,7 @@ def make_learner(preset: Preset, model: ResidualModel, env: Env) -> OnlineLearne
         num_envs=a.num_envs,
         starts=TaskStarts() if a.task_starts is None else FlownStarts(jnp.array(a.start_noise), a.task_starts),
         view=_view(preset, env.task),
+        trim=RestTrim() if a.trim == "rest" else Untrimmed(),
     )
 
 

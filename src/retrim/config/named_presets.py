@@ -45,7 +45,7 @@ RETRIM = dataclasses.replace(
     pretrain=dataclasses.replace(FAST.pretrain, num_updates=300, learning_rate=3e-3, hidden_sizes=(128, 128)),
     adapt=Adapt(
         residual="regression", fit_every=0.2, update_every=0.5, num_updates=5, learning_rate=1e-4, max_grad_norm=1.0,
-        optimiser="carried", task_starts=2, frame="gravity", fit_latency=0.02, update_latency=0.1,
+        optimiser="carried", task_starts=2, frame="gravity", trim="rest", fit_latency=0.02, update_latency=0.1,
     ),
 )  # fmt: skip
 
@@ -58,7 +58,7 @@ TRACK_RETRIM = dataclasses.replace(
     pretrain=dataclasses.replace(
         TRACK.pretrain, num_updates=1200, learning_rate=5e-3, adam_b2=0.95, hidden_sizes=(128, 128)
     ),
-    adapt=dataclasses.replace(RETRIM.adapt, window=150, memory=2.0, thrust_prior=0.2),
+    adapt=dataclasses.replace(RETRIM.adapt, window=150, memory=2.0, thrust_prior=0.2, trim="free"),
 )
 
 TRACK_FAST = dataclasses.replace(

@@ -82,6 +82,8 @@ class Adapt:
     frame: Literal["world", "gravity"] = "world"
     """gravity: fly and train in the frame of the gravity that is felt. A disturbance observer feels it, beside what the
     residual predicts; for a policy that sees occluded keypoints, the pose filter does, which needs no state."""
+    trim: Literal["free", "rest"] = "free"
+    """rest: after an update the policy is shifted so that at rest at home it commands hover."""
     fit_latency: Seconds = 0.2
     """Flight time until a fitted residual is used [s]."""
     update_latency: Seconds = 1.0
@@ -163,6 +165,8 @@ class Preset:
         for reward, task in (("sharp", "track"), ("view", "vision")):
             if self.reward == reward and self.task != task:
                 raise ValueError(f"reward = {reward!r} is for task = {task!r}, not for {self.task!r}")
+        if self.adapt.trim == "rest" and self.task == "track":
+            raise ValueError("adapt.trim = 'rest' is for a task that rests at home, not for 'track'")
         if self.options and self.task in BUILT_IN_TASKS:
             raise ValueError(f"a table [options] is for a task of one's own, not for {self.task!r}")
         if abs(1000 * self.dt - round(1000 * self.dt)) > 1e-6:

@@ -30,6 +30,8 @@ class LoraPolicy(eqx.Module):
     base: Policy
     delta: tuple[LowRankFactors, ...]
     scale: Float[Array, ""]
+    shift: Float[Array, "4"]
+    """Added to the output of the network; no optimiser trains it."""
 
     def __check_init__(self) -> None:
         """Raise ``ValueError``, with the shapes, if the delta does not fit the base."""
@@ -65,7 +67,8 @@ class LoraPolicy(eqx.Module):
             dtype, bound = layer.weight.dtype, fan_in**-0.5
             down = random.uniform(k, (rank, fan_in), dtype, minval=-bound, maxval=bound)
             thin.append(LowRankFactors(down, jnp.zeros((fan_out, rank), dtype=dtype)))
-        return cls(base, tuple(thin), jnp.array(scale, dtype=base.layers[0].weight.dtype))
+        dtype = base.layers[0].weight.dtype
+        return cls(base, tuple(thin), jnp.array(scale, dtype=dtype), jnp.zeros(4, dtype=dtype))
 
     @property
     def params(self) -> tuple[LowRankFactors, ...]:
@@ -74,13 +77,17 @@ class LoraPolicy(eqx.Module):
 
     def with_params(self, delta: tuple[LowRankFactors, ...]) -> "LoraPolicy":
         """Return the same base with another delta."""
-        return LoraPolicy(self.base, delta, self.scale)
+        return LoraPolicy(self.base, delta, self.scale, self.shift)
+
+    def shifted(self, by: Float[Array, "4"]) -> "LoraPolicy":
+        """Return the policy whose output is ``by`` larger, for every observation; base and delta stay."""
+        return LoraPolicy(self.base, self.delta, self.scale, self.shift + by)
 
     def merged(self) -> Policy:
         """Return a plain policy with the delta merged into its weights; no gradient flows to the base."""
-        base, scale = lax.stop_gradient((self.base, self.scale))
+        base, scale, shift = lax.stop_gradient((self.base, self.scale, self.shift))
         layers: Layers = tuple(
             eqx.tree_at(lambda l: l.weight, layer, layer.weight + scale * thin.up @ thin.down)
             for layer, thin in zip(base.layers, self.delta, strict=True)
         )
-        return base.with_params(layers)
+        return base.with_params(layers).shifted(shift)

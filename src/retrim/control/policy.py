@@ -68,12 +68,21 @@ class Policy(eqx.Module):
         """Return itself; a low-rank policy merges its delta here."""
         return self
 
+    def shifted(self, by: Float[Array, "4"]) -> "Policy":
+        """Return the policy whose output is ``by`` larger, for every observation."""
+        *layers, last = self.layers
+        return self.with_params((*layers, eqx.tree_at(lambda l: l.bias, last, replace_fn=lambda bias: bias + by)))
+
     def __call__(self, observation: Float[Array, " o"]) -> Command:
         """Return the command for one observation."""
+        return self.bounded(self.output(observation))
+
+    def output(self, observation: Float[Array, " o"]) -> Float[Array, "4"]:
+        """Return the network's output y for one observation."""
         h = observation
         for layer in self.layers[:-1]:
             h = jax.nn.relu(layer(h))
-        return self.bounded(self.layers[-1](h))
+        return self.layers[-1](h)
 
     def perturbed(self, observation: Float[Array, " o"], perturbations: Perturbations) -> tuple[Command, Inputs]:
         """Return the command with ``perturbations[l]`` added to the output of layer l, without gradients to weights.

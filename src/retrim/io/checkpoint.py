@@ -99,7 +99,7 @@ def save_delta(path: str | Path, policy: LoraPolicy) -> None:
         OSError: The file cannot be written.
     """
     about = {"base": fingerprint(policy.base), **lora_header(policy)}
-    write_whole(Path(path), wire.pack(policy.delta, kind="delta", about=about))
+    write_whole(Path(path), wire.pack((policy.delta, policy.shift), kind="delta", about=about))
 
 
 def load_delta(path: str | Path, base: Policy) -> LoraPolicy:
@@ -122,10 +122,10 @@ def load_delta(path: str | Path, base: Policy) -> LoraPolicy:
                 f"{path}: made for another base policy, {made_for}..., not for {fingerprint(base)[:12]}..."
             )
         like = lora_like(base, header, source=str(path))
-        delta = wire.unpack(data, like.delta, kind="delta", source=str(path))
+        delta, shift = wire.unpack(data, (like.delta, like.shift), kind="delta", source=str(path))
     except MessageError as error:
         raise CheckpointError(str(error)) from error
-    return LoraPolicy(base, delta, jnp.asarray(float(header["scale"]), dtype=base.layers[0].weight.dtype))
+    return LoraPolicy(base, delta, jnp.asarray(float(header["scale"]), dtype=base.layers[0].weight.dtype), shift)
 
 
 def lora_header(policy: LoraPolicy) -> dict[str, str]:

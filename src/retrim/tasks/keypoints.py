@@ -109,6 +109,10 @@ class Keypoints(AbstractObservation[KeypointMemory]):
 
         return jax.vmap(frame)(ago)
 
+    def at_rest(self, x: State) -> Float[Array, " o"]:
+        """Return what a camera without noise sees."""
+        return AbstractObservation.at_rest(dataclasses.replace(self, noise=jnp.zeros_like(self.noise)), x)
+
     def in_frame(self, frame: FeltFrame) -> "Keypoints":
         """Return what a camera would show in ``frame``, in which the ground is level."""
         return dataclasses.replace(self, goal=frame.vector(self.goal))

@@ -43,6 +43,11 @@ class AbstractObservation(eqx.Module, Generic[M]):
             The observation, and the new memory of the same shapes.
         """
 
+    def at_rest(self, x: State) -> Float[Array, " o"]:
+        """Return what a vehicle sees that has rested in ``x``, without noise."""
+        o, _ = self(self.init(x), jnp.zeros_like(x.p[0]), x, Command.hover(x.p.dtype))
+        return o
+
     def in_frame(self, frame: FeltFrame) -> "AbstractObservation[M]":
         """Return the same observation for states and commands of ``frame``.
 
