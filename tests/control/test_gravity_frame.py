@@ -13,9 +13,10 @@ from retrim.control import Policy
 from retrim.control.controller import PolicyController
 from retrim.control.gravity_frame import GravityFrame, SeenFrame, Unsteady
 from retrim.estimation.disturbance_observer import DisturbanceObserver
-from retrim.learn import Env, rollout
+from retrim.learn import Env, FittedResidual, rollout
+from retrim.learn.residuals import RegressionModel
 from retrim.physics import Command, Hybrid, PointMass, State, small, so3
-from retrim.physics.actuators import Lagged
+from retrim.physics.actuators import Lagged, RateBiased
 from retrim.physics.felt_frame import FeltFrame
 from retrim.tasks import Keypoints, L2Track, OccludedKeypoints, Preview, Start, Track
 from retrim.tasks.shapes import circle, figure8, star
@@ -262,3 +263,37 @@ def test_a_flight_under_a_known_push_is_the_calm_flight_turned(d, tracking):
         positions.append(frame.vector(x.p))
         memory, x = tick(memory, x, jnp.array(float(k)))
     np.testing.assert_allclose(np.stack(positions), calm.x.p[:40], atol=1e-6)
+
+
+def test_a_known_rate_bias_is_taken_off_the_command(key):
+    """A vehicle that turns too fast flies, tick for tick, as one that does not; the policy remembers what it meant."""
+    bias, policy = jnp.array([0.3, -0.2, 0.1]), Policy.of(23, small(), key=key, hidden=(8, 8))
+    observer = DisturbanceObserver(PointMass(0.02), jnp.array(0.05), LIMIT, jnp.array(4.0))
+    inner = PolicyController(hover_env(history=2).task.observation, jax.tree.map(lambda leaf: leaf + 0.02, policy))
+    plain, told_less = (GravityFrame(inner, observer, rate_bias=b) for b in (jnp.zeros(3), bias))
+
+    @eqx.filter_jit
+    def fly(controller, model):
+        x, trail = State.at(HOME + 0.1), []
+        memory = controller.init(x)
+        for i in range(10):
+            u, memory = controller(memory, jnp.array(0.02 * i), x)
+            memory = controller.accepted(memory, u)
+            x = model.step(x, u, jnp.zeros(3))
+            trail.append(x)
+        return trail
+
+    close(fly(told_less, RateBiased(PointMass(0.02), bias)), fly(plain, PointMass(0.02)), 1e-9)
+
+
+def test_a_corrected_model_turns_as_the_vehicle_was_seen_to_turn(key):
+    """In the world with bias and lag; in the frame, whose controller answers the bias, with the lag."""
+    model = RegressionModel.of(0.02)
+    fresh = model.init(key)
+    known = replaced(fresh, rates=replaced(fresh.rates, bias=jnp.array([0.3, 0.0, 0.0]), tau=jnp.array(0.08)))
+    env = hover_env(Lagged(PointMass(0.02), jnp.array(0.03)))
+    world, framed = (view(env, FittedResidual(model, known)).dynamics for view in (WorldView(), GravityView(LIMIT)))
+    true = Lagged(PointMass(0.02), jnp.array(0.08))
+    for seen, expected in ((world, RateBiased(true, known.rates.bias)), (framed, true)):
+        x, u = random_state(key), random_command(key)
+        close(seen.step(seen.init(x), u, jnp.zeros(3)), expected.step(expected.init(x), u, jnp.zeros(3)))

@@ -178,7 +178,7 @@ def test_a_log_gives_the_window_that_was_seen_in_flight(key):
 
         def act(self, measurement):
             u = inner.act(measurement)
-            buffer.push(measurement.t, measurement.x, u)
+            buffer.push(measurement.t, measurement.x, u, measurement.age)
             return u
 
         def accepted(self, u):

@@ -18,22 +18,22 @@ class RollingBuffer:
         if size < 2:
             raise ValueError(f"RollingBuffer: size = {size} must be at least 2, for one difference of velocity")
         # Leaves in NumPy: a tick is converted once, and not for every window that it is part of.
-        self._rows: deque[tuple[float, list[np.ndarray]]] = deque(maxlen=size)
+        self._rows: deque[tuple[float, float, list[np.ndarray]]] = deque(maxlen=size)
         self._structure: Any = None
         self._size = size
 
     def __len__(self) -> int:
         return len(self._rows)
 
-    def push(self, t: float, x: State, u: Command) -> None:
-        """Append the measured state at the tick of time ``t`` [s] and the command issued at it."""
+    def push(self, t: float, x: State, u: Command, age: float = 0.0) -> None:
+        """Append the measured state at the tick of time ``t`` [s], its ``age`` [s], and the command issued at it."""
         leaves, self._structure = jax.tree.flatten((x, u))
-        self._rows.append((t, [np.asarray(leaf) for leaf in leaves]))
+        self._rows.append((t, age, [np.asarray(leaf) for leaf in leaves]))
 
     def accepted(self, u: Command) -> None:
         """Replace the last command by the one that the plant accepted."""
         late = [np.asarray(leaf) for leaf in jax.tree.leaves(u)]
-        _, leaves = self._rows[-1]
+        _, _, leaves = self._rows[-1]
         leaves[-len(late) :] = late
 
     def clear(self) -> None:
@@ -50,7 +50,7 @@ class RollingBuffer:
             raise ValueError("RollingBuffer: no tick was pushed yet")
         missing = self._size - len(self._rows)
         rows = [self._rows[0]] * missing + list(self._rows)
-        columns = zip(*(leaves for _, leaves in rows), strict=True)
+        columns = zip(*(leaves for _, _, leaves in rows), strict=True)
         x, u = jax.tree.unflatten(self._structure, [jnp.asarray(np.stack(column)) for column in columns])
-        t = jnp.asarray(np.array([t for t, _ in rows]), dtype=x.p.dtype)
-        return Window(t, x, u, jnp.arange(self._size) >= missing)
+        t, age = (jnp.asarray(np.array(column), dtype=x.p.dtype) for column in list(zip(*rows, strict=True))[:2])
+        return Window(t, x, u, jnp.arange(self._size) >= missing, age)

@@ -8,6 +8,9 @@ from jaxtyping import Array, Float
 
 from ..control.gravity_frame import Capped, capped
 from ..learn.env import Env
+from ..learn.residuals.model import FittedResidual
+from ..learn.residuals.rates import RateFit
+from ..physics.actuators import Lagged, RateBiased
 from ..physics.dynamics import Residual
 from ..physics.state import Command, State
 
@@ -29,7 +32,11 @@ class WorldView(AbstractView):
     """The world as it is (the paper)."""
 
     def __call__(self, env: Env, residual: Residual) -> Env:
-        """Add the residual to the model."""
+        """Add the residual to the model, which turns as the vehicle was seen to turn."""
+        found = turning_of(residual)
+        env = with_lag(env, found)
+        if found is not None:
+            env = dataclasses.replace(env, dynamics=RateBiased(env.dynamics, found.bias))
         return env.with_residual(residual)
 
 
@@ -40,7 +47,8 @@ class GravityView(AbstractView):
     """Largest norm of the disturbance that turns the frame [m/s^2]."""
 
     def __call__(self, env: Env, residual: Residual) -> Env:
-        """Add the residual to the model, and let the frame answer it."""
+        """Add the residual to the model, and let the frame answer it, and a bias of the rates."""
+        env = with_lag(env, turning_of(residual))
         return dataclasses.replace(env.with_residual(residual), felt=Capped(residual, self.limit))
 
 
@@ -54,7 +62,20 @@ class RestView(AbstractView):
         """Add the residual to the model, and let the frame answer what it says at rest."""
         home = env.task.home()
         d = capped(residual(State.at(home), Command.hover(home.dtype)), self.limit)
+        env = with_lag(env, turning_of(residual))
         return dataclasses.replace(env.with_residual(residual), felt=Same(d))
+
+
+def turning_of(residual: Residual) -> RateFit | None:
+    """Return what was learnt of how the vehicle turns, if something was."""
+    return residual.turning if isinstance(residual, FittedResidual) else None
+
+
+def with_lag(env: Env, found: RateFit | None) -> Env:
+    """Return the environment with the lag that was identified, if it has a lag and one was."""
+    if found is None or not isinstance(env.dynamics, Lagged):
+        return env
+    return dataclasses.replace(env, dynamics=Lagged(env.dynamics.base, found.tau))
 
 
 class Same(eqx.Module):

@@ -15,8 +15,8 @@ from ..control.gravity_frame import GravityFrame, SeenFrame
 from ..errors import ConfigError, FrameError
 from ..estimation.disturbance_observer import DisturbanceObserver
 from ..learn.env import Env
-from ..learn.residuals.model import ResidualModel
-from ..physics.dynamics import PointMass, Residual
+from ..learn.residuals.model import FittedResidual, ResidualModel
+from ..physics.dynamics import PointMass
 from ..physics.felt_frame import FeltFrame
 from ..tasks.keypoints import Keypoints
 from ..tasks.occluded import OccludedKeypoints
@@ -82,14 +82,15 @@ def check_frame(preset: Preset, task: AbstractTask) -> None:
 
 
 def felt_frame(
-    controller: AbstractController[Any], preset: Preset, known: Residual | None = None
+    controller: AbstractController[Any], preset: Preset, known: FittedResidual | None = None
 ) -> GravityFrame | SeenFrame:
     """Return a controller, flown in the gravity that is felt: by a disturbance observer, or by its own pose filter.
 
     Args:
         controller: It can be turned.
         preset: Its control period and declared delay are those of the observer.
-        known: What is known of the residual; the observer sees the rest. A pose filter sees it all.
+        known: What was learnt of the residual and of the body rates; the observer sees the rest. A pose filter sees
+            it all.
     """
     limit = jnp.array(TILT_LIMIT)
     if isinstance(controller, PolicyController) and isinstance(controller.observation, OccludedKeypoints):
@@ -97,4 +98,6 @@ def felt_frame(
     observer = DisturbanceObserver(
         PointMass(preset.dt), jnp.array(OBSERVER_TAU), limit, jnp.array(WANDER), delay_ticks=preset.plant_delay_ticks
     )
-    return GravityFrame(controller, observer, known)
+    found = None if known is None else known.turning
+    bias = jnp.zeros(3) if found is None else found.bias
+    return GravityFrame(controller, observer, known, rate_bias=bias)

@@ -50,7 +50,8 @@ class Adapt:
     window: int = Field(default=100, ge=12, le=100_000, strict=True)
     """Ticks of flight that are remembered."""
     residual: str = "ensemble"
-    """Residual model: ensemble (the paper's), regression (ten physical numbers), or module:name."""
+    """Residual model: ensemble (the paper's), regression (ten physical numbers), layered (an ensemble on what the
+    regression leaves), or module:name."""
     memory: Seconds = 0.5
     """Regression: a tick counts for 1/e of the newest after this long [s]."""
     thrust_prior: float = Field(default=0.05, gt=0, le=1.0, strict=True)

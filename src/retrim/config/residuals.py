@@ -7,6 +7,7 @@ import jax.numpy as jnp
 
 from ..errors import ConfigError
 from ..learn.residuals.ensemble import EnsembleModel
+from ..learn.residuals.layered import LayeredModel
 from ..learn.residuals.model import ResidualModel
 from ..learn.residuals.regression import RegressionModel
 from ..physics.vehicle import Vehicle
@@ -40,7 +41,7 @@ def make_residual(request: ResidualRequest) -> ResidualModel:
     return model
 
 
-def _ensemble(request: ResidualRequest) -> ResidualModel:
+def _ensemble(request: ResidualRequest) -> EnsembleModel:
     a = request.preset.adapt
     return EnsembleModel(
         jnp.array(request.preset.goal),
@@ -51,10 +52,15 @@ def _ensemble(request: ResidualRequest) -> ResidualModel:
     )
 
 
-def _regression(request: ResidualRequest) -> ResidualModel:
+def _regression(request: ResidualRequest) -> RegressionModel:
     a = request.preset.adapt
     return RegressionModel.of(request.preset.dt, memory=a.memory, thrust_prior=a.thrust_prior)
 
 
+def _layered(request: ResidualRequest) -> ResidualModel:
+    return LayeredModel(_regression(request), _ensemble(request))
+
+
 register_residual("ensemble", _ensemble)
 register_residual("regression", _regression)
+register_residual("layered", _layered)

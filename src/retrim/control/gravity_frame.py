@@ -42,6 +42,9 @@ class GravityFrame(AbstractController[GravityFrameState]):
     age: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(0.0))
     """How old measurements are [s]: the controller inside is shown what they say of now."""
 
+    rate_bias: Float[Array, "3"] = eqx.field(default_factory=lambda: jnp.zeros(3))
+    """The vehicle turns so much faster than it is told [rad/s], so it is told less."""
+
     def aged(self, age: float) -> "GravityFrame":
         """Return the same for measurements that are ``age`` old [s]."""
         return dataclasses.replace(self, age=jnp.array(age)) if age > 0.0 else self
@@ -63,12 +66,14 @@ class GravityFrame(AbstractController[GravityFrameState]):
         x = ahead(x, memory.observer.commands[0], frame.d, self.age.astype(x.p.dtype))
         u, inner = self.inner.in_frame(frame)(memory.inner, t, frame.state(x))
         u = frame.world_command(u)
+        u = Command(u.c, u.omega - self.rate_bias.astype(u.omega.dtype))
         return u, GravityFrameState(observer.issued(observed, u), inner, frame)
 
     def accepted(self, memory: GravityFrameState, u: Command) -> GravityFrameState:
         """Remember the accepted command, in the observer and, as the frame has it, in the controller inside."""
         observer = self.observer.accepted(memory.observer, u)
-        return GravityFrameState(observer, self.inner.accepted(memory.inner, memory.frame.command(u)), memory.frame)
+        meant = memory.frame.command(Command(u.c, u.omega + self.rate_bias.astype(u.omega.dtype)))
+        return GravityFrameState(observer, self.inner.accepted(memory.inner, meant), memory.frame)
 
 
 class SeenFrame(AbstractController[tuple[OccludedMemory, Command]]):

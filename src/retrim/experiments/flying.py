@@ -138,7 +138,9 @@ def _until_terminated(task: AbstractTask, log: Log) -> Log:
     rows = int(left[0]) + 2
     true, measured = (States(*(part[:rows] for part in states)) for states in (log.true, log.measured))
     events = tuple(event for event in log.events if event.t < log.t[rows - 1])
-    return Log(log.t[:rows], true, measured, log.u[:rows], log.dt, True, events)
+    return Log(
+        log.t[:rows], true, measured, log.u[:rows], log.dt, True, events, np.broadcast_to(log.age, log.t.shape)[:rows]
+    )
 
 
 def _scored(setup: Setup, spec: FlightSpec, log: Log, pilot: Pilot) -> Flight:

@@ -93,6 +93,7 @@ def write_logs(flights: Sequence[Flight], folder: Path) -> None:
                 R_measured=log.measured.R,
                 v_measured=log.measured.v,
                 u=log.u,
+                age=np.broadcast_to(log.age, log.t.shape),
                 error=flight.error,
                 terminated=log.terminated,
             )

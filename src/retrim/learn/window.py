@@ -19,6 +19,8 @@ class Window(eqx.Module):
     u: Command
     """Command that the plant accepted at each tick (leading axis n)."""
     valid: Bool[Array, " n"]
+    age: Float[Array, " n"] | None = None
+    """How old each measurement was [s]; None for not at all."""
 
     @classmethod
     def of(

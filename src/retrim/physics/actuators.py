@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .dynamics import AbstractDynamics
+from .dynamics import AbstractDynamics, AbstractWrapper
 from .state import Command, State
 
 X = TypeVar("X")
@@ -38,6 +38,18 @@ def lagged(acting: Command, u: Command, dt: float, tau: Float[Array, ""]) -> tup
         jax.tree.map(lambda old, new, share=share: new + share * (old - new), acting, u) for share in (left, decay)
     )
     return mean, end
+
+
+class RateBiased(AbstractWrapper[X]):
+    """The vehicle turns faster than it is told, by a constant."""
+
+    base: AbstractDynamics[X]
+    bias: Float[Array, "3"]
+    """Body frame [rad/s]."""
+
+    def step(self, s: X, u: Command, a_ext: Float[Array, "3"]) -> X:
+        """Advance the base model by one tick under the rates that the vehicle turns at."""
+        return self.base.step(s, Command(u.c, u.omega + self.bias), a_ext)
 
 
 class Lagged(AbstractDynamics[LagState[X]]):

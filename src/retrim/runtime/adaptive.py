@@ -77,7 +77,7 @@ class AdaptivePilot(Pilot):
         tick = round(t / self.dt)
         self._apply(t, tick)
         u = self._pilot.act(measurement)
-        self._buffer.push(t, measurement.x, u)
+        self._buffer.push(t, measurement.x, u, measurement.age)
         due = [i for i, period in enumerate(self.periods) if tick // period > self._ticks_offered[i]]
         if due:
             window = self._buffer.window()

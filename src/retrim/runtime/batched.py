@@ -72,7 +72,8 @@ class Batch:
         x = jax.tree.map(lambda leaf: jnp.asarray(np.repeat(np.asarray(leaf)[:, None], size, axis=1)), self._starts)
         hover = Command.hover(x.p.dtype)
         u = jax.tree.map(lambda leaf: jnp.asarray(np.broadcast_to(leaf, (n, size, *leaf.shape))), hover)
-        blank: Window = jax.vmap(Window)(jnp.zeros((n, size), x.p.dtype), x, u, jnp.ones((n, size), dtype=bool))
+        nothing, every = jnp.zeros((n, size), x.p.dtype), jnp.ones((n, size), dtype=bool)
+        blank: Window = jax.vmap(Window)(nothing, x, u, every, nothing)
         return blank
 
     def window(self, tick: int, size: int) -> Window:
@@ -85,7 +86,8 @@ class Batch:
         u = jax.tree.map(newest, self._rows.accepted, self._rows.issued)
         n = x.p.shape[0]
         t = jnp.asarray(np.broadcast_to(at * self.dt, (n, size)), dtype=x.p.dtype)
-        windows: Window = jax.vmap(Window)(t, x, u, jnp.asarray(np.broadcast_to(wanted >= 0, (n, size))))
+        valid, age = jnp.asarray(np.broadcast_to(wanted >= 0, (n, size))), jnp.full_like(t, self._simulations.age)
+        windows: Window = jax.vmap(Window)(t, x, u, valid, age)
         return windows
 
     def log(self, i: int, events: Sequence[Event]) -> Log:
@@ -107,6 +109,7 @@ class Batch:
             self.dt,
             False,
             tuple(events),
+            self._simulations.age,
         )
 
 

@@ -52,6 +52,8 @@ class Log(NamedTuple):
     terminated: bool
     """The vehicle left the task's bounds; the flight ended there."""
     events: tuple[Event, ...] = ()
+    age: np.ndarray | float = 0.0
+    """How old each row's measurement was [s]."""
 
     @property
     def p(self) -> np.ndarray:
@@ -89,19 +91,20 @@ class Log(NamedTuple):
         states = jax.tree.map(lambda leaf: leaf[last - ticks : last], self.measured.as_state())
         t = jnp.asarray(self.t[last - ticks : last], dtype=states.p.dtype)
         u = jax.vmap(Command.of)(jnp.asarray(self.u[last - ticks + 1 : last + 1], dtype=states.p.dtype))
-        return Window(t, states, u, jnp.ones(ticks, dtype=bool))
+        age = np.broadcast_to(self.age, self.t.shape)[last - ticks : last]
+        return Window(t, states, u, jnp.ones(ticks, dtype=bool), jnp.asarray(age, dtype=states.p.dtype))
 
 
 class Recorder:
     """An observer that keeps the whole flight."""
 
     def __init__(self) -> None:
-        self._rows: list[tuple[float, State, State, Command]] = []
+        self._rows: list[tuple[float, State, State, Command, float]] = []
         self._events: list[Event] = []
 
     def measurement(self, measurement: Measurement, u: Command) -> None:
         """Keep a measurement, and the command accepted for the tick that it ended."""
-        self._rows.append((measurement.t, measurement.true_state, measurement.x, u))
+        self._rows.append((measurement.t, measurement.true_state, measurement.x, u, measurement.age))
 
     def event(self, event: Event) -> None:
         """Keep an event."""
@@ -109,10 +112,10 @@ class Recorder:
 
     def log(self, dt: float, *, terminated: bool) -> Log:
         """Return what was recorded."""
-        times, true, measured, commands = zip(*self._rows, strict=True)
+        times, true, measured, commands, ages = zip(*self._rows, strict=True)
         t = np.array(times)
         u = np.stack([as_numpy(command) for command in commands])
-        return Log(t - t[0], _stacked(true), _stacked(measured), u, dt, terminated, tuple(self._events))
+        return Log(t - t[0], _stacked(true), _stacked(measured), u, dt, terminated, tuple(self._events), np.array(ages))
 
 
 def fly(

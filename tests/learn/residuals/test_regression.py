@@ -25,7 +25,7 @@ def rows_of(parameters, key, n=96, noise=0.0, valid=None):
     parameters = jnp.broadcast_to(jnp.asarray(parameters), (n, 10))
     a_res = jnp.einsum("nik,nk->ni", jax.vmap(features_of)(x, u), parameters)
     a_res = a_res + noise * random.normal(k_noise, a_res.shape)
-    return Targets(x, u, a_res, jnp.ones(n, dtype=bool) if valid is None else valid)
+    return Targets(x, u, a_res, u.omega, jnp.ones(n, dtype=bool) if valid is None else valid)
 
 
 def push(*d):
@@ -112,7 +112,7 @@ def test_it_turns_with_the_world(key):
     Q = so3.exp(random.normal(key, (3,)))
     rows = rows_of(0.5 * random.normal(key, (10,)) * MODEL.prior, key, noise=0.2)
     x = jax.vmap(lambda x: type(x)(so3.act(Q, x.p), so3.mul(Q, x.R), so3.act(Q, x.v)))(rows.x)
-    turned = Targets(x, rows.u, rows.a_res @ Q.T, rows.valid)
+    turned = Targets(x, rows.u, rows.a_res @ Q.T, rows.omega, rows.valid)
     here, there = fitted(isotropic, rows)[0], fitted(isotropic, turned)[0]
     one = jax.tree.map(lambda leaf: leaf[3], rows.x), jax.tree.map(lambda leaf: leaf[3], rows.u)
     other = jax.tree.map(lambda leaf: leaf[3], x), one[1]

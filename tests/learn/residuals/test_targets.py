@@ -10,7 +10,7 @@ import pytest
 
 from helpers import random_field_flight, replaced
 from retrim.learn import Window, residual_targets
-from retrim.physics import Lagged, PointMass
+from retrim.physics import Command, Lagged, PointMass, State
 
 DT = 0.02
 
@@ -107,3 +107,28 @@ def test_a_window_of_columns_and_back(key):
     assert window.valid.all()
     again = Window.of(window.t, window.x.p, window.x.R, window.x.v, window.u.c, window.u.omega)
     jax.tree.map(np.testing.assert_array_equal, again, window)
+
+
+@pytest.mark.parametrize("age", [0.0, 0.005, 0.01, 0.02, 0.03])
+@pytest.mark.parametrize("delay", [0, 1])
+def test_a_late_measurement_is_paired_with_the_command_that_acted_then(age, delay, key):
+    """Of states that are 0 to 30 ms old, at a tick of 20 ms: the targets are those of the world, to a few per cent."""
+    n, fine, d = 40, 4, jnp.array([0.5, -0.2, 0.3])
+    k_c, k_w = jax.random.split(key)
+    u = jax.vmap(Command)(9.81 + jax.random.normal(k_c, (n,)), 0.5 * jax.random.normal(k_w, (n, 3)))
+    model = PointMass(DT / fine)
+
+    def tick(x, i):
+        late = jnp.maximum(i // fine - delay, 0)
+        return model.step(x, jax.tree.map(lambda leaf: leaf[late], u), d), x
+
+    _, x = jax.lax.scan(tick, State.at(jnp.array([0.0, 0.0, 1.0])), jnp.arange(n * fine))
+    seen = np.maximum(fine * np.arange(n) - round(age / DT * fine), 0)
+    states = jax.tree.map(lambda leaf: leaf[seen], x)
+    window = Window(DT * jnp.arange(float(n)), states, u, jnp.ones(n, dtype=bool), jnp.full(n, age))
+    told = residual_targets(window, PointMass(DT), delay_ticks=delay).a_res[4:] - d[None]
+    untold = residual_targets(replaced(window, age=None), PointMass(DT), delay_ticks=delay).a_res[4:] - d[None]
+    assert float(jnp.abs(told).mean()) < 0.03
+    assert float(jnp.abs(untold).mean()) > 0.1 or age == 0.0
+    if age == 0.0:
+        np.testing.assert_array_equal(told, untold)

@@ -4,8 +4,12 @@ from .ensemble import EnsembleModel as EnsembleModel
 from .ensemble import EnsembleResidual as EnsembleResidual
 from .ensemble import EnsembleState as EnsembleState
 from .ensemble import fit_ensemble as fit_ensemble
+from .layered import LayeredModel as LayeredModel
+from .layered import LayeredState as LayeredState
 from .model import FittedResidual as FittedResidual
 from .model import ResidualModel as ResidualModel
+from .rates import RateFit as RateFit
+from .rates import RateModel as RateModel
 from .regression import RegressionModel as RegressionModel
 from .regression import RegressionState as RegressionState
 from .targets import Targets as Targets

@@ -1,11 +1,13 @@
 """What the online learner needs from a model of the residual acceleration."""
 
+from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
 import equinox as eqx
 from jaxtyping import Array, Float, Key
 
 from ...physics.state import Command, State
+from .rates import RateFit
 from .targets import Targets
 
 
@@ -13,7 +15,8 @@ from .targets import Targets
 class ResidualModel(Protocol):
     """A way to learn the residual. It is an ``eqx.Module`` that holds settings; what is learnt is its *state*.
 
-    Every method is pure and traceable. The state is a pytree of arrays with fixed shapes.
+    Every method is pure and traceable. The state is a pytree of arrays with fixed shapes. A model that also learns how
+    the vehicle turns has a method ``turning``, from its state to a :class:`~retrim.learn.residuals.rates.RateFit`.
     """
 
     def init(self, key: Key[Array, ""]) -> Any:
@@ -42,6 +45,12 @@ class FittedResidual(eqx.Module):
 
     model: ResidualModel
     state: Any
+
+    @property
+    def turning(self) -> RateFit | None:
+        """What is known of how the vehicle turns; None from a model of the acceleration alone."""
+        turning: Callable[[Any], RateFit] | None = getattr(self.model, "turning", None)
+        return None if turning is None else turning(self.state)
 
     def __call__(self, x: State, u: Command) -> Float[Array, "3"]:
         """Return the predicted residual acceleration, world frame [m/s^2]."""

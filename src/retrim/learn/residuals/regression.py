@@ -1,5 +1,7 @@
 """A closed-form residual: Bayesian linear regression on physical features, with exponential forgetting."""
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -7,6 +9,7 @@ from jaxtyping import Array, Float, Int, Key
 
 from ...physics import so3
 from ...physics.state import STANDARD_GRAVITY, Command, State
+from .rates import RateFit, RateModel
 from .targets import Targets
 
 SIZE = 10
@@ -17,11 +20,20 @@ SURPRISE = 21.1
 """Of a chi-squared variable of three degrees of freedom, passed once in 10,000."""
 
 
-class RegressionState(eqx.Module):
-    """Posterior of the parameters: a normal distribution."""
+class Normal(NamedTuple):
+    """A normal distribution of the parameters."""
 
     mean: Float[Array, "10"]
     covariance: Float[Array, "10 10"]
+
+
+class RegressionState(eqx.Module):
+    """Posterior of the parameters, a normal distribution."""
+
+    mean: Float[Array, "10"]
+    covariance: Float[Array, "10 10"]
+    rates: RateFit
+    """How the vehicle turns."""
 
 
 class RegressionModel(eqx.Module):
@@ -38,6 +50,8 @@ class RegressionModel(eqx.Module):
     """Standard deviation of one row of targets [m/s^2]."""
     memory: Float[Array, ""]
     """A row counts for 1/e of the newest after this long [s]."""
+    rates: RateModel
+    """What is wrong with body rates is no acceleration; it is identified beside."""
     dt: float = eqx.field(static=True)
     """Control tick [s]."""
 
@@ -52,12 +66,12 @@ class RegressionModel(eqx.Module):
             thrust_prior: Standard deviation of the thrust gain [-].
         """
         prior = jnp.array([5.0, 5.0, 5.0, thrust_prior, 0.3, 0.3, 0.3, 0.03, 0.03, 0.03])
-        return cls(prior, jnp.array(noise), jnp.array(memory), dt)
+        return cls(prior, jnp.array(noise), jnp.array(memory), RateModel.of(dt, memory=memory), dt)
 
     def init(self, key: Key[Array, ""]) -> RegressionState:
         """Return the prior, which predicts zero; the key is not needed."""
         del key
-        return RegressionState(jnp.zeros_like(self.prior), jnp.diag(self.prior**2))
+        return RegressionState(jnp.zeros_like(self.prior), jnp.diag(self.prior**2), self.rates.init())
 
     def fit(self, state: RegressionState, rows: Targets) -> tuple[RegressionState, Float[Array, ""]]:
         """Return the posterior given ``rows``, the newest last; also the weighted error [m/s^2].
@@ -67,32 +81,38 @@ class RegressionModel(eqx.Module):
         from the first that it does not explain (99.99 %) nothing older counts.
         """
         del state  # the window says all: what is older has been forgotten
-        n = rows.valid.shape[0]
-        age = jnp.arange(n - 1, -1, -1)
         features = jax.vmap(features_of)(rows.x, rows.u)
-        valid = rows.valid.astype(rows.a_res.dtype)
-        recent = self._posterior(features, rows.a_res, jnp.where(age < BLOCK, valid, 0.0))
-        newer = self._unchanged(recent, features, rows.a_res, valid, age // BLOCK)
-        weight = jnp.exp(-self.dt * age.astype(valid.dtype) / self.memory) * valid * newer
+        weight = self._weight(features, rows)
         posterior = self._posterior(features, rows.a_res, weight)
         error = jnp.sum((rows.a_res - features @ posterior.mean) ** 2, axis=1)
         rms = jnp.sqrt(jnp.sum(weight * error) / jnp.maximum(jnp.sum(weight), 1e-6))
-        return posterior, rms
+        return RegressionState(posterior.mean, posterior.covariance, self.rates.fit(rows)), rms
+
+    def weight(self, rows: Targets) -> Float[Array, " n"]:
+        """Return how much each row counts: less with age, nothing if invalid or from before a change."""
+        return self._weight(jax.vmap(features_of)(rows.x, rows.u), rows)
+
+    def _weight(self, features: Float[Array, "n 3 10"], rows: Targets) -> Float[Array, " n"]:
+        age = jnp.arange(rows.valid.shape[0] - 1, -1, -1)
+        valid = rows.valid.astype(rows.a_res.dtype)
+        recent = self._posterior(features, rows.a_res, jnp.where(age < BLOCK, valid, 0.0))
+        newer = self._unchanged(recent, features, rows.a_res, valid, age // BLOCK)
+        return jnp.exp(-self.dt * age.astype(valid.dtype) / self.memory) * valid * newer
 
     def _posterior(
         self, features: Float[Array, "n 3 10"], target: Float[Array, "n 3"], weight: Float[Array, " n"]
-    ) -> RegressionState:
+    ) -> Normal:
         scaled = features * self.prior[None, None]  # parameters of order one: well conditioned in single precision
         eye = jnp.eye(SIZE, dtype=scaled.dtype)
         precision = eye + jnp.einsum("n,nik,nil->kl", weight, scaled, scaled) / self.noise**2
         factor = jax.scipy.linalg.cho_factor(precision)
         mean = jax.scipy.linalg.cho_solve(factor, jnp.einsum("n,nik,ni->k", weight, scaled, target) / self.noise**2)
         covariance = jax.scipy.linalg.cho_solve(factor, eye)
-        return RegressionState(self.prior * mean, self.prior[:, None] * covariance * self.prior[None])
+        return Normal(self.prior * mean, self.prior[:, None] * covariance * self.prior[None])
 
     def _unchanged(
         self,
-        recent: RegressionState,
+        recent: Normal,
         features: Float[Array, "n 3 10"],
         target: Float[Array, "n 3"],
         valid: Float[Array, " n"],
@@ -114,6 +134,10 @@ class RegressionModel(eqx.Module):
     def predict(self, state: RegressionState, x: State, u: Command) -> Float[Array, "3"]:
         """Return the mean prediction, world frame [m/s^2]."""
         return features_of(x, u) @ state.mean
+
+    def turning(self, state: RegressionState) -> RateFit:
+        """Return what is known of how the vehicle turns."""
+        return state.rates
 
     def spread(self, state: RegressionState, x: State, u: Command) -> Float[Array, "3"]:
         """Return the standard deviation of the prediction, without that of a single row [m/s^2]."""

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from ...physics import so3
 from ...physics.dynamics import AbstractDynamics
 from ...physics.state import Command, State
 from ..window import Window
@@ -22,6 +23,8 @@ class Targets(eqx.Module):
     """Command *acting* during the tick (leading axis n)."""
     a_res: Float[Array, "n 3"]
     """Missed acceleration, world frame [m/s^2]."""
+    omega: Float[Array, "n 3"]
+    """Body rates at which the vehicle turned, mean over the tick [rad/s]."""
     valid: Bool[Array, " n"]
 
 
@@ -35,7 +38,7 @@ def residual_targets(
     """Compute a_res = a_gt - a_hat of each tick.
 
     a_gt is the forward difference of velocity over the tick, a_hat that of the nominal model from the same state, both
-    under the command that was acting: the one accepted ``delay_ticks`` before.
+    under the command that was acting: the one accepted ``delay_ticks`` before, and earlier by the measurement's age.
 
     A row does not count if its time step, or a step between its command and it, is not one tick (a gap in the
     measurements), nor while the hidden state of the model (an actuator lag) still remembers the assumed hover start.
@@ -59,7 +62,7 @@ def residual_targets(
         raise ValueError(f"a window of {n} ticks is too short for a delay of {delay_ticks} ticks")
     x = jax.tree.map(lambda leaf: leaf[delay_ticks : delay_ticks + rows], window.x)
     v_next = window.x.v[delay_ticks + 1 :]
-    u = jax.tree.map(lambda leaf: leaf[:rows], window.u)
+    u = _acting(window, rows, delay_ticks, nominal.dt)
 
     def tick(s: Any, row: tuple[State, Command, Float[Array, "3"]]) -> tuple[Any, Float[Array, "3"]]:
         x, u, v_next = row
@@ -70,8 +73,31 @@ def residual_targets(
     if a_gt is not None:
         v_next = x.v + nominal.dt * a_gt[delay_ticks : delay_ticks + rows]
     _, a_res = lax.scan(tick, first, (x, u, v_next))
+    omega = jax.vmap(_turned)(x.R, window.x.R[delay_ticks + 1 :]) / nominal.dt
     settled = _settled(window, nominal.settling_ticks)[:rows]
-    return Targets(x, u, a_res, window.valid[:rows] & _regular(window, nominal.dt, delay_ticks) & settled)
+    return Targets(x, u, a_res, omega, window.valid[:rows] & _regular(window, nominal.dt, delay_ticks) & settled)
+
+
+def _acting(window: Window, rows: int, delay_ticks: int, dt: float) -> Command:
+    """The mean command over the tick that each measurement describes; two share it if that lies between two ticks."""
+    if window.age is None:
+        first: Command = jax.tree.map(lambda leaf: leaf[:rows], window.u)
+        return first
+    ticks = jnp.arange(rows, dtype=window.t.dtype)
+    at = jnp.maximum(ticks - window.age[delay_ticks : delay_ticks + rows] / dt, 0.0)
+    before, share = jnp.floor(at).astype(int), at - jnp.floor(at)
+
+    def mixed(leaf: Array) -> Array:
+        weight = share.reshape(-1, *(1,) * (leaf.ndim - 1)).astype(leaf.dtype)
+        return (1.0 - weight) * leaf[before] + weight * leaf[before + 1]
+
+    acting: Command = jax.tree.map(mixed, window.u)
+    return acting
+
+
+def _turned(before: Float[Array, "3 3"], after: Float[Array, "3 3"]) -> Float[Array, "3"]:
+    """Return the rotation vector from one attitude to the other, body frame [rad]."""
+    return so3.log(so3.mul(before.T, after))
 
 
 def _regular(window: Window, dt: float, delay_ticks: int) -> Bool[Array, " rows"]:

@@ -1,0 +1,77 @@
+"""How a vehicle turns: bias and lag are identified on known ones, with noise and without, and noise is no bias."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax, random
+
+from helpers import random_state, replaced
+from retrim.learn import Window, residual_targets
+from retrim.learn.residuals import RateModel
+from retrim.physics import Command, Lagged, PointMass, so3
+from retrim.physics.actuators import RateBiased
+
+DT = 0.02
+MODEL = RateModel.of(DT, memory=0.5)
+ENDLESS = replaced(MODEL, memory=jnp.array(1e9))
+
+
+@eqx.filter_jit
+def window_of(key, tau, bias, noise=0.0, n=100):
+    """A flight under random commands of a vehicle that turns late and too fast, measured with noise [rad]."""
+    k_x, k_c, k_w, k_noise = random.split(key, 4)
+    model = Lagged(RateBiased(PointMass(DT), bias), tau)
+    c = 9.81 + random.normal(k_c, (n,))
+    u = jax.vmap(Command)(c, jnp.repeat(random.normal(k_w, (n // 4, 3)), 4, axis=0))
+
+    def tick(s, u):
+        return model.step(s, u, jnp.zeros(3)), model.state(s)
+
+    _, x = lax.scan(tick, model.init(random_state(k_x)), u)
+    R = jax.vmap(lambda R, e: so3.mul(R, so3.exp(noise * e)))(x.R, random.normal(k_noise, (n, 3)))
+    return Window(DT * jnp.arange(float(n)), eqx.tree_at(lambda x: x.R, x, R), u, jnp.ones(n, dtype=bool))
+
+
+@eqx.filter_jit
+def fitted(model, window):
+    return model.fit(residual_targets(window, PointMass(DT)))
+
+
+@pytest.mark.parametrize("tau", [0.01, 0.03, 0.08])
+@pytest.mark.parametrize("bias", [(0.0, 0.0, 0.0), (0.3, -0.2, 0.1)])
+def test_lag_and_bias_are_identified(key, tau, bias):
+    found = fitted(ENDLESS, window_of(key, jnp.array(tau), jnp.array(bias)))
+    np.testing.assert_allclose(found.bias, bias, atol=0.01)
+    assert abs(np.log(float(found.tau) / tau)) < 0.15  # the grid's step is a fifth
+
+
+def test_noise_does_not_shorten_the_lag(key):
+    """Attitudes to 0.2 degrees: rates of a tick to a quarter of a radian per second."""
+    window = window_of(key, jnp.array(0.06), jnp.array([0.2, 0.0, -0.2]), noise=0.0035, n=200)
+    found = fitted(ENDLESS, window)
+    np.testing.assert_allclose(found.bias, [0.2, 0.0, -0.2], atol=3.0 * float(found.deviation[0]))
+    assert 0.04 < float(found.tau) < 0.09
+
+
+def test_a_bias_that_begins_is_learnt_within_the_memory(key):
+    before, after = (window_of(key, jnp.array(0.03), jnp.array([b, 0.0, 0.0])) for b in (0.0, 0.4))
+    joined = jax.tree.map(lambda a, b: jnp.concatenate([a[:50], b[50:]]), before, after)
+    assert abs(float(fitted(replaced(MODEL, memory=jnp.array(0.2)), joined).bias[0]) - 0.4) < 0.06
+
+
+def test_without_data_it_is_the_prior(key):
+    window = window_of(key, jnp.array(0.03), jnp.array([0.4, 0.0, 0.0]))
+    found = fitted(MODEL, replaced(window, valid=jnp.zeros(100, dtype=bool)))
+    jax.tree.map(np.testing.assert_array_equal, found, MODEL.init())
+
+
+def test_a_hover_says_nothing_of_the_lag(key):
+    """Commands that do not change leave the prior's time constant, and give the bias."""
+    window = window_of(key, jnp.array(0.1), jnp.array([0.2, 0.0, 0.0]))
+    still = replaced(window, u=jax.tree.map(jnp.zeros_like, window.u))
+    R = jax.vmap(lambda t: so3.exp(t * jnp.array([0.2, 0.0, 0.0])))(still.t)
+    found = fitted(ENDLESS, eqx.tree_at(lambda w: w.x.R, still, R))
+    np.testing.assert_allclose(found.bias[0], 0.2, atol=0.01)
+    assert 0.5 < float(found.tau / MODEL.tau_prior) < 2.0
