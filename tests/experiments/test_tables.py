@@ -1,14 +1,17 @@
 """Tables at reduced size, and what stands in them."""
 
 import dataclasses
+import importlib
+from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from commands import results, retrim
 from helpers import tiny_preset
 from made_up import DT, flight, log
-from retrim import Scenario, changed, load
+from retrim import Scenario, Setup, changed, load
 from retrim.config import named_presets as presets
 from retrim.config.presets import Adapt
 from retrim.experiments import Run
@@ -16,6 +19,8 @@ from retrim.experiments.reporter import Silent
 from retrim.experiments.tables.document import Document, TableSection
 from retrim.experiments.tables.reversing import METHODS, _errors, _moments, _section
 from retrim.experiments.tables.study import Levels, fly_levels, train_all
+
+fast = importlib.import_module("retrim.experiments.tables.fast")  # the package has a function of that name
 
 pytestmark = pytest.mark.usefixtures("as_a_user")
 
@@ -67,6 +72,25 @@ def test_a_section_of_tracking_has_cross_track_and_the_papers_rows(tmp_path):
     assert section.rows[-1] == ("paper, base", "1", "2", "3")
     assert section.rows[1][1] == f"{found[0]['cross_track_m']:.3f}"
     assert section.picture == tmp_path / "x.png"
+
+
+def test_a_table_of_fast_flight_flies_a_file_too(tmp_path):
+    """The race line that comes with the examples uses what the kingfisher can do, and no more."""
+    line = Path(__file__).parents[2] / "examples" / "race.csv"
+    preset = changed(load("track/fast"), track={"reference": "circle=8", "felt_copies": 0}, pretrain=TINY)
+    setup = Setup.of(preset, str(line))
+    assert setup.limits_exceeded() is None
+    flown = setup.flown.reference
+    speeds = [float(jnp.linalg.norm(flown(jnp.array(t)).v)) for t in np.linspace(3.0, 10.0, 50)]
+    assert 8.0 < max(speeds) < 12.0
+    section = dataclasses.replace(fast._section(preset, str(line), "simple", ("base",)), stem="race")
+    document = Document(Run("test", tmp_path), "table", "Title", "Intro.", [0], Silent())
+    fly_levels(document, [section], starts=1, seconds=1.0)
+    found = results(tmp_path, "table.json")["rows"]
+    assert [(row["disturbance"], row["vehicle"]) for row in found] == [
+        (level, "kingfisher") for level in ("none", "wind=4", "large")
+    ]
+    assert document.sections[0].columns[2] == "wind of 4 m/s"
 
 
 def test_an_interrupted_table_flies_nothing_more(tmp_path):

@@ -15,15 +15,18 @@ UNIT_FLOP = 2.0 * ROWS * WIDTH * WIDTH * STEPS
 """Of a unit: a scan of 1,000 products of 10 rows with a matrix of 512 x 512, which a roll-out is mostly made of."""
 
 
-def on_one_core() -> None:
-    """Keep this process, and the threads that JAX will start, on one core.
+def on_core(i: int) -> None:
+    """Keep this process, and the threads that JAX will start, on one of the cores that it may use.
+
+    Args:
+        i: Which of them; -1 for the last.
 
     Raises:
-        OSError: The system cannot.
+        OSError: The system does not let a process choose.
     """
     if not hasattr(os, "sched_setaffinity"):
         raise OSError("this system does not let a process choose its core")
-    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+    os.sched_setaffinity(0, {sorted(os.sched_getaffinity(0))[i]})
 
 
 def unit() -> Callable[[], float]:

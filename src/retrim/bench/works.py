@@ -13,7 +13,6 @@ import jax
 from jax import lax, random
 from jaxtyping import Array, Key
 
-from ..adapt.buffer import RollingBuffer
 from ..adapt.gate import Verdict
 from ..adapt.learner import HELD_OUT, LearnerState, OnlineLearner
 from ..config.disturbances import disturbance
@@ -32,27 +31,16 @@ from ..plants.sim import SimPlant
 from ..runtime.batch import batch_flight
 from ..runtime.batched import stacked
 from ..runtime.flight import fly
-from .machine import on_one_core, rates
+from .beside import policies
+from .flown import learner_in_flight
+from .machine import on_core, rates
 from .timing import Work, compiled, timed
 from .training import encode_and_pretrain, pretrain
 
 
-def _learner(name: str = "hover/paper") -> tuple[OnlineLearner, LearnerState, Window]:
-    """A learner, its state before the first fit, and a full window of flight under the large disturbance."""
-    setup = Setup.of(load(name))
-    plant = Scenario("large").make()
-    buffer = RollingBuffer(setup.preset.adapt.window)
-    measurement = plant.reset(setup.flight_starts(1)[0])
-    for _ in range(setup.preset.adapt.window):
-        buffer.push(measurement.t, measurement.x, Command.hover())
-        measurement, _ = plant.step(Command.hover())
-    state = setup.learner.init(setup.new_policy(random.key(0)), random.key(1))
-    return setup.learner, state, buffer.window()
-
-
 def _update(name: str, *, lora: bool = False) -> dict[str, Any]:
     """A policy update: its products are three to a step of training and one to a tick of the gate."""
-    learner, state, window = _learner(name)
+    learner, state, window = learner_in_flight(name)
     if lora:
         policy = Setup.of(load(name)).low_rank(state.policy.policy, random.key(2))
         state = learner.init(policy, random.key(1))
@@ -65,7 +53,7 @@ def _update(name: str, *, lora: bool = False) -> dict[str, Any]:
 
 
 def _residual(name: str = "hover/paper") -> dict[str, Any]:
-    learner, state, window = _learner(name)
+    learner, state, window = learner_in_flight(name)
     program, compile_s = compiled(OnlineLearner.fit_residual, learner, state.residual, window)
     return timed(compile_s, lambda: program(learner, state.residual, window), 9)
 
@@ -129,7 +117,7 @@ def _bem_tick() -> dict[str, Any]:
 
 def _fleet(how: str) -> dict[str, Any]:
     """Eight updates of eight vehicles."""
-    learner, state, window = _learner()
+    learner, state, window = learner_in_flight()
     fitted, _ = learner.fit_residual(state.residual, window)
     keys = random.split(random.key(0), 8)
 
@@ -189,6 +177,7 @@ WORKS: dict[str, Work] = {
     "update-retrim": Work(
         "burst 5 x 10 x 150, hover/retrim", "0.05 s on one core", lambda: _update("hover/retrim"), one_core=True
     ),
+    "policies": Work("burst beside a flight at 50 Hz, hover/retrim", "0.1 s, 10 a second", policies),
     "update-track-retrim": Work(
         "burst 5 x 10 x 100, track/retrim", "0.1 s, its latency", lambda: _update("track/retrim"), one_core=True
     ),
@@ -222,7 +211,7 @@ WORKS: dict[str, Work] = {
 def main() -> None:
     """Do the work named on the command line, on one core if a second word says so, and print its row."""
     if sys.argv[2:] == ["one"]:
-        on_one_core()
+        on_core(0)
     if sys.argv[1] == "machine":
         print(json.dumps(rates()))
         return

@@ -49,6 +49,7 @@ MADE = (
     tables.vision,
     tables.plants,
     tables.model,
+    tables.fast,
     tables.ablation,
 )
 COMMANDS: dict[str, Callable[..., Ordered]] = {make.__name__: command_of(make) for make in MADE}

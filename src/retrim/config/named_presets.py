@@ -58,7 +58,9 @@ TRACK_RETRIM = dataclasses.replace(
     pretrain=dataclasses.replace(
         TRACK.pretrain, num_updates=1200, learning_rate=5e-3, adam_b2=0.95, hidden_sizes=(128, 128)
     ),
-    adapt=dataclasses.replace(RETRIM.adapt, window=150, memory=2.0, thrust_prior=0.2, trim="free"),
+    adapt=dataclasses.replace(
+        RETRIM.adapt, window=150, residual="layered", fit_steps=10, memory=2.0, thrust_prior=0.2, trim="free"
+    ),
 )
 
 TRACK_FAST = dataclasses.replace(

@@ -41,7 +41,10 @@ def make_residual(request: ResidualRequest) -> ResidualModel:
     return model
 
 
-def _ensemble(request: ResidualRequest) -> EnsembleModel:
+SMALL = (32, 32)  # of an ensemble that only learns what a closed form leaves, and is flown in every burst
+
+
+def _ensemble(request: ResidualRequest, hidden: tuple[int, ...] = (128, 128)) -> EnsembleModel:
     a = request.preset.adapt
     return EnsembleModel(
         jnp.array(request.preset.goal),
@@ -49,6 +52,7 @@ def _ensemble(request: ResidualRequest) -> EnsembleModel:
         jnp.array(a.fit_learning_rate),
         jnp.array(a.spectral_weight),
         steps=a.fit_steps,
+        hidden=hidden,
     )
 
 
@@ -58,7 +62,7 @@ def _regression(request: ResidualRequest) -> RegressionModel:
 
 
 def _layered(request: ResidualRequest) -> ResidualModel:
-    return LayeredModel(_regression(request), _ensemble(request))
+    return LayeredModel(_regression(request), _ensemble(request, SMALL))
 
 
 register_residual("ensemble", _ensemble)

@@ -1,7 +1,7 @@
 """What every table does: train policies, fly them, lay methods and disturbances out as the paper does."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from ...config.loading import dump, load_for
@@ -19,8 +19,8 @@ from ..run import Run
 from ..training import nominal_error, train
 from .document import Document, TableSection
 
-LEVELS = ("none", "small", "large")
-COLUMNS = ("error [m]", "no disturbance", "small, 0.5 m/s² per axis", "large, 2 m/s² per axis")
+LEVELS = {"none": "no disturbance", "small": "small, 0.5 m/s² per axis", "large": "large, 2 m/s² per axis"}
+"""The paper's disturbances, and what they are called."""
 PaperRows = tuple[tuple[str, tuple[str, str, str]], ...]
 """Label and figures of the paper for the three levels [m]."""
 
@@ -94,7 +94,7 @@ def fly_all(
 
 @dataclass(frozen=True)
 class Levels:
-    """One section of a table as the paper's: methods down, its three levels of disturbance across."""
+    """One section of a table as the paper's: methods down, levels of disturbance across."""
 
     title: str
     preset: Preset
@@ -104,6 +104,8 @@ class Levels:
     """Name of the picture."""
     methods: Sequence[str] = ("base", "full", "lora")
     paper: PaperRows = ()
+    levels: Mapping[str, str] = field(default_factory=lambda: LEVELS)
+    """Disturbances, and what they are called."""
 
 
 def fly_levels(document: Document, sections: Sequence[Levels], *, starts: int, seconds: float | None) -> None:
@@ -133,7 +135,7 @@ def _level_section(
 ) -> tuple[TableSection, list[dict[str, Any]]] | None:
     """The section and its rows of results; None if nothing was flown."""
     methods, title = section.methods, section.title
-    scenarios = [replace(section.scenario, disturbance=level) for level in LEVELS]
+    scenarios = [replace(section.scenario, disturbance=level) for level in section.levels]
     flown = fly_all(study, scenarios, run, reporter, methods=methods, starts=starts, seconds=seconds).flown
     if not flown:
         return None
@@ -147,19 +149,25 @@ def _level_section(
     setup = Setup.of(study.preset, section.scenario.reference)
     first = [f for f in flown if f.spec.seed == flown[0].spec.seed and f.spec.method in ("base", "full")]
     drawn = picture(first, setup, scenarios[-1], run.folder, stem=section.stem)
-    table = level_table(found, methods, section.paper, title)
+    table = level_table(found, methods, section.paper, title, section.levels)
     return replace(table, about=about, picture=drawn[0] if drawn else None), found
 
 
-def level_table(found: Sequence[dict[str, Any]], methods: Sequence[str], paper: PaperRows, title: str) -> TableSection:
+def level_table(
+    found: Sequence[dict[str, Any]],
+    methods: Sequence[str],
+    paper: PaperRows,
+    title: str,
+    levels: Mapping[str, str] = LEVELS,
+) -> TableSection:
     """Lay rows of results out as the paper does: methods down, levels of disturbance across, its own rows below."""
     by = {(row["method"], row["disturbance"]): row for row in found}
     cells = list[tuple[str, ...]]()
     for method in methods:
-        ours = [by.get((method, level)) for level in LEVELS]
+        ours = [by.get((method, level)) for level in levels]
         cells.append((find_method(method).label, *("-" if row is None else cell(row) for row in ours)))
         cross = ["-" if row is None or "cross_track_m" not in row else f"{row['cross_track_m']:.3f}" for row in ours]
         if set(cross) != {"-"}:
             cells.append(("... cross-track", *cross))
     cells += [(f"paper, {label}", *figures) for label, figures in paper]
-    return TableSection(COLUMNS, tuple(cells), title)
+    return TableSection(("error [m]", *levels.values()), tuple(cells), title)

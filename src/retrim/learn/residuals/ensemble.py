@@ -103,6 +103,8 @@ class EnsembleModel(eqx.Module):
     """Weight of the spectral penalty."""
     steps: int = eqx.field(static=True, default=100)
     """Optimiser steps of one fit."""
+    hidden: tuple[int, ...] = eqx.field(static=True, default=(128, 128))
+    """Hidden layers of each member."""
 
     def __check_init__(self) -> None:
         """Raise ``ValueError`` if a fit would have no step."""
@@ -111,7 +113,8 @@ class EnsembleModel(eqx.Module):
 
     def init(self, key: Key[Array, ""]) -> EnsembleState:
         """Return fresh networks that predict zero; the key is consumed."""
-        return EnsembleState.of(EnsembleResidual.of(self.origin, self.omega_max, key=key), self._optimiser())
+        fresh = EnsembleResidual.of(self.origin, self.omega_max, key=key, hidden=self.hidden)
+        return EnsembleState.of(fresh, self._optimiser())
 
     def fit(self, state: EnsembleState, rows: Targets) -> tuple[EnsembleState, Float[Array, ""]]:
         """Fit from where the last fit ended; also return the error before the last step [m/s^2]."""

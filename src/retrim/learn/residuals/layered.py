@@ -26,11 +26,13 @@ class LayeredState(eqx.Module):
     """Forgetting sum of what was left times what had been foretold [m^2/s^4]."""
     foretold: Float[Array, ""]
     """The same of what had been foretold, squared."""
+    smooth: Float[Array, ""]
+    """Share of what was left in the last window that is no noise from tick to tick."""
 
     @property
     def share(self) -> Float[Array, ""]:
         """Share of the ensemble's prediction that is believed, between 0 and 1."""
-        return jnp.clip(self.agreed / (self.foretold + DOUBT), 0.0, 1.0)
+        return self.smooth * jnp.clip(self.agreed / (self.foretold + DOUBT), 0.0, 1.0)
 
 
 class LayeredModel(eqx.Module):
@@ -39,8 +41,9 @@ class LayeredModel(eqx.Module):
     The ensemble is fitted to what the closed form leaves, and only to rows since the last change. Before each fit its
     prediction of the newest rows, which it has not seen, is compared with what was left there: the coefficient of a
     regression of the one on the other, between 0 and 1, is the share of it that counts. So an ensemble that was fitted
-    across a change, or that knows nothing, does not make the layer below worse. Where its members disagree it is shrunk
-    further, per axis, by mean^2 / (mean^2 + spread^2).
+    across a change, or that knows nothing, does not make the layer below worse. Noise could pass this test, since what is
+    noisy in a velocity is so in the input and in the target; but it jumps from tick to tick, and the share falls with how
+    much of what is left does. Where members disagree, the mean is shrunk, per axis, by mean^2 / (mean^2 + spread^2).
     """
 
     first: RegressionModel
@@ -49,7 +52,7 @@ class LayeredModel(eqx.Module):
     def init(self, key: Key[Array, ""]) -> LayeredState:
         """Return the prior of the one and fresh networks of the other; the key is consumed."""
         nothing = jnp.zeros(())
-        return LayeredState(self.first.init(key), self.second.init(key), nothing, nothing)
+        return LayeredState(self.first.init(key), self.second.init(key), nothing, nothing, nothing)
 
     def fit(self, state: LayeredState, rows: Targets) -> tuple[LayeredState, Float[Array, ""]]:
         """Fit the closed form, weigh the ensemble by what it foretold, and fit it to the rest.
@@ -66,7 +69,7 @@ class LayeredModel(eqx.Module):
         squared = KEPT * state.foretold + jnp.sum(jnp.where(newest, jnp.sum(foretold**2, axis=1), 0.0))
         rest = Targets(rows.x, rows.u, left, rows.omega, weight > 0.0)
         second, _ = self.second.fit(state.second, rest)
-        fitted = LayeredState(first, second, agreed, squared)
+        fitted = LayeredState(first, second, agreed, squared, _smooth(left, weight))
         error = left - fitted.share * jax.vmap(lambda x, u: self._certain(second, x, u))(rows.x, rows.u)
         mean_square = jnp.sum(weight * jnp.sum(error**2, axis=1)) / jnp.maximum(jnp.sum(weight), 1e-6)
         return fitted, jnp.sqrt(mean_square)
@@ -89,3 +92,10 @@ class LayeredModel(eqx.Module):
         members = state.residual.members(x, u)
         squared = jnp.mean(members, axis=0) ** 2
         return jnp.mean(members, axis=0) * squared / (squared + jnp.var(members, axis=0) + 1e-9)
+
+
+def _smooth(left: Float[Array, "n 3"], weight: Float[Array, " n"]) -> Float[Array, ""]:
+    """One less the ratio of von Neumann: 1 for what hardly changes from row to row, 0 for white noise."""
+    counts = (weight > 0.0).astype(left.dtype)
+    jumps = 0.5 * jnp.sum(counts[1:] * counts[:-1] * jnp.sum(jnp.diff(left, axis=0) ** 2, axis=1))
+    return jnp.clip(1.0 - jumps / (jnp.sum(counts * jnp.sum(left**2, axis=1)) + 1e-9), 0.0, 1.0)

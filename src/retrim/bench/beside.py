@@ -1,0 +1,89 @@
+"""Policies a second beside a flight: the learner on one core, plant and pilot on another, by the clock on the wall."""
+
+import json
+import os
+import statistics
+import subprocess
+import sys
+import time
+from typing import Any
+
+import jax
+from jax import random
+
+from ..config.loading import load
+from ..config.scenario import Scenario
+from ..config.setup import Setup
+from .flown import learner_in_flight
+from .machine import on_core
+from .timing import timed
+
+POLICIES = 60
+PRESET = "hover/retrim"
+
+
+def policies() -> dict[str, Any]:
+    """Fit and re-train as fast as one core can, while a flight goes on at 50 Hz on another; return the row.
+
+    Raises:
+        OSError: The machine has one core, or the system does not let a process choose.
+    """
+    if len(getattr(os, "sched_getaffinity", lambda _: ())(0)) < 2:
+        raise OSError("a policy beside a flight needs two cores that a process may choose")
+    command = [sys.executable, "-m", "retrim.bench.beside"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as flight:
+        on_core(-1)  # the flight has begun with a choice of all
+        learner, state, window = learner_in_flight(PRESET)
+        keys = iter(random.split(random.key(0), 2 * POLICIES))
+
+        def one() -> Any:
+            residual, _ = learner.fit_residual(state.residual, window)
+            return learner.update_policy(state.policy, residual, window, next(keys))
+
+        began = time.perf_counter()
+        jax.block_until_ready(jax.tree.leaves(one()))
+        compile_s = time.perf_counter() - began
+        if flight.stdin is None or flight.stdout is None or not flight.stdout.readline():
+            raise OSError("the flight beside did not begin")
+        row = timed(compile_s, one, POLICIES)
+        flight.stdin.close()
+        flown = json.loads(flight.stdout.readline())
+    rate = f"{1.0 / row['run_s']:.0f} policies a second; {flown['late']} of {flown['ticks']} ticks beside ended late"
+    return row | {"remarks": f"{rate}, a tick took {1000 * flown['tick_s']:.1f} ms"}
+
+
+def _fly() -> None:
+    """Fly by the clock until the standard input is closed, and print how it went."""
+    on_core(0)
+    setup = Setup.of(load(PRESET))
+    pilot = setup.pilot(setup.new_policy(random.key(0)), "base-do")
+    plant, dt = Scenario().make(), setup.preset.dt
+    measurement = plant.reset(setup.flight_starts(1)[0])
+    pilot.warm_up(measurement)
+    plant.step(pilot.act(measurement))
+    measurement = plant.reset(setup.flight_starts(1)[0])
+    pilot.reset(measurement)
+    print("ready", flush=True)
+    os.set_blocking(sys.stdin.fileno(), False)
+    took, late, due = list[float](), 0, time.perf_counter()
+    while not _over():
+        began = time.perf_counter()
+        measurement, _ = plant.step(pilot.act(measurement))
+        took.append(time.perf_counter() - began)
+        due += dt
+        left = due - time.perf_counter()
+        late += left < 0.0
+        time.sleep(max(left, 0.0))
+    print(json.dumps({"ticks": len(took), "late": late, "tick_s": statistics.median(took)}), flush=True)
+
+
+def _over() -> bool:
+    """Whether the standard input has been closed."""
+    try:
+        return os.read(sys.stdin.fileno(), 1) == b""
+    except BlockingIOError:
+        return False
+
+
+if __name__ == "__main__":
+    _fly()
