@@ -1,7 +1,8 @@
 """A trajectory of your own, as a Python function or as a CSV file, is flown by a policy that never saw it.
 
 You learn to make a reference, to ask whether a vehicle can fly it, and that one policy, trained on circle, figure 8 and
-star, flies others too. Printed are the check, and the tracking error in wind.
+star, flies others too. Printed are the check, and the tracking error in wind. For a fast vehicle there is race.csv, a
+loop through gates at the limits of the kingfisher: `retrim reproduce fast --references examples/race.csv`.
 """
 
 import math

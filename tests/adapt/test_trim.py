@@ -79,6 +79,8 @@ def test_a_camera_at_rest_has_no_noise(key):
     assert float(jnp.abs(first - noisy).max()) > 1e-3
 
 
-def test_a_reference_has_no_rest():
-    with pytest.raises(ConfigError, match=r"adapt.trim = 'rest'"):
+def test_what_has_no_rest_is_refused():
+    with pytest.raises(ConfigError, match=r"adapt.trim = 'rest' is for a task that rests"):
         changed(load("track/retrim"), adapt={"trim": "rest"})
+    with pytest.raises(ConfigError, match=r"adapt.trim = 'rest' needs adapt.frame = 'gravity'"):
+        changed(load("hover/retrim"), adapt={"frame": "world"})

@@ -82,7 +82,7 @@ DEFAULTS = {
     "pretrain": (300, 100, 150, 5e-3, 0.999, None, (512, 512), math.pi),
     "adapt": (
         *(100, "ensemble", 0.5, 0.05, 3.0, 100, 1e-2, 1e-3, 5.0, 30, 10, 1e-3, None, "fresh", None, 0.1, "world"),
-        *(0.2, 1.0),
+        *("free", 0.2, 1.0),
     ),
     "rest": ("small", 0.02, (0.0, 0.0, 1.0), 5.0, 0, 0, 1, None),
 }
@@ -110,6 +110,7 @@ OURS = {
             "optimiser": "carried",
             "task_starts": 2,
             "frame": "gravity",
+            "trim": "rest",
             "fit_latency": 0.02,
             "update_latency": 0.1,
         },
@@ -177,7 +178,8 @@ OURS["track/retrim"] = OURS["track/preview"] | {
     "track": {"reference": "circle+figure8+star", "observation": "flat", "felt_copies": 7, "felt_push": 4.0},
     "pretrain": OURS["track/preview"]["pretrain"]
     | {"num_updates": 1200, "learning_rate": 5e-3, "adam_b2": 0.95, "hidden_sizes": (128, 128)},
-    "adapt": OURS["hover/retrim"]["adapt"] | {"window": 150, "memory": 2.0, "thrust_prior": 0.2},
+    "adapt": OURS["hover/retrim"]["adapt"]
+    | {"window": 150, "residual": "layered", "fit_steps": 10, "memory": 2.0, "thrust_prior": 0.2, "trim": "free"},
 }
 OURS["track/fast"] = OURS["track/retrim"] | {
     "vehicle": "kingfisher",

@@ -13,6 +13,7 @@ from helpers import tiny_preset
 from retrim import ConfigError
 from retrim.adapt.optimisers import CarriedAdam, FreshAdam
 from retrim.adapt.starts import TaskStarts
+from retrim.adapt.trim import RestTrim, Untrimmed
 from retrim.adapt.views import GravityView, RestView, WorldView
 from retrim.config import PRESETS, Scenario, Setup, changed, load, setup
 from retrim.config.learners import check_frame
@@ -152,11 +153,15 @@ def test_the_learner_has_the_presets_numbers(built):
     else:
         assert isinstance(learner.view, WorldView)
     assert learner.env.task is made.flown
+    assert isinstance(learner.trim, RestTrim if a.trim == "rest" else Untrimmed)
     model = learner.residual_model
-    if a.residual == "regression":
-        assert (float(model.memory), model.dt) == (a.memory, preset.dt)
-        assert float(model.prior[3]) == pytest.approx(a.thrust_prior)
-        return
+    if a.residual != "ensemble":
+        closed = model.first if a.residual == "layered" else model
+        assert (float(closed.memory), closed.dt, closed.rates.dt) == (a.memory, preset.dt, preset.dt)
+        assert float(closed.prior[3]) == pytest.approx(a.thrust_prior)
+        if a.residual == "regression":
+            return
+        model = model.second
     np.testing.assert_array_equal(model.origin, preset.goal)
     np.testing.assert_array_equal(model.omega_max, made.vehicle.omega_max)
     assert float(model.learning_rate) == a.fit_learning_rate == 1e-2

@@ -270,7 +270,8 @@ def test_a_known_rate_bias_is_taken_off_the_command(key):
     bias, policy = jnp.array([0.3, -0.2, 0.1]), Policy.of(23, small(), key=key, hidden=(8, 8))
     observer = DisturbanceObserver(PointMass(0.02), jnp.array(0.05), LIMIT, jnp.array(4.0))
     inner = PolicyController(hover_env(history=2).task.observation, jax.tree.map(lambda leaf: leaf + 0.02, policy))
-    plain, told_less = (GravityFrame(inner, observer, rate_bias=b) for b in (jnp.zeros(3), bias))
+    age = jnp.array(0.01)
+    plain, told_less = (GravityFrame(inner, observer, age=age, rate_bias=b) for b in (jnp.zeros(3), bias))
 
     @eqx.filter_jit
     def fly(controller, model):

@@ -5,7 +5,7 @@ from typing import Any
 
 LONG = {"num_updates": 30, "update_every": 5.0, "learning_rate": 1e-3, "update_latency": 1.0}
 SHORT = {"num_updates": 5, "update_every": 0.5, "learning_rate": 1e-4, "update_latency": 0.1}
-ENSEMBLE = {"residual": "ensemble", "fit_every": 3.0, "fit_latency": 0.2}
+ENSEMBLE = {"residual": "ensemble", "fit_every": 3.0, "fit_steps": 100, "fit_latency": 0.2}
 REGRESSION = {"residual": "regression", "fit_every": 0.2, "fit_latency": 0.02}
 NEVER = {"update_every": 3600.0}
 
@@ -30,7 +30,7 @@ LAYERS_OFF = (
     Lever("**all levers**"),
     Lever("disturbance observer alone", method="base-do"),
     Lever("observer and regression, no bursts", {"adapt": NEVER}),
-    Lever("bursts alone: no frame", {"adapt": {"frame": "world"}}),
+    Lever("bursts alone: no frame, no trim", {"adapt": {"frame": "world", "trim": "free"}}),
     Lever("ensemble instead of regression", {"adapt": ENSEMBLE}),
     Lever("long updates instead of bursts", {"adapt": LONG}),
     Lever("all starts from the task", {"adapt": {"task_starts": None}}),
@@ -41,12 +41,14 @@ LAYERS_OFF = (
 OFF: dict[str, tuple[Lever, ...]] = {
     "hover": (
         *LAYERS_OFF,
+        Lever("no trim", {"adapt": {"trim": "free"}}),
         Lever("the paper's reward", {"reward": "paper"}),
         Lever("no past commands", {"command_history": 0}),
         Lever("no delay in the model", {"delay_ticks": 0}),
     ),
     "track": (
         *LAYERS_OFF,
+        Lever("no ensemble on what the regression leaves", {"adapt": {"residual": "regression"}}),
         Lever("references as they are only", {"track": {"felt_copies": 0}}),
         Lever("no acceleration and jerk seen", {"track": {"observation": "preview"}}),
         Lever("no tip in the reward", {"reward": "l2"}),

@@ -168,6 +168,8 @@ class Preset:
                 raise ValueError(f"reward = {reward!r} is for task = {task!r}, not for {self.task!r}")
         if self.adapt.trim == "rest" and self.task == "track":
             raise ValueError("adapt.trim = 'rest' is for a task that rests at home, not for 'track'")
+        if self.adapt.trim == "rest" and self.adapt.frame == "world":
+            raise ValueError("adapt.trim = 'rest' needs adapt.frame = 'gravity': a push is part of hover there only")
         if self.options and self.task in BUILT_IN_TASKS:
             raise ValueError(f"a table [options] is for a task of one's own, not for {self.task!r}")
         if abs(1000 * self.dt - round(1000 * self.dt)) > 1e-6:

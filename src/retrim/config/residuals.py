@@ -9,7 +9,7 @@ from ..errors import ConfigError
 from ..learn.residuals.ensemble import EnsembleModel
 from ..learn.residuals.layered import LayeredModel
 from ..learn.residuals.model import ResidualModel
-from ..learn.residuals.regression import RegressionModel
+from ..learn.residuals.regression import BLOCK, RegressionModel
 from ..physics.vehicle import Vehicle
 from .presets import Preset
 from .registry import Registry
@@ -57,11 +57,17 @@ def _ensemble(request: ResidualRequest, hidden: tuple[int, ...] = (128, 128)) ->
 
 
 def _regression(request: ResidualRequest) -> RegressionModel:
-    a = request.preset.adapt
-    return RegressionModel.of(request.preset.dt, memory=a.memory, thrust_prior=a.thrust_prior)
+    p, a = request.preset, request.preset.adapt
+    return RegressionModel.of(p.dt, memory=a.memory, thrust_prior=a.thrust_prior, tau=p.actuator_tau or 0.03)
 
 
 def _layered(request: ResidualRequest) -> ResidualModel:
+    p, least = request.preset, BLOCK * request.preset.dt
+    if p.adapt.fit_every < least:
+        raise ConfigError(
+            f"adapt.residual = 'layered' is judged by the {BLOCK} newest ticks, which it must not have seen: "
+            f"adapt.fit_every = {p.adapt.fit_every:g} s must be at least {least:g} s"
+        )
     return LayeredModel(_regression(request), _ensemble(request, SMALL))
 
 

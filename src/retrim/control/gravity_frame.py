@@ -63,10 +63,11 @@ class GravityFrame(AbstractController[GravityFrameState]):
             observer = dataclasses.replace(observer, nominal=Hybrid(observer.nominal, unsteady))
         observed = observer(memory.observer, x)
         frame = FeltFrame.of(capped(observed.d_hat + felt, observer.limit))
-        x = ahead(x, memory.observer.commands[0], frame.d, self.age.astype(x.p.dtype))
+        bias, last = self.rate_bias.astype(x.p.dtype), memory.observer.commands[0]
+        x = ahead(x, Command(last.c, last.omega + bias), frame.d, self.age.astype(x.p.dtype))
         u, inner = self.inner.in_frame(frame)(memory.inner, t, frame.state(x))
         u = frame.world_command(u)
-        u = Command(u.c, u.omega - self.rate_bias.astype(u.omega.dtype))
+        u = Command(u.c, u.omega - bias)
         return u, GravityFrameState(observer.issued(observed, u), inner, frame)
 
     def accepted(self, memory: GravityFrameState, u: Command) -> GravityFrameState:

@@ -41,9 +41,10 @@ class LayeredModel(eqx.Module):
     The ensemble is fitted to what the closed form leaves, and only to rows since the last change. Before each fit its
     prediction of the newest rows, which it has not seen, is compared with what was left there: the coefficient of a
     regression of the one on the other, between 0 and 1, is the share of it that counts. So an ensemble that was fitted
-    across a change, or that knows nothing, does not make the layer below worse. Noise could pass this test, since what is
-    noisy in a velocity is so in the input and in the target; but it jumps from tick to tick, and the share falls with how
-    much of what is left does. Where members disagree, the mean is shrunk, per axis, by mean^2 / (mean^2 + spread^2).
+    across a change, or that knows nothing, does not make the layer below worse. Noise could pass this test, since what
+    is noisy in a velocity is so in the input and in the target; but it jumps from tick to tick, and the share falls
+    with how much of what is left does. Where members disagree, the mean is shrunk, per axis, by
+    mean^2 / (mean^2 + spread^2).
     """
 
     first: RegressionModel

@@ -17,7 +17,7 @@ from ...physics.state import Command, where
 from .targets import Targets
 
 GRID, SHORTEST, LONGEST = 24, 0.002, 0.2  # time constants that are compared: how many, and from where to where [s]
-UNSETTLED = 8  # rows at the beginning of a window that only let the lag settle
+UNSETTLED = 0.16  # [s] at the beginning of a window that only let the lag settle
 
 
 class RateFit(eqx.Module):
@@ -56,8 +56,8 @@ class RateModel(eqx.Module):
             memory: Time constant of forgetting [s].
             tau: Time constant of the lag that is most likely [s].
         """
-        bias, spread, noise = jnp.array(0.3), jnp.array(0.7), jnp.array(0.05)
-        return cls(bias, jnp.array(tau), spread, noise, jnp.array(memory), dt)
+        one = jnp.ones(())  # a fit has its type, so that nothing is compiled again after the first
+        return cls(0.3 * one, tau * one, 0.7 * one, 0.05 * one, memory * one, dt)
 
     def init(self) -> RateFit:
         """Return the prior."""
@@ -67,7 +67,7 @@ class RateModel(eqx.Module):
         """Return the posterior given ``rows``, the newest last; without a valid row it is the prior."""
         n = rows.valid.shape[0]
         age = jnp.arange(n - 1, -1, -1, dtype=rows.omega.dtype)
-        counts = rows.valid & (jnp.cumsum(rows.valid) > UNSETTLED)
+        counts = rows.valid & (jnp.cumsum(rows.valid) > round(UNSETTLED / self.dt))
         weight = jnp.exp(-self.dt * age / self.memory) * counts.astype(age.dtype)
         taus = jnp.geomspace(SHORTEST, LONGEST, GRID, dtype=age.dtype)
         missed = rows.omega[None] - jax.vmap(lambda tau: self._followed(rows, tau))(taus)

@@ -56,7 +56,9 @@ class RegressionModel(eqx.Module):
     """Control tick [s]."""
 
     @classmethod
-    def of(cls, dt: float, *, memory: float = 0.5, noise: float = 0.5, thrust_prior: float = 0.05) -> "RegressionModel":
+    def of(
+        cls, dt: float, *, memory: float = 0.5, noise: float = 0.5, thrust_prior: float = 0.05, tau: float = 0.03
+    ) -> "RegressionModel":
         """Return the model with priors that fit small and medium quadrotors.
 
         Args:
@@ -64,9 +66,10 @@ class RegressionModel(eqx.Module):
             memory: Time constant of forgetting [s].
             noise: Standard deviation of one row of targets [m/s^2]: of the sensors, and of what no feature explains.
             thrust_prior: Standard deviation of the thrust gain [-].
+            tau: Most likely time constant of the body rates [s].
         """
         prior = jnp.array([5.0, 5.0, 5.0, thrust_prior, 0.3, 0.3, 0.3, 0.03, 0.03, 0.03])
-        return cls(prior, jnp.array(noise), jnp.array(memory), RateModel.of(dt, memory=memory), dt)
+        return cls(prior, jnp.array(noise), jnp.array(memory), RateModel.of(dt, memory=memory, tau=tau), dt)
 
     def init(self, key: Key[Array, ""]) -> RegressionState:
         """Return the prior, which predicts zero; the key is not needed."""

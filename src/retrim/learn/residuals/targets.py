@@ -62,7 +62,7 @@ def residual_targets(
         raise ValueError(f"a window of {n} ticks is too short for a delay of {delay_ticks} ticks")
     x = jax.tree.map(lambda leaf: leaf[delay_ticks : delay_ticks + rows], window.x)
     v_next = window.x.v[delay_ticks + 1 :]
-    u = _acting(window, rows, delay_ticks, nominal.dt)
+    u, known = _acting(window, rows, delay_ticks, nominal.dt)
 
     def tick(s: Any, row: tuple[State, Command, Float[Array, "3"]]) -> tuple[Any, Float[Array, "3"]]:
         x, u, v_next = row
@@ -75,24 +75,28 @@ def residual_targets(
     _, a_res = lax.scan(tick, first, (x, u, v_next))
     omega = jax.vmap(_turned)(x.R, window.x.R[delay_ticks + 1 :]) / nominal.dt
     settled = _settled(window, nominal.settling_ticks)[:rows]
-    return Targets(x, u, a_res, omega, window.valid[:rows] & _regular(window, nominal.dt, delay_ticks) & settled)
+    return Targets(x, u, a_res, omega, known & _regular(window, nominal.dt, delay_ticks) & settled)
 
 
-def _acting(window: Window, rows: int, delay_ticks: int, dt: float) -> Command:
-    """The mean command over the tick that each measurement describes; two share it if that lies between two ticks."""
+def _acting(window: Window, rows: int, delay_ticks: int, dt: float) -> tuple[Command, Bool[Array, " rows"]]:
+    """The mean command over the tick that each measurement describes, and whether it lies in the window.
+
+    Two commands share a tick of measurements whose age is no whole number of ticks.
+    """
     if window.age is None:
         first: Command = jax.tree.map(lambda leaf: leaf[:rows], window.u)
-        return first
+        return first, window.valid[:rows]
     ticks = jnp.arange(rows, dtype=window.t.dtype)
-    at = jnp.maximum(ticks - window.age[delay_ticks : delay_ticks + rows] / dt, 0.0)
-    before, share = jnp.floor(at).astype(int), at - jnp.floor(at)
+    at = ticks - window.age[delay_ticks : delay_ticks + rows] / dt
+    before = jnp.floor(jnp.maximum(at, 0.0)).astype(int)
+    share = jnp.maximum(at, 0.0) - jnp.floor(jnp.maximum(at, 0.0))
 
     def mixed(leaf: Array) -> Array:
         weight = share.reshape(-1, *(1,) * (leaf.ndim - 1)).astype(leaf.dtype)
         return (1.0 - weight) * leaf[before] + weight * leaf[before + 1]
 
     acting: Command = jax.tree.map(mixed, window.u)
-    return acting
+    return acting, (at >= 0.0) & window.valid[before]
 
 
 def _turned(before: Float[Array, "3 3"], after: Float[Array, "3 3"]) -> Float[Array, "3"]:
@@ -101,8 +105,13 @@ def _turned(before: Float[Array, "3 3"], after: Float[Array, "3 3"]) -> Float[Ar
 
 
 def _regular(window: Window, dt: float, delay_ticks: int) -> Bool[Array, " rows"]:
-    """Whether all steps from the row's command to its next velocity are one tick long, to a quarter of it."""
+    """Whether all steps from the row's command to its next velocity are one tick long, to a quarter of it.
+
+    By the clock of commands, and by the times at which the states were true.
+    """
     one_tick = jnp.abs(jnp.diff(window.t) - dt) < 0.25 * dt
+    if window.age is not None:
+        one_tick &= jnp.abs(jnp.diff(window.t - window.age) - dt) < 0.25 * dt
     rows = one_tick.shape[0] - delay_ticks
     return jnp.all(jnp.stack([one_tick[k : k + rows] for k in range(delay_ticks + 1)]), axis=0)
 
