@@ -226,3 +226,14 @@ def test_low_rank_updates_leave_the_base(setup, window, key):
     assert float(optax.tree.norm(jax.tree.map(jnp.subtract, after.policy.delta, policy.delta))) > 0
     sizes = sum(leaf.size for leaf in jax.tree.leaves(after.optimiser))
     assert sizes < 3 * sum(leaf.size for leaf in jax.tree.leaves(policy.delta)) + 10
+
+
+@pytest.mark.parametrize("name", ["ensemble", "regression", "layered"])
+def test_what_was_learnt_has_the_types_of_nothing_learnt(window, name, key):
+    """Weak types, too: a program that took the first state must not be compiled again for the second, in flight."""
+    learner = Setup.of(tiny_preset(adapt={"residual": name, "fit_steps": 2})).learner
+    fresh = jax.eval_shape(learner.residual_model.init, key)
+    fitted, _ = eqx.filter_eval_shape(type(learner).fit_residual, learner, fresh, window)
+    types = lambda tree: [(leaf.shape, leaf.dtype, leaf.weak_type) for leaf in jax.tree.leaves(tree)]  # noqa: E731
+    assert types(fitted) == types(fresh)
+    assert not any(weak for _, _, weak in types(fresh))

@@ -81,6 +81,6 @@ def test_a_camera_at_rest_has_no_noise(key):
 
 def test_what_has_no_rest_is_refused():
     with pytest.raises(ConfigError, match=r"adapt.trim = 'rest' is for a task that rests"):
-        changed(load("track/retrim"), adapt={"trim": "rest"})
+        Setup.of(changed(load("track/retrim"), adapt={"trim": "rest"}))
     with pytest.raises(ConfigError, match=r"adapt.trim = 'rest' needs adapt.frame = 'gravity'"):
         changed(load("hover/retrim"), adapt={"frame": "world"})

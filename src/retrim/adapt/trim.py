@@ -42,7 +42,8 @@ class Untrimmed(AbstractTrim):
 class RestTrim(AbstractTrim):
     """The policy's output is shifted so that at rest at home, with the heading of the flight, it commands hover.
 
-    In the frame of the gravity that is felt, that command keeps the vehicle there under a disturbance, too.
+    In the frame of the gravity that is felt, that command keeps the vehicle there under a disturbance, too. It is for
+    tasks that rest at home and leave the heading free: at the heading that it has, the vehicle stays.
     """
 
     def __call__(self, policy: Policy | LoraPolicy, env: Env, window: Window) -> Policy | LoraPolicy:

@@ -16,7 +16,7 @@ from ..experiments.tables.document import Document, TableSection
 from .machine import UNIT_FLOP
 from .works import WORKS
 
-CORES = ("one", "all") if hasattr(os, "sched_setaffinity") and (os.cpu_count() or 1) > 1 else ("all",)
+CORES = ("one", "all") if hasattr(os, "sched_setaffinity") and len(os.sched_getaffinity(0)) > 1 else ("all",)
 COLUMNS = (
     "work", "one core, s", "units", "all cores, s", "units", "of the limit", "compile, s", "goal", "paper", "peak, MB",
     "remarks",
@@ -44,6 +44,9 @@ def bench(run: Run, reporter: Reporter, *, works: Sequence[str] = tuple(WORKS)) 
     with tempfile.TemporaryDirectory() as cache, reporter.progress("bench") as advance:
         for i, name in enumerate(works):
             advance(i / len(works), WORKS[name].title)
+            if WORKS[name].two_cores and "one" not in CORES:
+                reporter.say(f"{name}: left out, it needs two cores that a process may choose")
+                continue
             try:
                 machine = machine or {cores: _process("machine", cores, {}) for cores in CORES}
                 if name == "programs-warm" and not any(Path(cache).iterdir()):

@@ -24,6 +24,8 @@ class Work:
     """Uses the bench's own persistent compile cache, empty at first."""
     one_core: bool = False
     """Is done on one core, too."""
+    two_cores: bool = False
+    """Needs two cores, and chooses among them."""
 
 
 def timed(compile_s: float, run: Callable[[], Any], runs: int) -> dict[str, Any]:

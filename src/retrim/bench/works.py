@@ -177,7 +177,7 @@ WORKS: dict[str, Work] = {
     "update-retrim": Work(
         "burst 5 x 10 x 150, hover/retrim", "0.05 s on one core", lambda: _update("hover/retrim"), one_core=True
     ),
-    "policies": Work("burst beside a flight at 50 Hz, hover/retrim", "0.1 s, 10 a second", policies),
+    "policies": Work("burst beside a flight at 50 Hz, hover/retrim", "0.1 s, 10 a second", policies, two_cores=True),
     "update-track-retrim": Work(
         "burst 5 x 10 x 100, track/retrim", "0.1 s, its latency", lambda: _update("track/retrim"), one_core=True
     ),
@@ -195,6 +195,10 @@ WORKS: dict[str, Work] = {
     "residual": Work("residual, 3 nets x 100 steps x 100 samples", "0.1 s", _residual, "2 s", one_core=True),
     "residual-retrim": Work(
         "residual, regression on 100 samples", "0.01 s", lambda: _residual("hover/retrim"), one_core=True
+    ),
+    "residual-track-retrim": Work(
+        "residual, layered: regression, 3 small nets x 10 steps", "0.02 s, its latency",
+        lambda: _residual("track/retrim"), one_core=True,
     ),
     "programs-cold": Work("all programs of a flight, empty cache", "compile 60 s", _programs, cached=True),
     "programs-warm": Work("all programs of a flight, from the cache", "compile 5 s", _programs, cached=True),

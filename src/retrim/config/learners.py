@@ -22,6 +22,7 @@ from ..tasks.keypoints import Keypoints
 from ..tasks.occluded import OccludedKeypoints
 from ..tasks.task import AbstractTask
 from .presets import Preset
+from .tasks import find_task
 
 OBSERVER_TAU = 0.05  # [s]: half of it is unstable where the plant's delay is 40 ms longer than declared
 WANDER = 4.0  # [m/s^2] in a second
@@ -37,11 +38,13 @@ def make_learner(preset: Preset, model: ResidualModel, env: Env) -> OnlineLearne
         env: Environment of the flight.
 
     Raises:
-        ConfigError: The preset turns the frame of a task that cannot be turned.
+        ConfigError: The preset turns the frame of a task that cannot be turned, or trims one that does not rest.
     """
     a = preset.adapt
     if a.frame != "world":
         check_frame(preset, env.task)
+    if a.trim == "rest" and find_task(preset.task).has_reference:
+        raise ConfigError(f"adapt.trim = 'rest' is for a task that rests at home, not for {preset.task!r}")
     adam = CarriedAdam if a.optimiser == "carried" else FreshAdam
     return OnlineLearner(
         env,

@@ -166,8 +166,6 @@ class Preset:
         for reward, task in (("sharp", "track"), ("view", "vision")):
             if self.reward == reward and self.task != task:
                 raise ValueError(f"reward = {reward!r} is for task = {task!r}, not for {self.task!r}")
-        if self.adapt.trim == "rest" and self.task == "track":
-            raise ValueError("adapt.trim = 'rest' is for a task that rests at home, not for 'track'")
         if self.adapt.trim == "rest" and self.adapt.frame == "world":
             raise ValueError("adapt.trim = 'rest' needs adapt.frame = 'gravity': a push is part of hover there only")
         if self.options and self.task in BUILT_IN_TASKS:

@@ -52,6 +52,8 @@ class GravityFrame(AbstractController[GravityFrameState]):
     def init(self, x: State) -> GravityFrameState:
         """Return the memory at the start of a flight."""
         observed = self.observer.init(x)
+        told = tuple(Command(u.c, u.omega - self.rate_bias.astype(x.p.dtype)) for u in observed.commands)
+        observed = dataclasses.replace(observed, commands=told)
         return GravityFrameState(observed, self.inner.init(x), FeltFrame.of(observed.d_hat))
 
     def __call__(self, memory: GravityFrameState, t: Float[Array, ""], x: State) -> tuple[Command, GravityFrameState]:

@@ -44,7 +44,7 @@ class AbstractObservation(eqx.Module, Generic[M]):
         """
 
     def at_rest(self, x: State) -> Float[Array, " o"]:
-        """Return what a vehicle sees that has rested in ``x``, without noise."""
+        """Return what a vehicle sees that has rested in ``x``; an observation with noise overrides it, to show none."""
         o, _ = self(self.init(x), jnp.zeros_like(x.p[0]), x, Command.hover(x.p.dtype))
         return o
 

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from jax import random
 
 from ...config.conditions import conditions
 from ...config.loading import load
@@ -13,13 +12,12 @@ from ...config.setup import Setup
 from ...errors import ConfigError, PlantError
 from ...viz import plots
 from ...viz.panels import Curve, Panel, heat_map, panel_figure
-from ..fleet import Fleet
 from ..flights import Flight
 from ..recovery import change_times, recoveries
 from ..reporter import Reporter
 from ..run import Run
 from .document import Document, TableSection
-from .study import fly_all, table_presets, train_all
+from .study import fly_all, refuse_misfits, table_presets, train_all
 
 METHODS: dict[str, tuple[str, ...]] = {
     "hover": ("base", "base-i", "base-do", "full"),
@@ -66,8 +64,8 @@ def gauntlet(
     known = conditions(loaded)
     if unknown := [name for name in only if name not in known]:
         raise ConfigError(f"no condition {unknown[0]!r}; there are {', '.join(known)}")
-    untrained = Setup.of(loaded).new_policy(random.key(0))  # what does not fit is refused before anything is trained
-    Fleet(loaded, untrained, [known[name] for name in only or known], methods=methods, starts=starts, seconds=seconds)
+    chosen = [known[name] for name in only or known]
+    refuse_misfits(loaded, chosen, methods=methods, starts=starts, seconds=seconds)
     document = Document(run, "gauntlet", "The gauntlet", INTRO, seeds, reporter, data="results")
     study = train_all(loaded, seeds, run, reporter)
     home, flown, left_out = Setup.of(loaded).flown.home(), dict[str, list[Flight]](), list[str]()

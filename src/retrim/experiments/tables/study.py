@@ -4,6 +4,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from jax import random
+
 from ...config.loading import dump, load_for
 from ...config.methods import find_method
 from ...config.presets import Preset
@@ -68,6 +70,18 @@ def train_all(preset: Preset, seeds: Sequence[int], run: Run, reporter: Reporter
     return Study(preset, policies, tuple(errors))
 
 
+def refuse_misfits(
+    preset: Preset, scenarios: Sequence[Scenario], *, methods: Sequence[str], starts: int, seconds: float | None
+) -> None:
+    """Plan the flights of a table with a policy that has not been trained.
+
+    Raises:
+        ConfigError: Something does not exist, or does not fit together.
+    """
+    untrained = Setup.of(preset).new_policy(random.key(0))
+    Fleet(preset, untrained, scenarios, methods=methods, starts=starts, seconds=seconds)
+
+
 def fly_all(
     study: Study,
     scenarios: Sequence[Scenario],
@@ -107,6 +121,11 @@ class Levels:
     levels: Mapping[str, str] = field(default_factory=lambda: LEVELS)
     """Disturbances, and what they are called."""
 
+    @property
+    def scenarios(self) -> list[Scenario]:
+        """One for each level."""
+        return [replace(self.scenario, disturbance=level) for level in self.levels]
+
 
 def fly_levels(document: Document, sections: Sequence[Levels], *, starts: int, seconds: float | None) -> None:
     """Train, fly and lay out every section; the document is written after each, and when it is interrupted.
@@ -116,8 +135,13 @@ def fly_levels(document: Document, sections: Sequence[Levels], *, starts: int, s
         sections: What to fly; a preset is trained once.
         starts: Flights per disturbance, method and seed.
         seconds: Length of a flight; the task's own by default.
+
+    Raises:
+        ConfigError: Something does not exist, or does not fit together; nothing has been trained.
     """
     run, reporter, studies = document.run, document.reporter, dict[str, Study]()
+    for section in sections:
+        refuse_misfits(section.preset, section.scenarios, methods=section.methods, starts=starts, seconds=seconds)
     for section in sections:
         key = dump(section.preset)
         if key not in studies:
@@ -135,8 +159,7 @@ def _level_section(
 ) -> tuple[TableSection, list[dict[str, Any]]] | None:
     """The section and its rows of results; None if nothing was flown."""
     methods, title = section.methods, section.title
-    scenarios = [replace(section.scenario, disturbance=level) for level in section.levels]
-    flown = fly_all(study, scenarios, run, reporter, methods=methods, starts=starts, seconds=seconds).flown
+    flown = fly_all(study, section.scenarios, run, reporter, methods=methods, starts=starts, seconds=seconds).flown
     if not flown:
         return None
     found = [{**row, "preset": study.preset.name, "section": title} for row in rows(flown)]
@@ -148,7 +171,7 @@ def _level_section(
     )
     setup = Setup.of(study.preset, section.scenario.reference)
     first = [f for f in flown if f.spec.seed == flown[0].spec.seed and f.spec.method in ("base", "full")]
-    drawn = picture(first, setup, scenarios[-1], run.folder, stem=section.stem)
+    drawn = picture(first, setup, section.scenarios[-1], run.folder, stem=section.stem)
     table = level_table(found, methods, section.paper, title, section.levels)
     return replace(table, about=about, picture=drawn[0] if drawn else None), found
 

@@ -84,16 +84,17 @@ class RegressionModel(eqx.Module):
         from the first that it does not explain (99.99 %) nothing older counts.
         """
         del state  # the window says all: what is older has been forgotten
+        fitted, rms, _ = self.fit_weighted(rows)
+        return fitted, rms
+
+    def fit_weighted(self, rows: Targets) -> tuple[RegressionState, Float[Array, ""], Float[Array, " n"]]:
+        """Fit as :meth:`fit`; also return how much each row counts: nothing, if invalid or from before a change."""
         features = jax.vmap(features_of)(rows.x, rows.u)
         weight = self._weight(features, rows)
         posterior = self._posterior(features, rows.a_res, weight)
         error = jnp.sum((rows.a_res - features @ posterior.mean) ** 2, axis=1)
         rms = jnp.sqrt(jnp.sum(weight * error) / jnp.maximum(jnp.sum(weight), 1e-6))
-        return RegressionState(posterior.mean, posterior.covariance, self.rates.fit(rows)), rms
-
-    def weight(self, rows: Targets) -> Float[Array, " n"]:
-        """Return how much each row counts: less with age, nothing if invalid or from before a change."""
-        return self._weight(jax.vmap(features_of)(rows.x, rows.u), rows)
+        return RegressionState(posterior.mean, posterior.covariance, self.rates.fit(rows)), rms, weight
 
     def _weight(self, features: Float[Array, "n 3 10"], rows: Targets) -> Float[Array, " n"]:
         age = jnp.arange(rows.valid.shape[0] - 1, -1, -1)
