@@ -17,7 +17,7 @@ COMMANDS = {
     "fly": "Fly a policy on a plant, as it is and adapting as it flies.",
     "demo": "The whole loop: pretrain, fly, adapt; a table and pictures.",
     "sweep": "Presets x scenarios x seeds from a TOML file, to one table and one picture.",
-    "reproduce": "Make a table of the paper again: hover, tracking, vision, reversing, plants, model, ablation.",
+    "reproduce": "Make a table of the paper again: hover, tracking, fast, vision, reversing, ...",
     "gauntlet": "A policy under everything that changes, at hover or on references: recovery, steady and worst error.",
     "bench": "How long each piece of work takes on this machine.",
     "doctor": "Versions, device and cache, and known faults of dependencies.",
@@ -87,8 +87,10 @@ def _command(name: str, words: list[str], stop: threading.Event) -> int:
 
     from ..errors import RetrimError
     from ..experiments.compile_cache import enable_compile_cache
+    from ..experiments.compile_flags import compile_in_one_piece
     from .console import console, refuse
 
+    compile_in_one_piece()
     enable_compile_cache()
     command = importlib.import_module(f".{name}", PACKAGE)
     try:
