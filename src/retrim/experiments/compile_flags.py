@@ -12,8 +12,8 @@ def compile_in_one_piece() -> None:
     """Have each program compiled as one piece of code, unless ``XLA_FLAGS`` says otherwise.
 
     By default a program is up to 32 pieces, each with a memory map and a table for unwinding of its own. A command that
-    compiles thousands of programs then comes near the limit on maps, and one table in many thousands ends exactly at the
-    end of its page, where the C library reads on and the process dies. Compiling takes as long.
+    compiles thousands of programs then comes near the limit on maps, and one table in many thousands ends exactly at
+    the end of its page, where the C library reads on and the process dies. Compiling takes as long.
     """
     flags = os.environ.get("XLA_FLAGS", "")
     major, minor, *_ = version("jaxlib").split(".")
