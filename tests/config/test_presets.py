@@ -191,7 +191,7 @@ OURS["vision/occluded"] = OURS["vision/ideal"] | {
 OURS["vision/retrim"] = OURS["vision/occluded"] | {
     "reward": "view",
     "actuator_tau": 0.033,
-    "adapt": OURS["hover/retrim"]["adapt"],
+    "adapt": OURS["hover/retrim"]["adapt"] | {"trim": "free"},
 }
 OURS["hover/100hz"] = OURS["hover/fast"] | {
     "dt": 0.01,

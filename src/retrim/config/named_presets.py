@@ -77,7 +77,11 @@ OCCLUDED = dataclasses.replace(
 )
 
 VISION_RETRIM = dataclasses.replace(
-    OCCLUDED, name="vision/retrim", reward="view", actuator_tau=0.033, adapt=RETRIM.adapt
+    OCCLUDED,
+    name="vision/retrim",
+    reward="view",
+    actuator_tau=0.033,
+    adapt=dataclasses.replace(RETRIM.adapt, trim="free"),  # a pose that is estimated wrongly is no rest
 )
 
 PRESETS: dict[str, Preset] = {
