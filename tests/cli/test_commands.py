@@ -1,10 +1,7 @@
 """Commands as a user runs them, at reduced size: what they print, write and return."""
 
 import json
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -156,22 +153,3 @@ def test_words_that_name_a_module_of_the_user(word, names):
     from retrim.cli.main import _names_a_module
 
     assert _names_a_module(word) is names
-
-
-def test_a_command_compiles_each_program_in_one_piece():
-    """Before the backend has begun; what the user said stands."""
-    code = (
-        "import retrim.cli.main, retrim.experiments.compile_flags as flags, jax._src.xla_bridge as bridge, os;"
-        "flags.compile_in_one_piece(); print(bool(bridge._backends), os.environ['XLA_FLAGS'])"
-    )
-
-    def told(given):
-        environment = {**os.environ, "XLA_FLAGS": given}
-        return subprocess.run(
-            [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
-        ).stdout.split()
-
-    one = "--xla_cpu_parallel_codegen_split_count=1"
-    assert told("") == ["False", one]
-    assert told("--xla_dump_to=x") == ["False", "--xla_dump_to=x", one]
-    assert told("--xla_cpu_parallel_codegen_split_count=4") == ["False", "--xla_cpu_parallel_codegen_split_count=4"]

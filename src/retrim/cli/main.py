@@ -87,10 +87,8 @@ def _command(name: str, words: list[str], stop: threading.Event) -> int:
 
     from ..errors import RetrimError
     from ..experiments.compile_cache import enable_compile_cache
-    from ..experiments.compile_flags import compile_in_one_piece
     from .console import console, refuse
 
-    compile_in_one_piece()
     enable_compile_cache()
     command = importlib.import_module(f".{name}", PACKAGE)
     try:
