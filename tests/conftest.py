@@ -3,7 +3,6 @@
 import gc
 import os
 import signal
-from pathlib import Path
 
 # Nearly all of the suite's time is compiling, and half of that is optimisation that a short test never earns back. A
 # program in one piece takes fewer memory maps. The commands that tests start inherit this. What users run, optimised,
@@ -28,7 +27,7 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
-from retrim.experiments.compile_cache import enable_compile_cache  # noqa: E402  (after the configuration)
+from retrim.experiments.compile_cache import enable_compile_cache, release_programs  # noqa: E402
 
 enable_compile_cache()  # shared by the workers and by the commands that tests start
 # Only what takes long to compile is worth a file: thousands of small programs are not written from test workers.
@@ -50,13 +49,11 @@ def optax_promotion():
 def keep_programs():
     """Share compiled programs between files, but free them before they are too many.
 
-    Each program holds memory maps, of which a process has 65,530. What stays is not looked through for garbage again.
+    What stays is not looked through for garbage again.
     """
     yield
-    maps = Path("/proc/self/maps")
-    if maps.exists() and maps.read_text().count("\n") > 45_000:
+    if release_programs(above=45_000):
         gc.unfreeze()
-        jax.clear_caches()
     gc.collect()
     gc.freeze()
 

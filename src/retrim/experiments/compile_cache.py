@@ -1,10 +1,32 @@
 """JAX's persistent cache of compiled programs, in the user's cache folder."""
 
+import gc
 import os
 import warnings
 from pathlib import Path
 
 import jax
+
+MAPS = Path("/proc/self/maps")
+ENOUGH = 30_000  # of the 65,530 memory maps that Linux lets a process have; at the limit it dies of a fault
+
+
+def release_programs(above: int = ENOUGH) -> bool:
+    """Give compiled programs back if they hold more than so many memory maps; they are loaded again when needed.
+
+    Each program holds some. A long table compiles thousands, one set for each of its conditions.
+
+    Returns:
+        Whether they were given back.
+    """
+    try:
+        many = MAPS.read_bytes().count(b"\n") > above
+    except OSError:  # a system that has no such file
+        return False
+    if many:
+        jax.clear_caches()
+        gc.collect()
+    return many
 
 
 def enable_compile_cache() -> Path | None:

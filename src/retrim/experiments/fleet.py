@@ -20,6 +20,7 @@ from ..control.policy import Policy
 from ..errors import ConfigError
 from ..plants.plant import Measurement
 from ..runtime.flight import FlightStopped
+from .compile_cache import release_programs
 from .flights import Flight, FlightSpec
 from .flying import fly_lot, fly_one, program_of
 from .interrupts import interrupts_only_set
@@ -248,6 +249,8 @@ class Fleet:
             if not lot.compiles:
                 lot.compiled.wait()
             cold = lot.compiles
+            if cold:
+                release_programs()
             return fly_lot(
                 setup, policies, lot.specs, starts, seconds, state=state, progress=aloft, stop=stop, cold=cold
             )
