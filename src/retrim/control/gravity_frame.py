@@ -41,7 +41,6 @@ class GravityFrame(AbstractController[GravityFrameState]):
     which would come late."""
     age: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(0.0))
     """How old measurements are [s]: the controller inside is shown what they say of now."""
-
     rate_bias: Float[Array, "3"] = eqx.field(default_factory=lambda: jnp.zeros(3))
     """The vehicle turns so much faster than it is told [rad/s], so it is told less."""
 

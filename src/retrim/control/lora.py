@@ -59,15 +59,14 @@ class LoraPolicy(eqx.Module):
         """
         if len(ranks) != len(base.layers):
             raise ValueError(f"LoRA: {len(ranks)} ranks {ranks} for {len(base.layers)} layers")
-        thin = []
+        thin, dtype = [], base.layers[0].weight.dtype
         for layer, rank, k in zip(base.layers, ranks, random.split(key, len(ranks)), strict=True):
             fan_out, fan_in = layer.weight.shape
             if not 1 <= rank <= min(fan_out, fan_in):
                 raise ValueError(f"LoRA: rank {rank} for weights {fan_out} x {fan_in}")
-            dtype, bound = layer.weight.dtype, fan_in**-0.5
+            bound = fan_in**-0.5
             down = random.uniform(k, (rank, fan_in), dtype, minval=-bound, maxval=bound)
             thin.append(LowRankFactors(down, jnp.zeros((fan_out, rank), dtype=dtype)))
-        dtype = base.layers[0].weight.dtype
         return cls(base, tuple(thin), jnp.array(scale, dtype=dtype), jnp.zeros(4, dtype=dtype))
 
     @property

@@ -88,8 +88,9 @@ def _acting(window: Window, rows: int, delay_ticks: int, dt: float) -> tuple[Com
         return first, window.valid[:rows]
     ticks = jnp.arange(rows, dtype=window.t.dtype)
     at = ticks - window.age[delay_ticks : delay_ticks + rows] / dt
-    before = jnp.floor(jnp.maximum(at, 0.0)).astype(int)
-    share = jnp.maximum(at, 0.0) - jnp.floor(jnp.maximum(at, 0.0))
+    since = jnp.maximum(at, 0.0)
+    whole = jnp.floor(since)
+    before, share = whole.astype(int), since - whole
 
     def mixed(leaf: Array) -> Array:
         weight = share.reshape(-1, *(1,) * (leaf.ndim - 1)).astype(leaf.dtype)
