@@ -12,7 +12,7 @@ from safetensors.numpy import load, save
 from retrim import MessageError
 from retrim.control import Policy
 from retrim.physics import small
-from retrim.transport import wire
+from retrim.transport import message, wire
 
 TREE = {"a": jnp.arange(6.0).reshape(2, 3), "b": (jnp.array(3), jnp.zeros(0))}
 SHAPES = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), TREE)
@@ -34,7 +34,7 @@ def with_header(header):
 def edited(data, change=None, **header):
     """The message with other tensors or another header, without the checksum's consent."""
     tensors = load(data)
-    return save(change(tensors) if change else tensors, metadata=wire._metadata(data) | header)
+    return save(change(tensors) if change else tensors, metadata=message._metadata(data) | header)
 
 
 @pytest.mark.parametrize("like", [TREE, SHAPES])
@@ -100,16 +100,16 @@ def test_a_header_that_is_none(header):
 @pytest.mark.parametrize("dtype", ["BF16", "F8_E4M3"])
 def test_types_that_numpy_has_not(dtype):
     width = 2 if dtype == "BF16" else 1
-    message = with_header(
-        {"__metadata__": {"format": wire.FORMAT, "kind": "test"}}
+    data = with_header(
+        {"__metadata__": {"format": message.FORMAT, "kind": "test"}}
         | {"a": {"dtype": dtype, "shape": [6], "data_offsets": [0, 6 * width]}}
     ) + bytes(6 * width)
     with pytest.raises(MessageError, match="somewhere: "):
-        unpacked(message)
+        unpacked(data)
 
 
 def test_more_bytes_than_are_accepted(monkeypatch):
-    monkeypatch.setattr(wire, "MAX_BYTES", 100)
+    monkeypatch.setattr(message, "MAX_BYTES", 100)
     with pytest.raises(MessageError, match=r"somewhere: \d+ bytes, more than the 100 that are accepted"):
         unpacked(packed())
 

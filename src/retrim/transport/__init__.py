@@ -1,4 +1,1 @@
-"""Parameters as bytes."""
-
-from .wire import pack as pack
-from .wire import unpack as unpack
+"""Parameters as bytes, and the bus that carries them."""

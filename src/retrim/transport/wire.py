@@ -1,26 +1,17 @@
-"""Pytrees of arrays as bytes: one format for files and messages. Nothing in it is ever executed.
+"""Pytrees of arrays as messages (:mod:`retrim.transport.message`)."""
 
-A message is a safetensors file whose header says what it is: format, kind, and a checksum of the tensors. Reading
-validates names, shapes, types and finiteness against what is expected before anything is built.
-"""
-
-import hashlib
-import json
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from safetensors import SafetensorError, deserialize
-from safetensors.numpy import load, save
 
-from ..errors import MessageError
+from .message import MAX_BYTES as MAX_BYTES
+from .message import describe as describe
+from .message import kind_of as kind_of
+from .message import pack_arrays, unpack_arrays
 
 T = TypeVar("T")
-
-FORMAT = "retrim/1"
-MAX_BYTES = 256 * 2**20
 
 
 def names(tree: Any) -> dict[str, Any]:
@@ -37,38 +28,7 @@ def pack(tree: Any, *, kind: str, about: Mapping[str, str]) -> bytes:
         kind: What it is, as ``policy``.
         about: Header fields; the checksum covers them and the arrays.
     """
-    tensors = {name: np.array(leaf, order="C") for name, leaf in names(tree).items()}
-    header = {**about, "format": FORMAT, "kind": kind}
-    return save(tensors, metadata=header | {"checksum": _checksum(tensors, header)})
-
-
-def describe(data: bytes, *, kind: str, source: str) -> dict[str, str]:
-    """Return the header of a message.
-
-    Raises:
-        MessageError: It is not a whole message of this format and ``kind``.
-    """
-    if (found := kind_of(data, source=source)) != kind:
-        raise MessageError(f"{source}: holds a {found!r}, expected a {kind!r}")
-    return _metadata(data)
-
-
-def kind_of(data: bytes, *, source: str) -> str:
-    """Return what a message holds.
-
-    Raises:
-        MessageError: It is not a whole message of this format.
-    """
-    if len(data) > MAX_BYTES:
-        raise MessageError(f"{source}: {len(data)} bytes, more than the {MAX_BYTES} that are accepted")
-    try:
-        deserialize(data)
-    except SafetensorError as error:
-        raise MessageError(f"{source}: not a whole safetensors file; truncated or of another kind ({error})") from error
-    header = _metadata(data)
-    if header.get("format") != FORMAT:
-        raise MessageError(f"{source}: format {header.get('format', 'none')!r}, expected {FORMAT!r}")
-    return header.get("kind", "nothing")
+    return pack_arrays(names(tree), kind=kind, about=about)
 
 
 def unpack(data: bytes, like: T, *, kind: str, source: str) -> T:
@@ -86,43 +46,6 @@ def unpack(data: bytes, like: T, *, kind: str, source: str) -> T:
     Raises:
         MessageError: The message is truncated, damaged, of another kind or shape, or has values that are not finite.
     """
-    header = describe(data, kind=kind, source=source)
-    try:
-        tensors = load(data)
-    except (SafetensorError, KeyError, ValueError) as error:
-        raise MessageError(f"{source}: a tensor of a type that is not used here ({error})") from error
-    expected = names(like)
-    for name in sorted(expected.keys() | tensors.keys()):
-        if name not in tensors:
-            raise MessageError(f"{source}: tensor {name!r} is missing")
-        if name not in expected:
-            raise MessageError(f"{source}: unexpected tensor {name!r}; expected {', '.join(sorted(expected))}")
-        there, wanted = tensors[name], expected[name]
-        if there.shape != wanted.shape:
-            raise MessageError(f"{source}: tensor {name!r} has shape {there.shape}, expected {tuple(wanted.shape)}")
-        real = np.issubdtype(wanted.dtype, np.floating)
-        if not np.issubdtype(there.dtype, np.floating if real else np.integer):
-            expects = "floating point" if real else "integers"
-            raise MessageError(f"{source}: tensor {name!r} has type {there.dtype}, expected {expects}")
-        if not np.isfinite(there).all():
-            raise MessageError(
-                f"{source}: tensor {name!r} has {np.sum(~np.isfinite(there))} weights that are not finite"
-            )
-    if header.pop("checksum", None) != _checksum(tensors, header):
-        raise MessageError(f"{source}: the checksum does not match; the file was damaged or edited")
-    leaves = [jnp.asarray(tensors[name], dtype=wanted.dtype) for name, wanted in expected.items()]
-    tree: T = jax.tree.unflatten(jax.tree.structure(like), leaves)
+    arrays = unpack_arrays(data, names(like), kind=kind, source=source)
+    tree: T = jax.tree.unflatten(jax.tree.structure(like), [jnp.asarray(array) for array in arrays.values()])
     return tree
-
-
-def _metadata(data: bytes) -> dict[str, str]:
-    size = int.from_bytes(data[:8], "little")
-    return dict(json.loads(data[8 : 8 + size]).get("__metadata__") or {})
-
-
-def _checksum(tensors: Mapping[str, np.ndarray], header: Mapping[str, str]) -> str:
-    digest = hashlib.sha256(json.dumps(dict(header), sort_keys=True).encode())
-    for name in sorted(tensors):
-        digest.update(name.encode())
-        digest.update(tensors[name].tobytes())
-    return digest.hexdigest()

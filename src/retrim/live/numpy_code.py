@@ -1,0 +1,134 @@
+"""Any controller as NumPy source, so that the process that flies needs no JAX.
+
+A controller is traced once, before take-off. Each operation of the trace becomes one line of NumPy. What no input
+reaches is computed now, what only parameters reach is computed when they change, and the rest each tick. So learned and
+classical controllers, ours and the user's own, fly in real time by the same definition that trains in JAX.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from jax.extend.core import ClosedJaxpr, Jaxpr, Var
+
+from ..errors import ConfigError
+from ..onboard import lax
+from ..onboard.program import ProgramSource
+from .primitives import EXPRESSIONS
+
+CONSTANT, PARAMETER, INPUT = range(3)
+INLINE = ("jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "remat", "checkpoint")
+Ref = tuple[str, int]
+"""Name of a value in the source, and the kind of what it depends on."""
+
+
+def numpy_program(function: Callable[..., Any], parameters: Any, inputs: Any) -> ProgramSource:
+    """Return a function of two pytrees as a program.
+
+    Args:
+        function: ``function(parameters, inputs)`` returns a pytree; it is traced with JAX.
+        parameters: What changes seldom; an example.
+        inputs: What is new at every call; an example.
+
+    Raises:
+        ConfigError: The function has an operation that has no NumPy form here.
+    """
+    closed = jax.make_jaxpr(function)(parameters, inputs)
+    writer = _Writer()
+    kinds = [PARAMETER] * len(jax.tree.leaves(parameters)) + [INPUT] * len(jax.tree.leaves(inputs))
+    given: list[Ref] = [(f"p{i}" if kind == PARAMETER else f"i{i}", kind) for i, kind in enumerate(kinds)]
+    outputs = writer.inline(closed, given)
+    return ProgramSource(writer.source(given, outputs), writer.constants)
+
+
+class _Writer:
+    """Collects lines and constants."""
+
+    def __init__(self) -> None:
+        self.constants: dict[str, Any] = {}
+        self.lines: list[tuple[str, str, int, tuple[str, ...]]] = []
+        self._known: dict[str, Ref] = {}
+        self._scope: dict[str, Any] = {"np": np, "lax": lax}
+
+    def constant(self, value: Any) -> Ref:
+        """Return the name of a constant."""
+        array = np.asarray(value)
+        key = f"{array.dtype} {array.shape} {array.tobytes().hex()}"
+        if key not in self._known:
+            name = f"c{len(self.constants)}"
+            # Scalars of NumPy are several times faster than arrays without axes.
+            self.constants[name] = self._scope[name] = array if array.ndim else array[()]
+            self._known[key] = (name, CONSTANT)
+        return self._known[key]
+
+    def inline(self, closed: ClosedJaxpr, given: Sequence[Ref]) -> list[Ref]:
+        """Write the lines of a trace; return its outputs."""
+        jaxpr: Jaxpr = closed.jaxpr
+        found: dict[Var, Ref] = dict(zip(jaxpr.invars, given, strict=True))
+        found |= {var: self.constant(value) for var, value in zip(jaxpr.constvars, closed.consts, strict=True)}
+
+        def read(atom: Any) -> Ref:
+            return found[atom] if isinstance(atom, Var) else self.constant(np.asarray(atom.val, atom.aval.dtype))
+
+        for eqn in jaxpr.eqns:
+            operands = [read(atom) for atom in eqn.invars]
+            name = eqn.primitive.name
+            if name in INLINE:
+                inner = eqn.params.get("jaxpr") or eqn.params.get("call_jaxpr") or eqn.params["fun_jaxpr"]
+                if isinstance(inner, Jaxpr):
+                    inner = ClosedJaxpr(inner, ())
+                results = self.inline(inner, operands)
+            elif name in EXPRESSIONS:
+                results = self._write(eqn, operands)
+            else:
+                raise ConfigError(f"operation {name!r} of this controller has no NumPy form, so it cannot fly live")
+            found |= dict(zip(eqn.outvars, results, strict=True))
+        return [read(atom) for atom in jaxpr.outvars]
+
+    def _write(self, eqn: Any, operands: list[Ref]) -> list[Ref]:
+        names, kind = [name for name, _ in operands], max((kind for _, kind in operands), default=CONSTANT)
+        text = EXPRESSIONS[eqn.primitive.name](eqn, *names)
+        many = eqn.primitive.multiple_results
+        if text in names:  # nothing happens to it
+            return [operands[names.index(text)]]
+        if kind == CONSTANT:
+            value = eval(text, self._scope)
+            return [self.constant(v) for v in (value if many else [value])]
+        if text not in self._known:
+            self._known[text] = (f"v{len(self.lines)}", kind)
+            self.lines.append((*self._known[text][:1], text, kind, tuple(names)))
+        whole = self._known[text]
+        return [self._item(whole, i) for i in range(len(eqn.outvars))] if many else [whole]
+
+    def _item(self, whole: Ref, i: int) -> Ref:
+        text = f"{whole[0]}[{i}]"
+        if text not in self._known:
+            self._known[text] = (f"v{len(self.lines)}", whole[1])
+            self.lines.append((self._known[text][0], text, whole[1], (whole[0],)))
+        return self._known[text]
+
+    def source(self, given: Sequence[Ref], outputs: Sequence[Ref]) -> str:
+        """Return the source of both functions, without lines that nobody needs."""
+        needed, kept = {name for name, _ in outputs}, []
+        for line in reversed(self.lines):
+            if line[0] in needed:
+                needed |= set(line[3])
+                kept.append(line)
+        kept.reverse()
+        kinds = dict(given) | {name: kind for name, _, kind, _ in kept}
+        wanted = {n for *_, kind, names in kept if kind == INPUT for n in names} | {name for name, _ in outputs}
+        passed = sorted(n for n in wanted if kinds.get(n) == PARAMETER)
+
+        def body(kind: int) -> list[str]:
+            return [f"    {name} = {text}" for name, text, k, _ in kept if k == kind]
+
+        def unpacked(names: Sequence[str], source: str) -> list[str]:
+            return [f"    {', '.join(names)}, = {source}"] if names else []
+
+        parameters = [name for name, kind in given if kind == PARAMETER]
+        inputs = [name for name, kind in given if kind == INPUT]
+        lines = ["def prepare(parameters):", *unpacked(parameters, "parameters"), *body(PARAMETER)]
+        lines += [f"    return [{', '.join(passed)}]", "", "def step(prepared, inputs):"]
+        lines += [*unpacked(passed, "prepared"), *unpacked(inputs, "inputs"), *body(INPUT)]
+        return "\n".join([*lines, f"    return [{', '.join(name for name, _ in outputs)}]", ""])

@@ -1,0 +1,173 @@
+"""NumPy expressions for the operations of a trace, by name: functions of the equation and the names of its operands."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from jax.lax import GatherScatterMode
+
+Expression = Callable[..., str]
+
+
+def _infix(symbol: str) -> Expression:
+    return lambda eqn, a, b: f"{a} {symbol} {b}"
+
+
+def _call(function: str) -> Expression:
+    return lambda eqn, *operands: f"{function}({', '.join(operands)})"
+
+
+def _reduced(function: str) -> Expression:
+    return lambda eqn, x: f"{function}({x}, axis={tuple(eqn.params['axes'])})"
+
+
+def _same(eqn: Any, x: str) -> str:
+    return x
+
+
+def _shape(eqn: Any) -> tuple[int, ...]:
+    return tuple(eqn.outvars[0].aval.shape)
+
+
+def _reshape(eqn: Any, x: str) -> str:
+    return x if tuple(eqn.invars[0].aval.shape) == _shape(eqn) else f"{x}.reshape({_shape(eqn)})"
+
+
+def _broadcast(eqn: Any, x: str) -> str:
+    shape, before = _shape(eqn), eqn.invars[0].aval.shape
+    if tuple(before) == shape:
+        return x
+    spread = [1] * len(shape)
+    for axis, n in zip(eqn.params["broadcast_dimensions"], before, strict=True):
+        spread[axis] = n
+    placed = x if tuple(spread) == tuple(before) else f"{x}.reshape({tuple(spread)})"
+    return placed if tuple(spread) == shape else f"np.broadcast_to({placed}, {shape})"
+
+
+def _convert(eqn: Any, x: str) -> str:
+    dtype = np.dtype(eqn.params["new_dtype"])
+    return x if eqn.invars[0].aval.dtype == dtype else f"{x}.astype({dtype.name!r})"
+
+
+def _slice(eqn: Any, x: str) -> str:
+    p = eqn.params
+    strides = p["strides"] or (1,) * len(p["start_indices"])
+    axes = [
+        f"{a}:{b}" + (f":{s}" if s != 1 else "")
+        for a, b, s in zip(p["start_indices"], p["limit_indices"], strides, strict=True)
+    ]
+    return f"{x}[{', '.join(axes)}]"
+
+
+def _select(eqn: Any, which: str, *cases: str) -> str:
+    if len(cases) == 2 and eqn.invars[0].aval.dtype == bool:
+        return f"np.where({which}, {cases[1]}, {cases[0]})"
+    return f"np.choose({which}, ({', '.join(cases)},))"
+
+
+def _dot(eqn: Any, a: str, b: str) -> str:
+    (over_a, over_b), (batch_a, batch_b) = eqn.params["dimension_numbers"]
+    ranks = [v.aval.ndim for v in eqn.invars]
+    if not batch_a and tuple(over_a) == (ranks[0] - 1,) and tuple(over_b) == (0,) and max(ranks) <= 2:
+        return f"{a} @ {b}"
+    if not batch_a:
+        return f"np.tensordot({a}, {b}, ({tuple(over_a)}, {tuple(over_b)}))"
+    letters = iter("abcdefghijklmnopqrstuvwxyz")
+    left, right = [next(letters) for _ in range(ranks[0])], [next(letters) for _ in range(ranks[1])]
+    for i, j in zip((*batch_a, *over_a), (*batch_b, *over_b), strict=True):
+        right[j] = left[i]
+    free_a = [left[i] for i in range(ranks[0]) if i not in (*batch_a, *over_a)]
+    free_b = [right[j] for j in range(ranks[1]) if j not in (*batch_b, *over_b)]
+    out = [left[i] for i in batch_a] + free_a + free_b
+    return f"np.einsum('{''.join(left)},{''.join(right)}->{''.join(out)}', {a}, {b})"
+
+
+def _div(eqn: Any, a: str, b: str) -> str:
+    return f"{a} / {b}" if np.issubdtype(eqn.outvars[0].aval.dtype, np.floating) else f"lax.integer_div({a}, {b})"
+
+
+def _power(eqn: Any, x: str) -> str:
+    n = eqn.params["y"]
+    return f"{x} * {x}" if n == 2 else f"{x} ** {n}" if n >= 0 else f"1 / {x} ** {-n}"
+
+
+def _gather(eqn: Any, x: str, at: str) -> str:
+    d, fill = eqn.params["dimension_numbers"], GatherScatterMode.FILL_OR_DROP
+    axes = (d.offset_dims, d.collapsed_slice_dims, d.start_index_map, eqn.params["slice_sizes"])
+    mode = GatherScatterMode.from_any(eqn.params["mode"])
+    return f"lax.gather({x}, {at}, {', '.join(str(tuple(each)) for each in axes)}, fill={mode == fill})"
+
+
+def _scatter(eqn: Any, x: str, at: str, updates: str) -> str:
+    d = eqn.params["dimension_numbers"]
+    axes = f"{tuple(d.update_window_dims)}, {tuple(d.inserted_window_dims)}, {tuple(d.scatter_dims_to_operand_dims)}"
+    return f"lax.scatter({x}, {at}, {updates}, {axes})"
+
+
+def _split(eqn: Any, x: str) -> str:
+    return f"np.split({x}, {np.cumsum(eqn.params['sizes'])[:-1].tolist()}, axis={eqn.params['axis']})"
+
+
+def _pad(eqn: Any, x: str, value: str) -> str:
+    return f"lax.pad({x}, {value}, {tuple(tuple(int(n) for n in axis) for axis in eqn.params['padding_config'])})"
+
+
+def _iota(eqn: Any) -> str:
+    shape, along, dtype = _shape(eqn), eqn.params["dimension"], np.dtype(eqn.params["dtype"]).name
+    spread = tuple(-1 if axis == along else 1 for axis in range(len(shape)))
+    return f"np.broadcast_to(np.arange({shape[along]}, dtype={dtype!r}).reshape({spread}), {shape})"
+
+
+def _index(function: str) -> Expression:
+    return lambda eqn, x: (
+        f"{function}({x}, axis={eqn.params['axes'][0]}).astype({np.dtype(eqn.params['index_dtype']).name!r})"
+    )
+
+
+EXPRESSIONS: dict[str, Expression] = {
+    **{name: _infix(s) for name, s in {
+        "add": "+", "add_any": "+", "sub": "-", "mul": "*", "pow": "**", "eq": "==", "ne": "!=", "lt": "<", "le": "<=",
+        "gt": ">", "ge": ">=", "and": "&", "or": "|", "xor": "^",
+    }.items()},
+    **{name: _call(f"np.{f}") for name, f in {
+        "sqrt": "sqrt", "exp": "exp", "log": "log", "log1p": "log1p", "expm1": "expm1", "sin": "sin", "cos": "cos",
+        "tan": "tan", "tanh": "tanh", "atan2": "arctan2", "asin": "arcsin", "acos": "arccos", "atan": "arctan",
+        "abs": "abs", "sign": "sign", "floor": "floor", "ceil": "ceil", "max": "maximum", "min": "minimum",
+        "is_finite": "isfinite", "not": "logical_not", "square": "square", "rem": "fmod", "nextafter": "nextafter",
+    }.items()},
+    **{name: _reduced(f"np.{f}") for name, f in {
+        "reduce_sum": "sum", "reduce_max": "max", "reduce_min": "min", "reduce_and": "all", "reduce_or": "any",
+        "reduce_prod": "prod",
+    }.items()},
+    **dict.fromkeys(("stop_gradient", "copy", "copy_p", "optimization_barrier"), _same),
+    "neg": lambda eqn, x: f"-{x}",
+    "rsqrt": lambda eqn, x: f"1 / np.sqrt({x})",
+    "logistic": _call("lax.logistic"),
+    "round": lambda eqn, x: f"np.round({x})",
+    "div": _div,
+    "integer_pow": _power,
+    "clamp": lambda eqn, low, x, high: f"np.minimum(np.maximum({x}, {low}), {high})",
+    "select_n": _select,
+    "convert_element_type": _convert,
+    "reshape": _reshape,
+    "squeeze": _reshape,
+    "expand_dims": _reshape,
+    "broadcast_in_dim": _broadcast,
+    "transpose": lambda eqn, x: f"np.transpose({x}, {tuple(eqn.params['permutation'])})",
+    "rev": lambda eqn, x: f"np.flip({x}, {tuple(eqn.params['dimensions'])})",
+    "slice": _slice,
+    "split": _split,
+    "concatenate": lambda eqn, *xs: f"np.concatenate(({', '.join(xs)},), axis={eqn.params['dimension']})",
+    "stack": lambda eqn, *xs: f"np.stack(({', '.join(xs)},), axis={eqn.params['axis']})",
+    "tile": lambda eqn, x: f"np.tile({x}, {tuple(eqn.params['reps'])})",
+    "pad": _pad,
+    "iota": _iota,
+    "cumsum": lambda eqn, x: f"np.cumsum({x}, axis={eqn.params['axis']})",
+    "argmin": _index("np.argmin"),
+    "argmax": _index("np.argmax"),
+    "dot_general": _dot,
+    "gather": _gather,
+    "scatter": _scatter,
+    "dynamic_slice": lambda eqn, x, *at: f"lax.dynamic_slice({x}, ({', '.join(at)},), {_shape(eqn)})",
+    "dynamic_update_slice": lambda eqn, x, new, *at: f"lax.dynamic_update_slice({x}, {new}, ({', '.join(at)},))",
+}  # fmt: skip

@@ -1,0 +1,45 @@
+"""A bus within one process, for tests and for threads."""
+
+import threading
+from collections.abc import Mapping
+
+from ..errors import MessageError
+from .bus import Bus, Message
+
+
+class InProcessBus(Bus):
+    """A dictionary behind a lock."""
+
+    def __init__(self, capacities: Mapping[str, int]) -> None:
+        """Build a bus; ``capacities`` are the longest messages of its topics, in bytes."""
+        self._capacities, self._lock = dict(capacities), threading.Lock()
+        self._last = dict.fromkeys(capacities, Message(0, b""))
+
+    def publish(self, topic: str, data: bytes) -> None:
+        """Replace the last message of ``topic``."""
+        check_fits(topic, data, self._capacities)
+        with self._lock:
+            self._last[topic] = Message(self._last[topic].version + 1, bytes(data))
+
+    def latest(self, topic: str, after: int = 0) -> Message | None:
+        """Return the last message of ``topic`` if it is newer than ``after``."""
+        check_topic(topic, self._capacities)
+        with self._lock:
+            found = self._last[topic]
+        return found if found.version > after else None
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+def check_topic(topic: str, capacities: Mapping[str, int]) -> None:
+    """Raise :class:`MessageError` if there is no such topic."""
+    if topic not in capacities:
+        raise MessageError(f"no topic {topic!r} on this bus; there are {', '.join(sorted(capacities))}")
+
+
+def check_fits(topic: str, data: bytes, capacities: Mapping[str, int]) -> None:
+    """Raise :class:`MessageError` if there is no such topic, or the message is too long for it."""
+    check_topic(topic, capacities)
+    if len(data) > capacities[topic]:
+        raise MessageError(f"topic {topic!r}: a message of {len(data)} bytes, room for {capacities[topic]}")

@@ -1,0 +1,131 @@
+"""Named arrays as bytes: one format for files and messages. Nothing in it is ever executed.
+
+A message is a safetensors file whose header says what it is: format, kind, and a checksum of the tensors. Reading
+validates names, shapes, types and finiteness against what is expected before anything is built.
+"""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from safetensors import SafetensorError, deserialize
+from safetensors.numpy import load, save
+
+from ..errors import MessageError
+
+FORMAT = "retrim/1"
+MAX_BYTES = 256 * 2**20
+
+
+@runtime_checkable
+class ArrayLike(Protocol):
+    """What is expected of an array: any array of that shape and type will do."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Its shape."""
+        ...
+
+    @property
+    def dtype(self) -> Any:
+        """Type of its numbers."""
+        ...
+
+
+def pack_arrays(arrays: Mapping[str, Any], *, kind: str, about: Mapping[str, str]) -> bytes:
+    """Return the bytes of a message; the inverse of :func:`unpack_arrays`.
+
+    Args:
+        arrays: Arrays by name.
+        kind: What it is, as ``policy``.
+        about: Header fields; the checksum covers them and the arrays.
+    """
+    tensors = {name: np.array(array, order="C") for name, array in arrays.items()}
+    header = {**about, "format": FORMAT, "kind": kind}
+    return save(tensors, metadata=header | {"checksum": _checksum(tensors, header)})
+
+
+def describe(data: bytes, *, kind: str, source: str) -> dict[str, str]:
+    """Return the header of a message.
+
+    Raises:
+        MessageError: It is not a whole message of this format and ``kind``.
+    """
+    if (found := kind_of(data, source=source)) != kind:
+        raise MessageError(f"{source}: holds a {found!r}, expected a {kind!r}")
+    return _metadata(data)
+
+
+def kind_of(data: bytes, *, source: str) -> str:
+    """Return what a message holds.
+
+    Raises:
+        MessageError: It is not a whole message of this format.
+    """
+    if len(data) > MAX_BYTES:
+        raise MessageError(f"{source}: {len(data)} bytes, more than the {MAX_BYTES} that are accepted")
+    try:
+        deserialize(data)
+    except SafetensorError as error:
+        raise MessageError(f"{source}: not a whole safetensors file; truncated or of another kind ({error})") from error
+    header = _metadata(data)
+    if header.get("format") != FORMAT:
+        raise MessageError(f"{source}: format {header.get('format', 'none')!r}, expected {FORMAT!r}")
+    return header.get("kind", "nothing")
+
+
+def unpack_arrays(data: bytes, expected: Mapping[str, ArrayLike], *, kind: str, source: str) -> dict[str, np.ndarray]:
+    """Read a message.
+
+    Args:
+        data: Bytes of the message.
+        expected: Shape and type of each array, by name.
+        kind: What the message should hold.
+        source: Where the bytes come from, for messages of errors.
+
+    Returns:
+        The arrays, in the order of ``expected``.
+
+    Raises:
+        MessageError: The message is truncated, damaged, of another kind or shape, or has values that are not finite.
+    """
+    header = describe(data, kind=kind, source=source)
+    try:
+        tensors = load(data)
+    except (SafetensorError, KeyError, ValueError) as error:
+        raise MessageError(f"{source}: a tensor of a type that is not used here ({error})") from error
+    found: dict[str, np.ndarray] = {}
+    for name in sorted(expected.keys() | tensors.keys()):
+        if name not in tensors:
+            raise MessageError(f"{source}: tensor {name!r} is missing")
+        if name not in expected:
+            raise MessageError(f"{source}: unexpected tensor {name!r}; expected {', '.join(sorted(expected))}")
+        there, wanted = tensors[name], expected[name]
+        if there.shape != wanted.shape:
+            raise MessageError(f"{source}: tensor {name!r} has shape {there.shape}, expected {tuple(wanted.shape)}")
+        real = np.issubdtype(wanted.dtype, np.floating)
+        if not np.issubdtype(there.dtype, np.floating if real else np.integer):
+            expects = "floating point" if real else "integers"
+            raise MessageError(f"{source}: tensor {name!r} has type {there.dtype}, expected {expects}")
+        with np.errstate(over="ignore"):
+            found[name] = there.astype(wanted.dtype)
+        if wrong := np.sum(~np.isfinite(found[name])):
+            raise MessageError(f"{source}: tensor {name!r} has {wrong} weights that are not finite")
+    if header.pop("checksum", None) != _checksum(tensors, header):
+        raise MessageError(f"{source}: the checksum does not match; the file was damaged or edited")
+    return {name: found[name] for name in expected}
+
+
+def _metadata(data: bytes) -> dict[str, str]:
+    size = int.from_bytes(data[:8], "little")
+    return dict(json.loads(data[8 : 8 + size]).get("__metadata__") or {})
+
+
+def _checksum(tensors: Mapping[str, np.ndarray], header: Mapping[str, str]) -> str:
+    digest = hashlib.sha256(json.dumps(dict(header), sort_keys=True).encode())
+    for name in sorted(tensors):
+        digest.update(name.encode())
+        digest.update(tensors[name].tobytes())
+    return digest.hexdigest()

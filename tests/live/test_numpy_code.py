@@ -1,0 +1,119 @@
+"""A controller written as NumPy decides as it does in JAX, tick after tick."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax, random
+
+from retrim.config.named_presets import PRESETS
+from retrim.config.setup import Setup
+from retrim.errors import ConfigError
+from retrim.live.numpy_code import numpy_program
+from retrim.onboard.program import NumpyProgram
+from retrim.physics import so3
+from retrim.physics.state import State
+
+
+def leaves(tree):
+    return [np.asarray(leaf)[()] for leaf in jax.tree.leaves(tree)]
+
+
+def check(function, parameters, inputs, tolerance=1e-12):
+    """Assert that the program returns what JAX returns, in the same shapes and types."""
+    program = NumpyProgram(numpy_program(function, parameters, inputs))
+    found = program.step(program.prepare(leaves(parameters)), leaves(inputs))
+    wanted = jax.tree.leaves(function(parameters, inputs))
+    assert len(found) == len(wanted)
+    for a, b in zip(found, wanted, strict=True):
+        assert (np.shape(a), np.asarray(a).dtype) == (b.shape, b.dtype)
+        np.testing.assert_allclose(a, b, rtol=tolerance, atol=tolerance)
+
+
+X = jnp.linspace(-1.4, 1.7, 24).reshape(2, 3, 4)
+POSITIVE = jnp.abs(X) + 0.1
+OPERATIONS = {
+    "unary": lambda p, x: [
+        jnp.sin(x), jnp.cos(x), jnp.tanh(x), jnp.exp(x), jnp.abs(x), jnp.sign(x), jnp.floor(x), jnp.ceil(x), -x,
+        jnp.log(jnp.abs(x) + p), jnp.sqrt(jnp.abs(x)), lax.rsqrt(jnp.abs(x) + 1.0), jax.nn.sigmoid(x), jnp.square(x),
+        x**3, lax.integer_pow(x, -2), jnp.round(x), jnp.arcsin(x / 2.0), jnp.arctan(x), jnp.expm1(x),
+    ],
+    "binary": lambda p, x: [
+        x + p, x - p, x * p, x / p, jnp.arctan2(x, p), jnp.maximum(x, p), jnp.minimum(x, p), jnp.fmod(x, p),
+        jnp.abs(x) ** p, x < p, x >= p, x == p, (x < p) & (x > -p), (x < p) | (x > 1.0), ~(x < p), (x < p) ^ (x > 1.0),
+    ],
+    "choice": lambda p, x: [jnp.where(x > p, x, p), jnp.clip(x, -p, p), lax.select_n(jnp.array(2), x, 2 * x, 3 * x)],
+    "shapes": lambda p, x: [
+        x.reshape(6, 4), x[0, 1:, ::2], x[..., ::-1], x.transpose(2, 0, 1), jnp.broadcast_to(x[:, :1], (2, 5, 4)),
+        jnp.concatenate([x, 2.0 * x], axis=1), jnp.stack([x, x], axis=-1), jnp.pad(x, ((0, 0), (1, 2), (0, 1))),
+        lax.pad(x, p, ((0, 0, 0), (-1, 2, 1), (1, -1, 0))), jnp.split(x, [1, 3], axis=2), jnp.tile(x, (1, 2, 1)),
+        jnp.squeeze(x[:1]), x[:, None], jnp.arange(5) * p, jnp.eye(3) * p,
+    ],
+    "sums": lambda p, x: [
+        x.sum(), x.sum((0, 2)), x.max(1), x.min((1, 2)), x.mean(0), x.prod(2),
+        (x > p).any(1), (x > p).all(), x.cumsum(1),
+        x.argmin(2), x.argmax(0),
+    ],
+    "products": lambda p, x: [
+        x[0] @ x[1].T, x[0] @ x[1, 0], x[0, 0] @ x[1].T, jnp.einsum("bij,bkj->bik", x, x),
+        jnp.einsum("bij,bkj->bki", x, p * x),
+        jnp.tensordot(x, x, ((0, 2), (0, 2))), jnp.einsum("bij,bij->b", x, x), jnp.outer(x[0, 0], x[1, 1]),
+    ],
+    "indices": lambda p, x: [
+        x[0, 1, jnp.array([3, 0, 2])], jnp.take(x, jnp.array([1, 5]), axis=1), x[jnp.int32(p), 2], x.at[0, 1].set(p),
+        x.at[:, jnp.array([2])].set(7.0), lax.dynamic_slice(x, (0, jnp.int64(p + 5.0), 1), (2, 2, 2)), x[jnp.int32(-1)],
+        lax.dynamic_update_slice(x, jnp.ones((1, 2, 2)), (jnp.int64(p), 2, 1)), 7 // jnp.int32(2 + p), x.astype(int),
+    ],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", OPERATIONS)
+def test_each_operation_is_that_of_jax(name):
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        check(OPERATIONS[name], jnp.array(0.7), X)
+
+
+def test_what_parameters_alone_decide_is_computed_once():
+    source = numpy_program(lambda p, x: jnp.exp(p) * x + jnp.sin(jnp.array(2.0)), jnp.array(0.3), X)
+    prepare, step = source.text.split("def step")
+    assert "np.exp" in prepare
+    assert "np.exp" not in step
+    assert "np.sin" not in source.text
+
+
+def test_what_has_no_numpy_form_is_named_before_take_off():
+    with pytest.raises(ConfigError, match="operation 'sort' of this controller has no NumPy form"):
+        numpy_program(lambda p, x: jnp.sort(x), jnp.array(0.0), X)
+
+
+@pytest.mark.parametrize(
+    ("preset", "reference"),
+    [("hover/retrim", None), ("hover/paper", None), ("track/retrim", "figure8"), ("track/fast", "star")],
+)
+def test_a_preset_flies_the_same_commands(preset, reference):
+    setup = Setup.of(PRESETS[preset], reference)
+    with jax.numpy_dtype_promotion("standard"):
+        state = setup.learner.init(setup.new_policy(random.key(0)), random.key(1))
+    parameters, fixed = eqx.partition(state, eqx.is_array)
+
+    def decide(parameters, inputs):
+        memory, t, x = inputs
+        return setup.controller(eqx.combine(parameters, fixed))(memory, t, x)
+
+    memory = setup.controller(state).init(State.at(jnp.array([0.0, 0.0, 1.0])))
+    program = NumpyProgram(numpy_program(decide, parameters, (memory, jnp.array(0.0), State.at(jnp.zeros(3)))))
+    prepared, remembered, jitted = program.prepare(leaves(parameters)), leaves(memory), jax.jit(decide)
+    for i in range(25):
+        a, b, c = random.split(random.key(i), 3)
+        x = State(
+            0.5 * random.normal(a, (3,)) + jnp.array([0.0, 0.0, 1.0]),
+            so3.exp(0.3 * random.normal(b, (3,))),
+            0.3 * random.normal(c, (3,)),
+        )
+        t = jnp.array(0.02 * i)
+        u, memory = jitted(parameters, (memory, t, x))
+        found = program.step(prepared, [*remembered, *leaves((t, x))])
+        remembered = found[2:]
+        for one, other in zip(found, jax.tree.leaves((u, memory)), strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)
