@@ -18,6 +18,7 @@ COMMANDS = {
     "demo": "The whole loop: pretrain, fly, adapt; a table and pictures.",
     "sweep": "Presets x scenarios x seeds from a TOML file, to one table and one picture.",
     "reproduce": "Make a table of the paper again: hover, tracking, fast, vision, reversing, ...",
+    "live": "Fly against the clock and learn at the same time, in processes of their own.",
     "gauntlet": "A policy under everything that changes, at hover or on references: recovery, steady and worst error.",
     "bench": "How long each piece of work takes on this machine.",
     "doctor": "Versions, device and cache, and known faults of dependencies.",

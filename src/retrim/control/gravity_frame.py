@@ -46,7 +46,7 @@ class GravityFrame(AbstractController[GravityFrameState]):
 
     def aged(self, age: float) -> "GravityFrame":
         """Return the same for measurements that are ``age`` old [s]."""
-        return dataclasses.replace(self, age=jnp.array(age)) if age > 0.0 else self
+        return dataclasses.replace(self, age=jnp.array(age))
 
     def init(self, x: State) -> GravityFrameState:
         """Return the memory at the start of a flight."""

@@ -64,7 +64,7 @@ def fly_one(
         return bool(_terminated(task, np.float64(t), x))
 
     log = fly(plant, pilot, x0, ticks=round(seconds / preset.dt), terminated=terminated, observers=observers, stop=stop)
-    return _scored(setup, spec, log, pilot)
+    return scored(setup, spec, log, learnt_by(pilot))
 
 
 def program_of(setup: Setup, policy: Policy | LoraPolicy, specs: Sequence[FlightSpec]) -> Hashable:
@@ -125,12 +125,12 @@ def fly_lot(
     ticks = round(seconds / preset.dt)
     logs = fly_together(simulated, pilots, starts, ticks=ticks, progress=progress, stop=stop, cold=cold)
     return [
-        _scored(setup, spec, _until_terminated(setup.flown, log), pilot)
+        scored(setup, spec, until_terminated(setup.flown, log), learnt_by(pilot))
         for spec, log, pilot in zip(specs, logs, pilots, strict=True)
     ]
 
 
-def _until_terminated(task: AbstractTask, log: Log) -> Log:
+def until_terminated(task: AbstractTask, log: Log) -> Log:
     """Cut a log where the vehicle left the task's bounds; a batch flies on."""
     left = np.flatnonzero(np.asarray(_all_terminated(task, log.t, log.true.as_state()))[1:])
     if not len(left):
@@ -143,7 +143,13 @@ def _until_terminated(task: AbstractTask, log: Log) -> Log:
     )
 
 
-def _scored(setup: Setup, spec: FlightSpec, log: Log, pilot: Pilot) -> Flight:
+def learnt_by(pilot: Pilot) -> LearnerState | None:
+    """Return what a pilot has learnt; None if it does not learn."""
+    return pilot.state if isinstance(pilot, AdaptivePilot) else None
+
+
+def scored(setup: Setup, spec: FlightSpec, log: Log, learnt: LearnerState | None = None) -> Flight:
+    """Return a flight with its errors, and why it was terminated if it was."""
     task = setup.flown
     error, cross = _errors(task, log.t, log.true.as_state())
     if log.terminated:
@@ -157,7 +163,7 @@ def _scored(setup: Setup, spec: FlightSpec, log: Log, pilot: Pilot) -> Flight:
         task.metric,
         task.steady_seconds,
         None if cross is None else np.asarray(cross),
-        pilot.state if isinstance(pilot, AdaptivePilot) else None,
+        learnt,
     )
 
 

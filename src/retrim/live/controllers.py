@@ -1,0 +1,108 @@
+"""The controller of a set-up as programs for the process that flies."""
+
+import hashlib
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..adapt.learner import LearnerState
+from ..config.setup import Setup
+from ..control.controller import AbstractController
+from ..control.policy import Policy
+from ..learn.bptt import PolicyState
+from ..learn.residuals.model import FittedResidual
+from ..onboard.pilot import ControllerSource
+from ..physics.dynamics import f_a
+from ..physics.state import Command, State
+from ..transport import wire
+from .numpy_code import numpy_program
+
+
+def flown(policy: Policy, residual: Any) -> dict[str, Any]:
+    """Return the parameters of a controller that learns, by half."""
+    return {"policy": eqx.filter(policy, eqx.is_array), "residual": eqx.filter(residual, eqx.is_array)}
+
+
+def adaptive_source(setup: Setup, state: LearnerState) -> ControllerSource:
+    """Return the controller of a policy that adapts.
+
+    Args:
+        setup: Its preset, on the reference that is flown.
+        state: What has been learnt before the flight.
+
+    Raises:
+        ConfigError: It has an operation without a NumPy form.
+    """
+    policy = state.policy.policy.merged()
+    parts = eqx.partition((policy, state.residual), eqx.is_array)
+
+    def whole(parameters: dict[str, Any]) -> tuple[Policy, Any]:
+        found: tuple[Policy, Any] = eqx.combine((parameters["policy"], parameters["residual"]), parts[1])
+        return found
+
+    def controller(parameters: dict[str, Any]) -> AbstractController[Any]:
+        policy, residual = whole(parameters)
+        return setup.controller(LearnerState(PolicyState(policy, ()), residual))
+
+    def predicted(parameters: dict[str, Any], inputs: tuple[State, Command]) -> Any:
+        model = FittedResidual(setup.learner.residual_model, whole(parameters)[1])
+        return f_a(*inputs, model(*inputs)).v
+
+    return _source(setup, controller, predicted, {"policy": parts[0][0], "residual": parts[0][1]})
+
+
+def plain_source(setup: Setup, controller: AbstractController[Any]) -> ControllerSource:
+    """Return a controller that does not learn.
+
+    Raises:
+        ConfigError: It has an operation without a NumPy form.
+    """
+    arrays, fixed = eqx.partition(controller, eqx.is_array)
+
+    def predicted(parameters: dict[str, Any], inputs: tuple[State, Command]) -> Any:
+        return f_a(*inputs, jnp.zeros_like(inputs[0].p)).v
+
+    return _source(setup, lambda found: eqx.combine(found["policy"], fixed), predicted, {"policy": arrays})
+
+
+def _source(setup: Setup, controller: Any, predicted: Any, parameters: dict[str, Any]) -> ControllerSource:
+    x, u = State.at(setup.flown.home()), Command.hover(setup.flown.home().dtype)
+    t = jnp.zeros_like(x.p[0])
+
+    def init(parameters: Any, x: State) -> Any:
+        return controller(parameters).init(x)
+
+    memory = _arrays(jax.jit(init)(parameters, x))
+
+    def decide(parameters: Any, inputs: Any) -> Any:
+        memory, t, age, x = inputs
+        u, after = controller(parameters).aged(age)(memory, t, x)
+        return (u.c, u.omega), after
+
+    def accepted(parameters: Any, inputs: Any) -> Any:
+        return controller(parameters).accepted(*inputs)
+
+    programs = {
+        "init": numpy_program(init, parameters, x),
+        "decide": numpy_program(decide, parameters, (memory, t, t, x)),
+        "accepted": numpy_program(accepted, parameters, (memory, u)),
+        "target": numpy_program(lambda _, t: setup.flown.target(t), (), t),
+        "predicted": numpy_program(predicted, parameters, (x, u)),
+    }
+    named = {half: {n: np.asarray(a) for n, a in wire.names(tree).items()} for half, tree in parameters.items()}
+    digest = hashlib.sha256()
+    for program in programs.values():
+        digest.update(program.text.encode())
+    for half, arrays in named.items():
+        digest.update(f"{half} {[(n, a.shape, a.dtype.name) for n, a in arrays.items()]}".encode())
+    return ControllerSource(**programs, parameters=named, base=digest.hexdigest()[:16], dtype=np.dtype(x.p.dtype))
+
+
+def _arrays(memory: Any) -> Any:
+    """Return a memory; raise ``TypeError`` if it holds more than arrays, which cannot be carried in NumPy."""
+    if not all(eqx.is_array(leaf) for leaf in jax.tree.leaves(memory)):
+        raise TypeError("a controller's memory must be a pytree of arrays to fly live")
+    return memory

@@ -1,0 +1,191 @@
+"""The process of one layer of learning: windows of flight come in, parameters go out."""
+
+import os
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import random
+
+from ..adapt.buffer import RollingBuffer
+from ..adapt.learner import LearnerState
+from ..adapt.updates import Layer, PolicyUpdate, ResidualUpdate, Update, pack_update, unpack_update
+from ..adapt.workers import PolicyWorker, ResidualWorker, Worker
+from ..config.setup import Setup
+from ..errors import MessageError
+from ..experiments.compile_cache import enable_compile_cache
+from ..io.trained import load_learnt
+from ..onboard.messages import COMMAND, MEASURED, FlightRows, Parameters, pack_note, unpack_note
+from ..onboard.realtime import Lifeline
+from ..physics.state import Command, State
+from ..transport import wire
+from ..transport.bus import Bus
+from ..transport.shared_memory import SharedMemoryBus
+from .controllers import flown
+
+CHECK_EVERY = 0.005  # [s]
+VERDICT = 1.0  # [s] that a policy waits to be flown; after it, it counts as lost
+
+
+@dataclass(frozen=True)
+class LearnerPlan:
+    """Everything that the process is started with."""
+
+    folder: Path
+    layer: Layer
+    start: Path
+    """File with what was learnt before the flight, and the preset."""
+    reference: str | None
+    seed: int
+    base: str
+    """Hash of the controller that flies."""
+    cores: frozenset[int]
+    parent: int
+
+
+class LearnerLoop:
+    """One layer beside the flight. :meth:`step` is the whole of it, so that a test needs no clock."""
+
+    def __init__(self, plan: LearnerPlan, bus: Bus) -> None:
+        state, preset = load_learnt(plan.start)
+        self.plan, self.bus, self.state = plan, bus, state
+        self.setup = Setup.of(preset, plan.reference)
+        self.every = preset.adapt.fit_every if plan.layer == "residual" else preset.adapt.update_every
+        self._buffer = RollingBuffer(preset.adapt.window)
+        self._worker = self._new_worker()
+        self._last_tick, self._new_ticks, self._began = -1, 0, 0.0
+        self._known: dict[str, int] = {}
+        self._pending: tuple[int, PolicyUpdate, float] | None = None
+        self._flown: list[tuple[int, Update]] = []
+
+    def _new_worker(self) -> Worker:
+        if self.plan.layer == "residual":
+            return ResidualWorker(self.setup.learner, self.state)
+        return PolicyWorker(self.setup.learner, self.state, random.key(self.plan.seed))
+
+    def warm_up(self) -> None:
+        """Compile what a flight needs; what is learnt from a made-up window is dropped."""
+        x = State.at(self.setup.flown.home())
+        self._buffer.push(0.0, x, Command.hover(x.p.dtype))
+        self._worker.learn(self._buffer.window())
+        self._buffer.clear()
+        self._worker = self._new_worker()
+
+    def catch_up(self) -> None:
+        """Go on from what an earlier process of this layer published last."""
+        for layer in ("residual", "policy"):
+            self._take(layer)
+
+    def step(self, now: float) -> bool:
+        """Take what is new and learn if it is time; return whether something was learnt."""
+        self._look()
+        if self.plan.layer == "policy":
+            self._take("residual")
+            self._judge(now)
+        if self._pending is not None or len(self._buffer) < 2 or now - self._began < self.every:
+            return False
+        if self._new_ticks == 0:
+            return False
+        self._began, self._new_ticks = now, 0
+        self._publish(self._worker.learn(self._buffer.window()), now)
+        return True
+
+    def _look(self) -> None:
+        """Add the ticks that are new to the window."""
+        message = self._fresh("flight")
+        if message is None:
+            return
+        try:
+            rows = FlightRows.unpack(message).rows
+        except MessageError:
+            return
+        dtype = np.asarray(self.setup.flown.home()).dtype
+        for row in rows[rows[:, 0] > self._last_tick]:
+            x, u = row[MEASURED].astype(dtype), row[COMMAND].astype(dtype)
+            state = State(*(jnp.asarray(part) for part in (x[:3], x[3:12].reshape(3, 3), x[12:])))
+            self._buffer.push(float(row[1]), state, Command(jnp.asarray(u[0]), jnp.asarray(u[1:])), float(row[2]))
+            self._last_tick, self._new_ticks = int(row[0]), self._new_ticks + 1
+
+    def _publish(self, update: Update, now: float) -> None:
+        layer = self.plan.layer
+        self.bus.publish(f"update.{layer}", pack_update(update))
+        if not isinstance(update, ResidualUpdate | PolicyUpdate):
+            return
+        topic = f"parameters.{layer}"
+        before = self.bus.latest(topic)
+        version = 1 if before is None else before.version + 1
+        whole = self._learnt_by(update)
+        arrays = wire.names(flown(whole.policy.policy.merged(), whole.residual)[layer])
+        self.bus.publish(topic, Parameters(layer, version, self.plan.base, update.computed_from, arrays).pack())
+        if isinstance(update, PolicyUpdate):
+            self._pending = version, update, now
+        else:
+            self._worker.receive(update)
+
+    def _learnt_by(self, update: Update) -> LearnerState:
+        if isinstance(update, PolicyUpdate):
+            return LearnerState(update.state, self.state.residual)
+        assert isinstance(update, ResidualUpdate)
+        return LearnerState(self.state.policy, update.state)
+
+    def _judge(self, now: float) -> None:
+        """Go on from a policy once it is flown, and from the one before if it was taken back."""
+        message = self.bus.latest("status")
+        if message is None:
+            return
+        try:
+            status = unpack_note(message.data, "status")
+        except MessageError:
+            return
+        taken_back = status.get("rolled_back", [])
+        while self._flown and self._flown[-1][0] in taken_back:
+            self._flown.pop()
+            self._worker.receive(self._flown[-1][1] if self._flown else _start(self.state))
+        if self._pending is None:
+            return
+        version, update, published = self._pending
+        if status.get("versions", {}).get("policy", 0) >= version:
+            self._worker.receive(update)
+            self._flown = [*self._flown[-3:], (version, update)]
+            self._pending = None
+        elif now - published > VERDICT:
+            self._pending = None
+
+    def _take(self, layer: str) -> None:
+        """Take note of the newest update of a layer, if it is new."""
+        data = self._fresh(f"update.{layer}")
+        if data is None:
+            return
+        try:
+            self._worker.receive(unpack_update(data, self.state, source=f"update.{layer}"))
+        except MessageError:
+            return
+
+    def _fresh(self, topic: str) -> bytes | None:
+        message = self.bus.latest(topic, self._known.get(topic, 0))
+        if message is None:
+            return None
+        self._known[topic] = message.version
+        return message.data
+
+
+def _start(state: LearnerState) -> PolicyUpdate:
+    return PolicyUpdate(0.0, 0.0, 0.0, state.policy)
+
+
+def learn(plan: LearnerPlan) -> None:
+    """Learn until the flight is over: the main function of the process."""
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, set(plan.cores))
+    enable_compile_cache()
+    bus, parent = SharedMemoryBus(plan.folder), Lifeline(plan.parent)
+    loop = LearnerLoop(plan, bus)
+    loop.warm_up()
+    loop.catch_up()
+    bus.publish(f"ready.{plan.layer}", pack_note("ready", device=jax.devices()[0].platform))
+    while not parent.gone() and bus.latest("ended") is None:
+        if not loop.step(time.monotonic()):
+            time.sleep(CHECK_EVERY)

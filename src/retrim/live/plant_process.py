@@ -1,0 +1,128 @@
+"""The process of a simulated plant: it keeps wall-clock time, as a vehicle does."""
+
+import os
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from ..config.scenario import Scenario
+from ..errors import MessageError, PlantError
+from ..experiments.compile_cache import enable_compile_cache
+from ..onboard.messages import Sample, Setpoint, pack_note, unpack_note
+from ..onboard.realtime import Lifeline, be_punctual, sleep_until
+from ..physics.state import Command, State
+from ..plants.plant import Measurement
+from ..transport.bus import Bus
+from ..transport.shared_memory import SharedMemoryBus
+
+SHARE = 0.6  # of a tick, for which a command is waited for; the rest is for the simulation
+GROUND = -0.5  # [m]; below it a vehicle has crashed
+
+
+@dataclass(frozen=True)
+class PlantPlan:
+    """Everything that the process is started with."""
+
+    folder: Path
+    scenario: Scenario
+    vehicle: Any
+    """Vehicle that the policy was trained for: a name or a specification."""
+    x0: np.ndarray
+    """Start: p, R by rows, v."""
+    dt: float
+    seed: int
+    cores: frozenset[int]
+    priority: int
+    parent: int
+
+
+def simulate(plan: PlantPlan) -> None:
+    """Fly until the vehicle has landed: the main function of the process."""
+    os.sched_setaffinity(0, set(plan.cores)) if hasattr(os, "sched_setaffinity") else None
+    enable_compile_cache()
+    bus, parent = SharedMemoryBus(plan.folder), Lifeline(plan.parent)
+    x0 = State(*map(jnp.asarray, _parts(plan.x0)))
+    try:
+        with plan.scenario.make(plan.vehicle, dt=plan.dt, seed=plan.seed) as plant:
+            for _ in range(2):  # every program compiled, and run
+                plant.reset(x0)
+                for _ in range(5):
+                    plant.step(Command.hover(x0.p.dtype))
+            measurement = plant.reset(x0)
+            refused = be_punctual(plan.priority, set(plan.cores))
+            bus.publish("ready.plant", pack_note("ready", refused=refused))
+            while (epoch := _epoch(bus)) is None:
+                if parent.gone(0.01):
+                    return
+            reason = _flown(plan, plant, bus, measurement, epoch)
+    except PlantError as error:
+        reason = f"plant lost: {error}"
+    bus.publish("ended", pack_note("ended", reason=reason))
+
+
+def _flown(plan: PlantPlan, plant: Any, bus: Bus, measurement: Measurement, epoch: float) -> str:
+    """Fly, and return why the flight ended."""
+    tick, late, held = 0, 0, 0
+    u = accepted = np.asarray(Command.hover().vector(), dtype=float)
+    while True:
+        sleep_until(epoch + tick * plan.dt)
+        now = time.monotonic()
+        sample = Sample(
+            tick, measurement.t, now, measurement.age, _vector(measurement.x), _vector(measurement.true_state), accepted
+        )
+        bus.publish("sample", sample.pack())
+        if not np.isfinite(sample.truth).all() or sample.truth[2] < GROUND:
+            return "crashed"
+        setpoint = _answer(bus, tick, epoch + (tick + SHARE) * plan.dt)
+        if setpoint is None:
+            held += 1  # a vehicle goes on with the last one, too
+        elif setpoint.landed:
+            return "landed"
+        else:
+            u = setpoint.u
+        dtype = measurement.x.p.dtype
+        measurement, taken = plant.step(Command(jnp.asarray(u[0], dtype), jnp.asarray(u[1:], dtype)))
+        accepted, tick = np.asarray(taken.vector(), dtype=float), tick + 1
+        behind = time.monotonic() - (epoch + tick * plan.dt)
+        if behind > 0:
+            late += 1
+            epoch += max(0.0, behind - plan.dt)  # the world waits rather than jump
+        if tick % 25 == 0:
+            bus.publish("world", pack_note("world", late=late, held=held, epoch=epoch))
+
+
+def _answer(bus: Bus, tick: int, until: float) -> Setpoint | None:
+    """Return the answer to a sample, or the fallback's, if there is one in time."""
+    while True:
+        for topic in ("setpoint", "fallback"):
+            message = bus.latest(topic)
+            if message is None:
+                continue
+            try:
+                found = Setpoint.unpack(message.data)
+            except MessageError:
+                continue
+            if found.tick == tick:
+                return found
+        if time.monotonic() >= until:
+            return None
+        time.sleep(3e-4)
+
+
+def _epoch(bus: Bus) -> float | None:
+    message = bus.latest("order")
+    found = None if message is None else unpack_note(message.data, "order").get("epoch")
+    return None if found is None else float(found)
+
+
+def _vector(x: State) -> np.ndarray:
+    return np.concatenate([np.asarray(leaf, dtype=float).ravel() for leaf in (x.p, x.R, x.v)])
+
+
+def _parts(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    x = x.astype(np.asarray(jnp.zeros(0)).dtype)
+    return x[:3], x[3:12].reshape(3, 3), x[12:]

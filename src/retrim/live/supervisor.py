@@ -1,0 +1,219 @@
+"""Starts the processes of a live flight, arms it when all are ready, brings back those that die, and ends it."""
+
+import contextlib
+import os
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from subprocess import Popen, TimeoutExpired
+from typing import Any
+
+import numpy as np
+
+from ..errors import MessageError, PlantError
+from ..onboard.control import ControlPlan
+from ..onboard.guard import Limits
+from ..onboard.launch import launch
+from ..onboard.messages import COLUMNS, pack_note, unpack_note
+from ..onboard.pilot import ControllerSource
+from ..onboard.realtime import cores_of
+from ..onboard.recorder import RecorderPlan
+from ..onboard.watchdog import WatchdogPlan
+from ..transport.shared_memory import SharedMemoryBus
+from .learner_process import LearnerPlan
+from .plant_process import PlantPlan
+
+READY_S = 300.0  # [s], compiling included
+RESTARTED = ("residual", "policy", "watchdog", "recorder")
+PRIORITIES = {"control": 30, "watchdog": 40, "plant": 20}
+
+
+@dataclass(frozen=True)
+class LiveSpec:
+    """A live flight, before it has processes."""
+
+    controller: ControllerSource
+    layers: tuple[Any, ...]
+    """Layers of learning: ``residual``, ``policy``, or none."""
+    start: Path
+    """File with what was learnt before the flight."""
+    reference: str | None
+    scenario: Any
+    vehicle: Any
+    """Vehicle of training, by name or specification."""
+    x0: np.ndarray
+    home: np.ndarray
+    limits: Limits
+    low: np.ndarray
+    high: np.ndarray
+    dt: float
+    delay_ticks: int
+    window: int
+    seed: int
+    folder: Path
+    """Where the log goes, and what the processes write to their standard outputs."""
+    floor: float = 0.1
+    """Height at which the vehicle has landed [m]."""
+
+
+@dataclass
+class Status:
+    """A flight as the supervisor sees it."""
+
+    t: float
+    """Time since take-off [s]."""
+    control: dict[str, Any]
+    world: dict[str, Any]
+    alive: dict[str, bool]
+    restarts: dict[str, int]
+    ended: str | None
+    """Why the flight is over; None while it is not."""
+
+
+@dataclass
+class Supervisor:
+    """The processes of one flight. Leaving it as a context ends them all."""
+
+    spec: LiveSpec
+    processes: dict[str, "Popen[bytes]"] = field(default_factory=dict)
+    restarts: dict[str, int] = field(default_factory=dict)
+    refused: dict[str, list[str]] = field(default_factory=dict)
+    """What the operating system refused to which process."""
+    epoch: float | None = None
+    _landing: float | None = None
+
+    def __enter__(self) -> "Supervisor":
+        """Make the bus."""
+        half = {
+            name: sum(a.nbytes for a in arrays.values()) for name, arrays in self.spec.controller.parameters.items()
+        }
+        rows = 8 * len(COLUMNS) * self.spec.window + 10_000
+        roles = ("control", "plant", "watchdog", "recorder", "residual", "policy")
+        learnt = self.spec.start.stat().st_size + 200_000
+        self.bus = SharedMemoryBus.create(
+            {"sample": 4096, "setpoint": 4096, "fallback": 4096, "order": 4096, "ended": 4096, "world": 4096}
+            | {"status": 65536, "flight": rows}
+            | {f"ready.{role}": 8192 for role in roles}
+            | {f"parameters.{name}": size + 100_000 for name, size in half.items()}
+            | {"update.residual": learnt, "update.policy": learnt}
+        )
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """End what still runs, and take the bus away."""
+        for process in self.processes.values():
+            if process.poll() is None:
+                process.terminate()
+        for process in self.processes.values():
+            with contextlib.suppress(TimeoutExpired):
+                process.wait(2.0)
+            if process.poll() is None:
+                process.kill()
+                process.wait()
+        self.bus.remove()
+
+    def warm_up(self) -> Iterator[tuple[str, float]]:
+        """Start the processes; yield what is waited for and since when [s], until all are ready.
+
+        Raises:
+            PlantError: A process ended, or was not ready in time; the message has the last line of what it said.
+        """
+        began = time.monotonic()
+        for role in ("control", "plant", *self.spec.layers):
+            self._start(role)
+        self._start("watchdog")
+        self._start("recorder")
+        while waiting := [role for role in self.processes if self.bus.latest(f"ready.{role}") is None]:
+            for role in waiting:
+                if self.processes[role].poll() is not None:
+                    raise PlantError(f"the {role} process ended before take-off: {self._last_words(role)}")
+            if time.monotonic() - began > READY_S:
+                raise PlantError(f"not ready after {READY_S:g} s: {', '.join(waiting)}; nothing has flown")
+            yield ", ".join(waiting), time.monotonic() - began
+            time.sleep(0.1)
+        for role in ("control", "plant", "watchdog"):
+            message = self.bus.latest(f"ready.{role}")
+            assert message is not None
+            self.refused[role] = unpack_note(message.data, "ready").get("refused", [])
+
+    def take_off(self) -> None:
+        """Give the order; the first tick is half a second away, the same for all."""
+        self.epoch = time.monotonic() + 0.5
+        self.bus.publish("order", pack_note("order", epoch=self.epoch))
+
+    def land(self) -> None:
+        """Give the order to land, once."""
+        if self._landing is None:
+            self._landing = time.monotonic()
+            self.bus.publish("order", pack_note("order", epoch=self.epoch, order="land"))
+
+    def watch(self) -> Status:
+        """Bring back processes that have died and may; return how the flight stands."""
+        assert self.epoch is not None
+        ended = self._note("ended").get("reason")
+        for role, process in self.processes.items():
+            if role in RESTARTED and process.poll() is not None and ended is None and not self._over(role):
+                self.restarts[role] = self.restarts.get(role, 0) + 1
+                self._start(role)
+        if ended is None and self.processes["plant"].poll() is not None:
+            ended = f"the plant process is gone: {self._last_words('plant')}"
+        alive = {role: process.poll() is None for role, process in self.processes.items()}
+        control, world = self._note("status"), self._note("world")
+        return Status(time.monotonic() - self.epoch, control, world, alive, dict(self.restarts), ended)
+
+    def finish(self, patience: float = 3.0) -> None:
+        """Wait until the log is written."""
+        until = time.monotonic() + patience
+        while self.processes["recorder"].poll() is None and time.monotonic() < until:
+            if self.processes["control"].poll() is None and self.processes["plant"].poll() is not None:
+                self.processes["control"].terminate()  # there is nothing left to fly
+            time.sleep(0.02)
+
+    def _over(self, role: str) -> bool:
+        """Whether a process ended because the flight did."""
+        return role in ("watchdog", "recorder") and (
+            self._note("status").get("mode") == "landed" or self.processes["control"].poll() is not None
+        )
+
+    def _start(self, role: str) -> None:
+        main, plan = self._plan(role)
+        self.processes[role] = launch(main, plan, self.spec.folder / f"{role}.log")
+
+    def _plan(self, role: str) -> tuple[str, Any]:
+        s, bus, parent = self.spec, self.bus.folder, os.getpid()
+        fly, learn = frozenset(cores_of("fly")), frozenset(cores_of("learn"))
+        if role == "control":
+            return "retrim.onboard.control:fly", ControlPlan(
+                bus, s.controller, s.limits, s.low, s.high, s.dt, s.delay_ticks, s.window, s.floor, fly,
+                PRIORITIES[role], parent,
+            )  # fmt: skip
+        if role == "watchdog":
+            return "retrim.onboard.watchdog:watch", WatchdogPlan(
+                bus, s.low, s.high, s.dt, s.home, s.limits.state_age, s.floor, fly, PRIORITIES[role],
+                self.processes["control"].pid, parent,
+            )  # fmt: skip
+        if role == "recorder":
+            plan = RecorderPlan(bus, s.folder / "flight.csv", self.processes["control"].pid)
+            return "retrim.onboard.recorder:record", plan
+        if role == "plant":
+            return "retrim.live.plant_process:simulate", PlantPlan(
+                bus, s.scenario, s.vehicle, s.x0, s.dt, s.seed, fly, PRIORITIES[role], parent
+            )
+        return "retrim.live.learner_process:learn", LearnerPlan(
+            bus, role, s.start, s.reference, s.seed, s.controller.base, learn, parent  # type: ignore[arg-type]
+        )  # fmt: skip
+
+    def _note(self, topic: str) -> dict[str, Any]:
+        message = self.bus.latest(topic)
+        try:
+            return {} if message is None else unpack_note(message.data, topic)
+        except MessageError:
+            return {}
+
+    def _last_words(self, role: str) -> str:
+        try:
+            lines = (self.spec.folder / f"{role}.log").read_text(errors="replace").strip().splitlines()
+        except OSError:
+            return "it left no word"
+        return lines[-1] if lines else "without a word"

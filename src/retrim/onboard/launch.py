@@ -1,0 +1,48 @@
+"""Processes of a live flight: started with a plan, deaf to Ctrl-C, which is the supervisor's to answer."""
+
+import importlib
+import os
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+
+def launch(main: str, plan: Any, complaints: Path) -> "subprocess.Popen[bytes]":
+    """Start a process of this machine.
+
+    Args:
+        main: ``module:function`` that takes the plan.
+        plan: What it is started with; it travels from this process to its own child and to nobody else.
+        complaints: File for what it writes to its standard outputs.
+
+    Returns:
+        The process.
+    """
+    # One thread: the arrays are small, and a pool of threads is late.
+    quiet = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+    with complaints.open("ab") as file:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "retrim.onboard.launch", main],
+            stdin=subprocess.PIPE,
+            stdout=file,
+            stderr=file,
+            start_new_session=True,
+            env=os.environ | quiet | {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p)},
+        )
+    assert process.stdin is not None
+    with process.stdin as pipe:
+        pickle.dump(plan, pipe)
+    return process
+
+
+def main() -> None:
+    """Read the plan and run."""
+    module, _, name = sys.argv[1].partition(":")
+    function = getattr(importlib.import_module(module), name)
+    function(pickle.load(sys.stdin.buffer))  # the parent wrote it
+
+
+if __name__ == "__main__":
+    main()

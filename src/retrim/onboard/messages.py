@@ -1,0 +1,188 @@
+"""What the processes of a live flight tell each other: frozen values that turn into bytes and back."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+
+from ..errors import MessageError
+from ..transport.message import describe, pack_arrays, unpack_arrays
+
+STATE = 15  # p, R by rows, v
+
+
+class Shaped(Protocol):
+    """What a parameter must look like."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+
+
+@dataclass(frozen=True)
+class Sample:
+    """What the plant measured at the end of a tick."""
+
+    tick: int
+    """Ticks since the start of the flight."""
+    t: float
+    """Time by the plant's clock [s]."""
+    sent: float
+    """When it was sent, by the monotonic clock of the machine [s]."""
+    age: float
+    """Time since the state was valid [s]."""
+    state: np.ndarray
+    """p [m], R by rows, v [m/s], world."""
+    truth: np.ndarray
+    """The same, true where the plant knows it; for scores, never for pilots."""
+    accepted: np.ndarray
+    """Command [c, omega] that acted for the tick that has ended, as the plant accepted it."""
+
+    def pack(self) -> bytes:
+        """Return the bytes; the inverse of :meth:`unpack`."""
+        row = np.concatenate([[self.tick, self.t, self.sent, self.age], self.state, self.truth, self.accepted])
+        return pack_arrays({"row": row}, kind="sample", about={})
+
+    @classmethod
+    def unpack(cls, data: bytes) -> "Sample":
+        """Read a sample.
+
+        Raises:
+            MessageError: The bytes are not one, or a number is not finite.
+        """
+        row = unpack_arrays(data, {"row": np.empty(8 + 2 * STATE)}, kind="sample", source="sample")["row"]
+        state, truth, accepted = np.split(row[4:], [STATE, 2 * STATE])
+        return cls(int(row[0]), float(row[1]), float(row[2]), float(row[3]), state, truth, accepted)
+
+
+@dataclass(frozen=True)
+class Setpoint:
+    """A command on its way to the plant."""
+
+    tick: int
+    """Sample that it answers."""
+    sent: float
+    """Monotonic clock [s]."""
+    u: np.ndarray
+    """c [m/s^2], omega [rad/s]."""
+    landed: bool = False
+    """The vehicle has landed, or fallen: the plant shall stop."""
+
+    def pack(self) -> bytes:
+        """Return the bytes; the inverse of :meth:`unpack`."""
+        row = np.concatenate([[self.tick, self.sent, self.landed], self.u])
+        return pack_arrays({"row": row}, kind="setpoint", about={})
+
+    @classmethod
+    def unpack(cls, data: bytes) -> "Setpoint":
+        """Read a command.
+
+        Raises:
+            MessageError: The bytes are not one, or a number is not finite.
+        """
+        row = unpack_arrays(data, {"row": np.empty(7)}, kind="setpoint", source="setpoint")["row"]
+        return cls(int(row[0]), float(row[1]), row[3:], bool(row[2]))
+
+
+COLUMNS = (
+    *("tick", "t", "age"),
+    *(f"x{i}" for i in range(STATE)),
+    *(f"true{i}" for i in range(STATE)),
+    *("c", "omega0", "omega1", "omega2"),
+    *("lateness", "duration", "mode"),
+)
+MEASURED, TRUE, COMMAND = slice(3, 3 + STATE), slice(3 + STATE, 3 + 2 * STATE), slice(-7, -3)
+
+
+@dataclass(frozen=True)
+class FlightRows:
+    """The last ticks of a flight, oldest first; each has the command that followed its measurement."""
+
+    rows: np.ndarray
+    """One row per tick, columns as in ``COLUMNS``."""
+
+    def pack(self) -> bytes:
+        """Return the bytes; the inverse of :meth:`unpack`."""
+        return pack_arrays({"rows": self.rows}, kind="flight", about={"ticks": str(len(self.rows))})
+
+    @classmethod
+    def unpack(cls, data: bytes) -> "FlightRows":
+        """Read rows.
+
+        Raises:
+            MessageError: The bytes are none.
+        """
+        ticks = describe(data, kind="flight", source="flight").get("ticks", "")
+        if not ticks.isdecimal() or int(ticks) > 10_000:
+            raise MessageError(f"flight: {ticks!r} ticks")
+        expected = {"rows": np.empty((int(ticks), len(COLUMNS)))}
+        return cls(unpack_arrays(data, expected, kind="flight", source="flight")["rows"])
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """New parameters of one half of a controller: ``policy`` or ``residual``."""
+
+    half: str
+    version: int
+    """It rises; what is not newer is stale."""
+    base: str
+    """Hash of what the receiver was started with: parameters for another controller are foreign."""
+    computed_from: float
+    """Flight time of the newest measurement that they were learnt from [s]."""
+    arrays: Mapping[str, Any] = field(repr=False)
+
+    def pack(self) -> bytes:
+        """Return the bytes; the inverse of :meth:`unpack`."""
+        about = {"version": str(self.version), "base": self.base, "computed_from": repr(self.computed_from)}
+        return pack_arrays(self.arrays, kind=f"parameters of {self.half}", about=about)
+
+    @classmethod
+    def unpack(cls, data: bytes, expected: Mapping[str, Shaped], *, half: str, base: str, after: int) -> "Parameters":
+        """Read parameters.
+
+        Args:
+            data: Bytes of a message.
+            expected: Shape and type of each array.
+            half: Which half they should be for.
+            base: Hash that they should name.
+            after: Version that is flown now.
+
+        Raises:
+            MessageError: They are truncated, damaged, foreign, stale or not finite.
+        """
+        kind = f"parameters of {half}"
+        header = describe(data, kind=kind, source=half)
+        if header.get("base") != base:
+            raise MessageError(f"{half}: parameters for another controller, {header.get('base', 'unnamed')!r}")
+        version, computed = header.get("version", ""), header.get("computed_from", "")
+        try:
+            number, learnt = int(version), float(computed)
+        except ValueError as error:
+            raise MessageError(f"{half}: version {version!r}, computed from {computed!r}") from error
+        if number <= after or not np.isfinite(learnt):
+            raise MessageError(f"{half}: version {number} is stale, {after} is flown")
+        return cls(half, number, base, learnt, unpack_arrays(data, expected, kind=kind, source=half))
+
+
+def pack_note(kind: str, **fields: Any) -> bytes:
+    """Return the bytes of a small message of plain values: an order, a report; the inverse of :func:`unpack_note`."""
+    return pack_arrays({}, kind=kind, about={"fields": json.dumps(fields)})
+
+
+def unpack_note(data: bytes, kind: str) -> dict[str, Any]:
+    """Read a small message.
+
+    Raises:
+        MessageError: It is none, or of another kind.
+    """
+    header = describe(data, kind=kind, source=kind)
+    unpack_arrays(data, {}, kind=kind, source=kind)
+    try:
+        fields = json.loads(header["fields"])
+    except (KeyError, ValueError, RecursionError) as error:
+        raise MessageError(f"{kind}: no fields ({error})") from error
+    if not isinstance(fields, dict):
+        raise MessageError(f"{kind}: no fields")
+    return fields

@@ -1,0 +1,137 @@
+"""The pilot of the process that flies: a controller as NumPy programs, whose parameters are swapped in flight."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from .messages import STATE, Parameters
+from .program import Arrays, NumpyProgram, ProgramSource
+
+BLEND = 5  # ticks over which a jump of the command at a swap dies away
+
+
+@dataclass(frozen=True)
+class ControllerSource:
+    """A controller, and what its parameters look like. All of it was made before take-off."""
+
+    init: ProgramSource
+    """(parameters, state) -> memory"""
+    decide: ProgramSource
+    """(parameters, [memory, time, age, state]) -> command, memory"""
+    accepted: ProgramSource
+    """(parameters, [memory, command]) -> memory, after the plant took another command than was issued"""
+    target: ProgramSource
+    """((), time) -> where the vehicle should be"""
+    predicted: ProgramSource
+    """(parameters, [state, command]) -> acceleration by the corrected model"""
+    parameters: Mapping[str, Mapping[str, Any]]
+    """Parameters at the start, by half (``policy``, ``residual``) and name, in the order of the programs."""
+    base: str
+    """Hash of the programs and of the shapes of their parameters."""
+    dtype: np.dtype[Any]
+    """Of the numbers that it computes with."""
+
+
+class LivePilot:
+    """Flies one controller, tick by tick."""
+
+    def __init__(self, source: ControllerSource) -> None:
+        self._source = source
+        self._init, self._decide = NumpyProgram(source.init), NumpyProgram(source.decide)
+        self._accepted, self._target = NumpyProgram(source.accepted), NumpyProgram(source.target)
+        self._predicted = NumpyProgram(source.predicted)
+        self._where = self._target.prepare(())
+        self._parameters = {half: list(arrays.values()) for half, arrays in source.parameters.items()}
+        self.versions = dict.fromkeys(source.parameters, 0)
+        self._before: tuple[str, int, Arrays] | None = None
+        self._memory: Arrays = []
+        self._prepared = self._prepare()
+        self._old = self._prepared[1]
+        self._jump, self._left, self._swapped = np.zeros(4), 0, False
+
+    def reset(self, x: np.ndarray) -> None:
+        """Start a flight in the state ``x`` (p, R by rows, v)."""
+        self._memory = self._init.step(self._prepared[0], self._state(x))
+        self._left, self._swapped = 0, False
+
+    def target(self, t: float) -> np.ndarray:
+        """Return where the vehicle should be at time ``t`` of the flight [s], world [m]."""
+        return np.asarray(self._target.step(self._where, [self._scalar(t)])[0], dtype=float)
+
+    def act(self, t: float, age: float, x: np.ndarray) -> np.ndarray:
+        """Return the command [c, omega] for a new measurement.
+
+        Args:
+            t: Time since the start of the flight [s].
+            age: How old the measurement is [s].
+            x: p, R by rows, v.
+        """
+        inputs = [self._scalar(t), self._scalar(age), *self._state(x)]
+        decide, memory = self._prepared[1], self._memory
+        c, omega, *self._memory = self._decide.step(decide, [*memory, *inputs])
+        u = np.concatenate([[c], omega]).astype(float)
+        if self._swapped:
+            before, rates, *_ = self._decide.step(self._old, [*memory, *inputs])
+            self._jump, self._left, self._swapped = np.concatenate([[before], rates]).astype(float) - u, BLEND, False
+        if self._left:
+            u = u + self._jump * self._left / BLEND
+            self._left -= 1
+            self.accepted(u)
+        return u
+
+    def accepted(self, u: np.ndarray) -> None:
+        """Correct the memory: the plant took ``u`` instead of the command that was issued last."""
+        command = [self._scalar(u[0]), u[1:].astype(self._source.dtype)]
+        self._memory = self._accepted.step(self._prepared[2], [*self._memory, *command])
+
+    def predicted(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """Return the acceleration that the corrected model predicts, world [m/s^2]."""
+        command = [self._scalar(u[0]), u[1:].astype(self._source.dtype)]
+        return np.asarray(self._predicted.step(self._prepared[3], [*self._state(x), *command])[0], dtype=float)
+
+    def swap(self, parameters: Parameters) -> None:
+        """Fly with new parameters from the next tick on; the command goes over to theirs within a few ticks."""
+        half = parameters.half
+        self._before = half, self.versions[half], self._parameters[half]
+        self._parameters[half] = list(parameters.arrays.values())
+        self.versions[half] = parameters.version
+        self._change()
+
+    def expected(self, half: str) -> Mapping[str, Any]:
+        """Return what parameters of a half look like."""
+        return self._source.parameters[half]
+
+    def back(self, half: str) -> int | None:
+        """Fly with the parameters of before the last swap of ``half`` again.
+
+        Returns:
+            The version that is given up, or None if there is none to go back to.
+        """
+        if self._before is None or self._before[0] != half:
+            return None
+        given_up = self.versions[half]
+        _, _, self._parameters[half] = self._before
+        self._before = None
+        self._change()
+        return given_up
+
+    def _change(self) -> None:
+        if not self._swapped:
+            self._old = self._prepared[1]
+        self._prepared, self._swapped = self._prepare(), True
+
+    def _prepare(self) -> tuple[Arrays, ...]:
+        programs = (self._init, self._decide, self._accepted, self._predicted)
+        return tuple(program.prepare(self._flat()) for program in programs)
+
+    def _flat(self) -> Arrays:
+        return [leaf[()] for half in self._parameters.values() for leaf in half]
+
+    def _scalar(self, value: float) -> Any:
+        return self._source.dtype.type(value)
+
+    def _state(self, x: np.ndarray) -> Arrays:
+        x = x.astype(self._source.dtype)
+        return [x[:3], x[3:12].reshape(3, 3), x[12:STATE]]

@@ -1,0 +1,102 @@
+"""The process that writes the flight down as it goes. What it has written is readable whatever happens to it."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import MessageError
+from ..transport.bus import Bus
+from ..transport.shared_memory import SharedMemoryBus
+from .messages import COLUMNS, FlightRows, pack_note, unpack_note
+from .realtime import Lifeline
+
+EVERY = 0.1  # [s]
+
+
+@dataclass(frozen=True)
+class RecorderPlan:
+    """Everything that the process is started with."""
+
+    folder: Path
+    """Of the bus."""
+    path: Path
+    """Of the log, a CSV file with a line per tick."""
+    control: int
+    """The process that flies; the log ends with the flight."""
+
+
+class Recorder:
+    """Appends the ticks that are new. A gap is filled from the last seconds of flight, which every report holds."""
+
+    def __init__(self, path: Path, bus: Bus) -> None:
+        self._path, self._bus, self._version = path, bus, 0
+        self.failed: str | None = None
+        self._last = -1
+        try:
+            self._last = _mended(path)
+        except OSError as error:
+            self.failed = str(error)
+
+    def step(self) -> int:
+        """Write what is new; return how many ticks that were. A full disk ends the log and not the flight."""
+        message = self._bus.latest("flight", self._version)
+        if message is None or self.failed:
+            return 0
+        self._version = message.version
+        try:
+            rows = FlightRows.unpack(message.data).rows
+        except MessageError:
+            return 0
+        new = rows[rows[:, 0] > self._last]
+        try:
+            with self._path.open("a") as file:
+                file.write("".join(",".join(f"{value:.9g}" for value in row) + "\n" for row in new))
+        except OSError as error:
+            self.failed = str(error)
+            self._bus.publish("ready.recorder", pack_note("ready", failed=self.failed))
+            return 0
+        if len(new):
+            self._last = int(new[-1, 0])
+        return len(new)
+
+
+def read_log(path: Path) -> np.ndarray:
+    """Return the ticks of a log, in the columns of :data:`retrim.onboard.messages.COLUMNS`; a torn last line is left.
+
+    Raises:
+        OSError: There is no such file.
+    """
+    lines = path.read_text().splitlines(keepends=True)[1:]
+    whole = [line.split(",") for line in lines if line.endswith("\n") and line.count(",") == len(COLUMNS) - 1]
+    return np.array(whole, dtype=float).reshape(-1, len(COLUMNS))
+
+
+def _mended(path: Path) -> int:
+    """Write the header, or take away a torn last line; return the last tick that is written."""
+    if not path.exists() or path.stat().st_size == 0:
+        path.write_text(",".join(COLUMNS) + "\n")
+        return -1
+    with path.open("r+b") as file:
+        data = file.read()
+        file.truncate(data.rfind(b"\n") + 1)
+    rows = read_log(path)
+    return int(rows[-1, 0]) if len(rows) else -1
+
+
+def record(plan: RecorderPlan) -> None:
+    """Write until the flight is over: the main function of the process."""
+    bus = SharedMemoryBus(plan.folder)
+    recorder, control = Recorder(plan.path, bus), Lifeline(plan.control)
+    bus.publish("ready.recorder", pack_note("ready", failed=recorder.failed))
+    while not (control.gone(EVERY) or _landed(bus)):
+        recorder.step()
+    recorder.step()
+
+
+def _landed(bus: Bus) -> bool:
+    message = bus.latest("status")
+    try:
+        return message is not None and unpack_note(message.data, "status").get("mode") == "landed"
+    except MessageError:
+        return False

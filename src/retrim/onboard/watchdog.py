@@ -1,0 +1,106 @@
+"""The process that goes on commanding when the one that flies has died or hangs: nothing but the fallback."""
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import MessageError
+from ..transport.bus import Bus
+from ..transport.shared_memory import SharedMemoryBus
+from .guard import Fallback, GeometricHover, Mode
+from .messages import Sample, Setpoint, pack_note
+from .realtime import Lifeline, be_punctual
+
+PATIENCE = 1.6  # ticks without a command
+CHECK_EVERY = 0.004  # [s]
+
+
+@dataclass(frozen=True)
+class WatchdogPlan:
+    """Everything that the process is started with."""
+
+    folder: Path
+    low: np.ndarray
+    high: np.ndarray
+    dt: float
+    home: np.ndarray
+    """Where to hold, world [m]."""
+    state_age: float
+    floor: float
+    cores: frozenset[int]
+    priority: int
+    control: int
+    """The process that is watched."""
+    parent: int
+    """Without it the watchdog ends once the flight has."""
+
+
+class Watchdog:
+    """Decides, tick by tick, whether to command, and what."""
+
+    def __init__(self, plan: WatchdogPlan, bus: Bus) -> None:
+        self.plan, self.bus = plan, bus
+        self._fallback = Fallback(GeometricHover(plan.low, plan.high, plan.dt), plan.floor)
+        self.heard: float | None = None
+        self.done = False
+        self._version = 0
+        self._sample: Sample | None = None
+        self._seen = 0
+        self._next = 0.0
+
+    def check(self, now: float, gone: bool) -> Setpoint | None:
+        """Return the command that was published, if one was due.
+
+        Args:
+            now: Monotonic clock [s].
+            gone: The process that flies has ended.
+        """
+        if (message := self.bus.latest("setpoint", self._version)) is not None:
+            self._version, self.heard = message.version, now
+            self.done = self.done or _landed(message.data)
+        self._look()
+        silent = self.heard is not None and (gone or now - self.heard > PATIENCE * self.plan.dt)
+        if not silent or self.done or self._sample is None or now < self._next:
+            return None
+        self._next = now + self.plan.dt - CHECK_EVERY
+        fresh = self._sample.age + now - self._sample.sent <= self.plan.state_age
+        u, mode = self._fallback.step(self._sample.state, fresh, self.plan.home, land=False)
+        self.done = mode == Mode.LANDED
+        setpoint = Setpoint(self._sample.tick, now, u, self.done)
+        self.bus.publish("fallback", setpoint.pack())
+        return setpoint
+
+    def _look(self) -> None:
+        if (message := self.bus.latest("sample", self._seen)) is not None:
+            self._seen = message.version
+            try:
+                sample = Sample.unpack(message.data)
+            except MessageError:
+                return
+            if self._sample is not None and sample.tick == self._sample.tick + 1:
+                self._fallback.hover.feel(self._sample.state, sample.state, sample.accepted)
+            self._sample = sample
+
+
+def _landed(data: bytes) -> bool:
+    try:
+        return Setpoint.unpack(data).landed
+    except MessageError:
+        return False
+
+
+def watch(plan: WatchdogPlan) -> None:
+    """Watch until the flight is over: the main function of the process."""
+    refused = be_punctual(plan.priority, set(plan.cores))
+    bus = SharedMemoryBus(plan.folder)
+    watchdog, control, parent = Watchdog(plan, bus), Lifeline(plan.control), Lifeline(plan.parent)
+    bus.publish("ready.watchdog", pack_note("ready", refused=refused))
+    while not watchdog.done:
+        gone = control.gone(CHECK_EVERY)
+        if gone:
+            time.sleep(CHECK_EVERY)
+            if watchdog.heard is None and parent.gone():
+                return
+        watchdog.check(time.monotonic(), gone)
