@@ -14,6 +14,7 @@ from ..config.scenario import Scenario
 from ..config.setup import Setup
 from ..errors import ConfigError
 from ..experiments.figures import picture
+from ..experiments.interrupts import interrupts_only_set
 from ..experiments.limits import check_seeds
 from ..experiments.run import INTERRUPTED, Run
 from ..experiments.tables.document import TableSection
@@ -107,7 +108,8 @@ def live(
         for old in (*run.folder.glob("*.log"), run.folder / "flight.csv"):
             old.unlink(missing_ok=True)
         request = LiveRequest(setup, weights, scenario, method, seconds or LONGEST, seed, fence, run.folder, state)
-        return _fly(request, run)
+        with interrupts_only_set(run.stop):  # a Ctrl-C lands the vehicle; whoever is in the air is not dropped
+            return _fly(request, run)
 
     return ordered
 
@@ -129,7 +131,7 @@ def _fly(request: LiveRequest, run: Run) -> int:
         status = _watched(supervisor, request, run, events)
         supervisor.finish()
     console.print(f"flight over: {status.ended}", markup=False, soft_wrap=True)
-    flight, rows = flight_of(request, events.all)
+    flight, rows = flight_of(request, events.all, status)
     found = results(request, flight, rows, status)
     run.write_results(
         found, seeds=[request.seed], preset=request.setup.preset.name, seconds=float(flight.log.t[-1]),
@@ -149,7 +151,7 @@ def _watched(supervisor: Supervisor, request: LiveRequest, run: Run, events: Liv
     with Live(console=console, refresh_per_second=5, auto_refresh=False) as screen:
         while True:
             status = supervisor.watch()
-            new = events.take(status.t, status.control, status.restarts)
+            new = events.take(status)
             if status.ended is not None or time.monotonic() > landed_by:
                 return status
             if (run.interrupted or status.t >= request.seconds) and landed_by == float("inf"):

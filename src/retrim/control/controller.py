@@ -41,7 +41,7 @@ class AbstractController(eqx.Module, Generic[M]):
         del u
         return memory
 
-    def aged(self, age: float) -> "AbstractController[M]":
+    def aged(self, age: float | Float[Array, ""]) -> "AbstractController[M]":
         """Return the same controller for measurements ``age`` old [s]; by default they are taken as they are."""
         del age
         return self

@@ -44,7 +44,7 @@ class GravityFrame(AbstractController[GravityFrameState]):
     rate_bias: Float[Array, "3"] = eqx.field(default_factory=lambda: jnp.zeros(3))
     """The vehicle turns so much faster than it is told [rad/s], so it is told less."""
 
-    def aged(self, age: float) -> "GravityFrame":
+    def aged(self, age: float | Float[Array, ""]) -> "GravityFrame":
         """Return the same for measurements that are ``age`` old [s]."""
         return dataclasses.replace(self, age=jnp.array(age))
 

@@ -1,8 +1,7 @@
 """What happens in a live flight, as events: each once, from reports that repeat themselves."""
 
-from typing import Any
-
 from ..runtime.events import Event
+from .supervisor import Status
 
 
 class LiveEvents:
@@ -12,18 +11,17 @@ class LiveEvents:
         self.all: list[Event] = []
         self._seen: dict[str, int] = {}
         self._mode = "policy"
+        self._watchdog = False
         self._restarts: dict[str, int] = {}
         self._rolled_back, self._refused = 0, dict[str, int]()
 
-    def take(self, t: float, control: dict[str, Any], restarts: dict[str, int]) -> list[Event]:
-        """Return what is new.
-
-        Args:
-            t: Time of the flight [s].
-            control: Report of the process that flies.
-            restarts: How often each process was started again.
-        """
-        new = []
+    def take(self, status: Status) -> list[Event]:
+        """Return what is new."""
+        t, control, restarts = status.t, status.control, status.restarts
+        new: list[Event] = []
+        if not (status.alive["control"] or self._watchdog or control.get("mode") == "landed"):
+            self._watchdog = True
+            new.append(Event(t, "guard", "watchdog: the control process is gone, the watchdog flies the fallback"))
         for at, half, version, age in control.get("swaps", []):
             if version > self._seen.get(half, 0):
                 self._seen[half] = version

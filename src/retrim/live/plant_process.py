@@ -12,7 +12,8 @@ import numpy as np
 from ..config.scenario import Scenario
 from ..errors import MessageError, PlantError
 from ..experiments.compile_cache import enable_compile_cache
-from ..onboard.messages import Sample, Setpoint, pack_note, unpack_note
+from ..onboard.messages import Sample, Setpoint, pack_note
+from ..onboard.orders import wait_for_take_off
 from ..onboard.realtime import Lifeline, be_punctual, sleep_until
 from ..physics.state import Command, State
 from ..plants.plant import Measurement
@@ -55,9 +56,9 @@ def simulate(plan: PlantPlan) -> None:
             measurement = plant.reset(x0)
             refused = be_punctual(plan.priority, set(plan.cores))
             bus.publish("ready.plant", pack_note("ready", refused=refused))
-            while (epoch := _epoch(bus)) is None:
-                if parent.gone(0.01):
-                    return
+            epoch = wait_for_take_off(bus, parent)
+            if epoch is None:
+                return
             reason = _flown(plan, plant, bus, measurement, epoch)
     except PlantError as error:
         reason = f"plant lost: {error}"
@@ -111,12 +112,6 @@ def _answer(bus: Bus, tick: int, until: float) -> Setpoint | None:
         if time.monotonic() >= until:
             return None
         time.sleep(3e-4)
-
-
-def _epoch(bus: Bus) -> float | None:
-    message = bus.latest("order")
-    found = None if message is None else unpack_note(message.data, "order").get("epoch")
-    return None if found is None else float(found)
 
 
 def _vector(x: State) -> np.ndarray:

@@ -22,8 +22,13 @@ from .supervisor import Status
 HOVER = np.array([9.81, 0.0, 0.0, 0.0])
 
 
-def flight_of(request: LiveRequest, events: Sequence[Event]) -> tuple[Flight, np.ndarray]:
+def flight_of(request: LiveRequest, events: Sequence[Event], status: Status) -> tuple[Flight, np.ndarray]:
     """Return the flight that a log holds, up to its landing, and the rows of the log.
+
+    Args:
+        request: What was flown.
+        events: What happened.
+        status: The last one.
 
     Raises:
         PlantError: The log holds no flight.
@@ -31,6 +36,8 @@ def flight_of(request: LiveRequest, events: Sequence[Event]) -> tuple[Flight, np
     rows = read_log(request.folder / "flight.csv")
     dt = request.setup.preset.dt
     shown = rows[rows[:, 1] < request.seconds - 0.5 * dt]
+    if status.control.get("reason") == "landing":  # as ordered: what follows is not the policy's
+        shown = shown[np.cumsum(shown[:, -1] != Mode.POLICY) == 0]
     if len(shown) < 2:
         raise PlantError(f"{request.folder / 'flight.csv'} holds {len(shown)} ticks: there was no flight")
     u = np.concatenate([HOVER[None], shown[:-1, COMMAND]])

@@ -10,6 +10,7 @@ import numpy as np
 from jax import random
 
 from ..adapt.learner import LearnerState
+from ..adapt.updates import Layer
 from ..config.scenario import Scenario
 from ..config.setup import Setup
 from ..control.policy import Policy
@@ -19,9 +20,9 @@ from ..io.trained import save_learnt
 from ..onboard.guard import Limits
 from ..runtime.pilot import ControllerPilot
 from .controllers import adaptive_source, plain_source
-from .supervisor import LiveSpec
+from .spec import LiveSpec
 
-LAYERS = ("residual", "policy")
+LAYERS: tuple[Layer, ...] = ("residual", "policy")
 LEARNING = ("full", "lora")
 BELOW_GROUND = 0.3  # [m], by which a fence lies below z = 0: starts may lie there, and a transient dips
 

@@ -5,56 +5,25 @@ import os
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 from subprocess import Popen, TimeoutExpired
 from typing import Any
 
-import numpy as np
-
+from ..adapt.updates import Layer
 from ..errors import MessageError, PlantError
 from ..onboard.control import ControlPlan
-from ..onboard.guard import Limits
 from ..onboard.launch import launch
 from ..onboard.messages import COLUMNS, pack_note, unpack_note
-from ..onboard.pilot import ControllerSource
 from ..onboard.realtime import cores_of
 from ..onboard.recorder import RecorderPlan
 from ..onboard.watchdog import WatchdogPlan
 from ..transport.shared_memory import SharedMemoryBus
 from .learner_process import LearnerPlan
 from .plant_process import PlantPlan
+from .spec import LiveSpec
 
 READY_S = 300.0  # [s], compiling included
 RESTARTED = ("residual", "policy", "watchdog", "recorder")
 PRIORITIES = {"control": 30, "watchdog": 40, "plant": 20}
-
-
-@dataclass(frozen=True)
-class LiveSpec:
-    """A live flight, before it has processes."""
-
-    controller: ControllerSource
-    layers: tuple[Any, ...]
-    """Layers of learning: ``residual``, ``policy``, or none."""
-    start: Path
-    """File with what was learnt before the flight."""
-    reference: str | None
-    scenario: Any
-    vehicle: Any
-    """Vehicle of training, by name or specification."""
-    x0: np.ndarray
-    home: np.ndarray
-    limits: Limits
-    low: np.ndarray
-    high: np.ndarray
-    dt: float
-    delay_ticks: int
-    window: int
-    seed: int
-    folder: Path
-    """Where the log goes, and what the processes write to their standard outputs."""
-    floor: float = 0.1
-    """Height at which the vehicle has landed [m]."""
 
 
 @dataclass
@@ -177,32 +146,28 @@ class Supervisor:
         )
 
     def _start(self, role: str) -> None:
-        main, plan = self._plan(role)
-        self.processes[role] = launch(main, plan, self.spec.folder / f"{role}.log")
+        complaints = self.spec.folder / f"{role}.log"
+        self.processes[role] = launch(self.spec.mains[role], self._plan(role), complaints)
 
-    def _plan(self, role: str) -> tuple[str, Any]:
+    def _plan(self, role: str) -> Any:
         s, bus, parent = self.spec, self.bus.folder, os.getpid()
         fly, learn = frozenset(cores_of("fly")), frozenset(cores_of("learn"))
         if role == "control":
-            return "retrim.onboard.control:fly", ControlPlan(
+            return ControlPlan(
                 bus, s.controller, s.limits, s.low, s.high, s.dt, s.delay_ticks, s.window, s.floor, fly,
                 PRIORITIES[role], parent,
             )  # fmt: skip
+        if role == "plant":
+            return PlantPlan(bus, s.scenario, s.vehicle, s.x0, s.dt, s.seed, fly, PRIORITIES[role], parent)
         if role == "watchdog":
-            return "retrim.onboard.watchdog:watch", WatchdogPlan(
+            return WatchdogPlan(
                 bus, s.low, s.high, s.dt, s.home, s.limits.state_age, s.floor, fly, PRIORITIES[role],
                 self.processes["control"].pid, parent,
             )  # fmt: skip
         if role == "recorder":
-            plan = RecorderPlan(bus, s.folder / "flight.csv", self.processes["control"].pid)
-            return "retrim.onboard.recorder:record", plan
-        if role == "plant":
-            return "retrim.live.plant_process:simulate", PlantPlan(
-                bus, s.scenario, s.vehicle, s.x0, s.dt, s.seed, fly, PRIORITIES[role], parent
-            )
-        return "retrim.live.learner_process:learn", LearnerPlan(
-            bus, role, s.start, s.reference, s.seed, s.controller.base, learn, parent  # type: ignore[arg-type]
-        )  # fmt: skip
+            return RecorderPlan(bus, s.folder / "flight.csv", s.dt, self.processes["control"].pid, parent)
+        layer: Layer = "residual" if role == "residual" else "policy"
+        return LearnerPlan(bus, layer, s.start, s.reference, s.seed, s.controller.base, learn, parent)
 
     def _note(self, topic: str) -> dict[str, Any]:
         message = self.bus.latest(topic)

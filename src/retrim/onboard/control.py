@@ -1,4 +1,4 @@
-"""The process that flies: one step per tick of its own clock, and what is not urgent in the time that is left."""
+"""What the process that flies does each tick, and what is not urgent in the time that is left."""
 
 import time
 from collections import deque
@@ -10,15 +10,11 @@ import numpy as np
 
 from ..errors import MessageError
 from ..transport.bus import Bus
-from ..transport.shared_memory import SharedMemoryBus
 from .guard import Fallback, GeometricHover, Limits, Mode
 from .messages import COMMAND, FlightRows, Parameters, Sample, Setpoint, pack_note, unpack_note
 from .pilot import ControllerSource, LivePilot
-from .realtime import Lifeline, be_punctual, sleep_until
 from .rollback import FlownError
 
-PHASE = 0.002  # [s] after the plant's tick
-PATIENCE = 0.005  # [s] that a late sample is waited for
 REPORT_EVERY = 5  # ticks
 
 
@@ -66,6 +62,15 @@ class ControlLoop:
         self._commands: deque[np.ndarray] = deque(maxlen=plan.delay_ticks + 1)
         self._known = {"sample": 0, "order": 0} | {f"parameters.{half}": 0 for half in plan.controller.parameters}
         self._landing, self._learnt, self._ticks = False, 0.0, 0
+
+    @property
+    def sample(self) -> Sample | None:
+        """The newest measurement."""
+        return self._sample
+
+    def new_sample(self) -> bool:
+        """Return whether there is one that has not been answered."""
+        return self.bus.latest("sample", self._known["sample"]) is not None
 
     def warm_up(self) -> None:
         """Touch everything once, before it is urgent."""
@@ -221,44 +226,3 @@ class ControlLoop:
     def _note(self, sample: Sample, t: float, lateness: float, duration: float) -> None:
         head, tail = [sample.tick, t, sample.age], [lateness, duration, self.mode]
         self.rows.append(np.concatenate([head, sample.state, sample.truth, self._issued, tail]))
-
-
-def fly(plan: ControlPlan) -> None:
-    """Fly until the vehicle has landed: the main function of the process."""
-    refused = be_punctual(plan.priority, set(plan.cores))
-    bus = SharedMemoryBus(plan.folder)
-    loop = ControlLoop(plan, bus)
-    loop.warm_up()
-    bus.publish("ready.control", pack_note("ready", refused=refused))
-    parent = Lifeline(plan.parent)
-    while (epoch := _epoch(bus)) is None:
-        if parent.gone(0.01):
-            return
-    tick = 0
-    while loop.mode != Mode.LANDED:
-        scheduled = epoch + tick * plan.dt + PHASE
-        sleep_until(scheduled)
-        woke = time.monotonic()
-        known = loop._known["sample"]
-        while bus.latest("sample", known) is None and time.monotonic() < scheduled + PATIENCE:
-            time.sleep(2e-4)
-        waited = time.monotonic() - woke
-        loop.late_samples += waited > 2e-4
-        loop.tick(time.monotonic(), woke - scheduled)
-        if parent.gone():
-            loop.land("the supervisor is gone")
-        loop.idle()
-        # What should have begun by now, and has not, is missed.
-        due = int((time.monotonic() - epoch - PHASE) / plan.dt)
-        loop.missed += max(0, due - tick)
-        tick = max(due, tick) + 1
-    loop.report()
-    time.sleep(2 * plan.dt)  # the last command is taken
-
-
-def _epoch(bus: Bus) -> float | None:
-    message = bus.latest("order")
-    if message is None:
-        return None
-    found = unpack_note(message.data, "order").get("epoch")
-    return None if found is None else float(found)

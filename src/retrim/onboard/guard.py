@@ -22,6 +22,8 @@ class Mode(IntEnum):
     BLIND = 3
     """Nobody knows the state: level by what was known last, sinking."""
     LANDED = 4
+    WATCHDOG = 5
+    """The watchdog's fallback: the process that flew is dead."""
 
 
 @dataclass(frozen=True)
@@ -130,6 +132,11 @@ class Fallback:
     blind_s: float = 0.0
     place: np.ndarray | None = None
     """Where it holds, and from where it sinks."""
+
+    def rest(self) -> None:
+        """Take note that somebody else flies: the next step is the first one of a new sequence."""
+        self.since, self.blind_s, self.place = 0.0, 0.0, None
+        self.hover.integral[:] = 0.0
 
     def step(self, x: np.ndarray, fresh: bool, target: np.ndarray, *, land: bool) -> tuple[np.ndarray, Mode]:
         """Return the command of one more tick.

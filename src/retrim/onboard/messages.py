@@ -3,21 +3,14 @@
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from ..errors import MessageError
-from ..transport.message import describe, pack_arrays, unpack_arrays
+from ..transport.message import ArrayLike, describe, pack_arrays, unpack_arrays
 
 STATE = 15  # p, R by rows, v
-
-
-class Shaped(Protocol):
-    """What a parameter must look like."""
-
-    shape: tuple[int, ...]
-    dtype: np.dtype[Any]
 
 
 @dataclass(frozen=True)
@@ -139,7 +132,9 @@ class Parameters:
         return pack_arrays(self.arrays, kind=f"parameters of {self.half}", about=about)
 
     @classmethod
-    def unpack(cls, data: bytes, expected: Mapping[str, Shaped], *, half: str, base: str, after: int) -> "Parameters":
+    def unpack(
+        cls, data: bytes, expected: Mapping[str, ArrayLike], *, half: str, base: str, after: int
+    ) -> "Parameters":
         """Read parameters.
 
         Args:

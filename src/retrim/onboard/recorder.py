@@ -1,5 +1,6 @@
 """The process that writes the flight down as it goes. What it has written is readable whatever happens to it."""
 
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -8,10 +9,12 @@ import numpy as np
 from ..errors import MessageError
 from ..transport.bus import Bus
 from ..transport.shared_memory import SharedMemoryBus
-from .messages import COLUMNS, FlightRows, pack_note, unpack_note
+from .guard import Mode
+from .messages import COLUMNS, FlightRows, Sample, Setpoint, pack_note, unpack_note
 from .realtime import Lifeline
 
 EVERY = 0.1  # [s]
+SILENCE = 1.0  # [s] without a sample, after which a flight without its pilot is over
 
 
 @dataclass(frozen=True)
@@ -22,15 +25,19 @@ class RecorderPlan:
     """Of the bus."""
     path: Path
     """Of the log, a CSV file with a line per tick."""
+    dt: float
     control: int
     """The process that flies; the log ends with the flight."""
+    parent: int
+    """Who takes the bus away; if it is gone, the recorder does."""
 
 
 class Recorder:
     """Appends the ticks that are new. A gap is filled from the last seconds of flight, which every report holds."""
 
-    def __init__(self, path: Path, bus: Bus) -> None:
-        self._path, self._bus, self._version = path, bus, 0
+    def __init__(self, path: Path, bus: Bus, dt: float) -> None:
+        self._path, self._bus, self._version, self._dt = path, bus, 0, dt
+        self._start: float | None = None
         self.failed: str | None = None
         self._last = -1
         try:
@@ -48,7 +55,24 @@ class Recorder:
             rows = FlightRows.unpack(message.data).rows
         except MessageError:
             return 0
-        new = rows[rows[:, 0] > self._last]
+        return self._append(rows[rows[:, 0] > self._last])
+
+    def follow(self) -> int:
+        """Write what the plant says and the watchdog commands, where nobody reports any more; return how many ticks."""
+        sample, command = self._bus.latest("sample"), self._bus.latest("fallback")
+        if sample is None or self.failed:
+            return 0
+        try:
+            said = Sample.unpack(sample.data)
+            u = said.accepted if command is None else Setpoint.unpack(command.data).u
+        except MessageError:
+            return 0
+        self._start = said.t - said.tick * self._dt if self._start is None else self._start
+        head, tail = [said.tick, said.t - self._start, said.age], [0.0, 0.0, Mode.WATCHDOG]
+        row = np.concatenate([head, said.state, said.truth, u, tail])
+        return self._append(row[None]) if said.tick > self._last else 0
+
+    def _append(self, new: np.ndarray) -> int:
         try:
             with self._path.open("a") as file:
                 file.write("".join(",".join(f"{value:.9g}" for value in row) + "\n" for row in new))
@@ -87,11 +111,18 @@ def _mended(path: Path) -> int:
 def record(plan: RecorderPlan) -> None:
     """Write until the flight is over: the main function of the process."""
     bus = SharedMemoryBus(plan.folder)
-    recorder, control = Recorder(plan.path, bus), Lifeline(plan.control)
+    recorder, control = Recorder(plan.path, bus, plan.dt), Lifeline(plan.control)
     bus.publish("ready.recorder", pack_note("ready", failed=recorder.failed))
     while not (control.gone(EVERY) or _landed(bus)):
         recorder.step()
     recorder.step()
+    heard = time.monotonic()
+    while not _landed(bus) and bus.latest("ended") is None and time.monotonic() < heard + SILENCE:
+        if recorder.follow():
+            heard = time.monotonic()
+        time.sleep(plan.dt / 5)
+    if Lifeline(plan.parent).gone():
+        bus.remove()
 
 
 def _landed(bus: Bus) -> bool:

@@ -14,7 +14,7 @@ from .messages import Sample, Setpoint, pack_note
 from .realtime import Lifeline, be_punctual
 
 PATIENCE = 1.6  # ticks without a command
-CHECK_EVERY = 0.004  # [s]
+CHECK_EVERY = 0.002  # [s]
 
 
 @dataclass(frozen=True)
@@ -59,12 +59,13 @@ class Watchdog:
         """
         if (message := self.bus.latest("setpoint", self._version)) is not None:
             self._version, self.heard = message.version, now
+            self._fallback.rest()
             self.done = self.done or _landed(message.data)
-        self._look()
+        new = self._look()
         silent = self.heard is not None and (gone or now - self.heard > PATIENCE * self.plan.dt)
-        if not silent or self.done or self._sample is None or now < self._next:
+        if not silent or self.done or self._sample is None or not (new or now >= self._next):
             return None
-        self._next = now + self.plan.dt - CHECK_EVERY
+        self._next = now + 1.5 * self.plan.dt  # at the latest, should no sample come
         fresh = self._sample.age + now - self._sample.sent <= self.plan.state_age
         u, mode = self._fallback.step(self._sample.state, fresh, self.plan.home, land=False)
         self.done = mode == Mode.LANDED
@@ -72,16 +73,20 @@ class Watchdog:
         self.bus.publish("fallback", setpoint.pack())
         return setpoint
 
-    def _look(self) -> None:
-        if (message := self.bus.latest("sample", self._seen)) is not None:
-            self._seen = message.version
-            try:
-                sample = Sample.unpack(message.data)
-            except MessageError:
-                return
-            if self._sample is not None and sample.tick == self._sample.tick + 1:
-                self._fallback.hover.feel(self._sample.state, sample.state, sample.accepted)
-            self._sample = sample
+    def _look(self) -> bool:
+        """Take a new sample, if there is one."""
+        message = self.bus.latest("sample", self._seen)
+        if message is None:
+            return False
+        self._seen = message.version
+        try:
+            sample = Sample.unpack(message.data)
+        except MessageError:
+            return False
+        if self._sample is not None and sample.tick == self._sample.tick + 1:
+            self._fallback.hover.feel(self._sample.state, sample.state, sample.accepted)
+        self._sample = sample
+        return True
 
 
 def _landed(data: bytes) -> bool:

@@ -1,0 +1,53 @@
+"""A live flight, before it has processes."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..adapt.updates import Layer
+from ..config.scenario import Scenario
+from ..onboard.guard import Limits
+from ..onboard.pilot import ControllerSource
+
+MAINS = {
+    "control": "retrim.onboard.control_process:fly",
+    "watchdog": "retrim.onboard.watchdog:watch",
+    "recorder": "retrim.onboard.recorder:record",
+    "plant": "retrim.live.plant_process:simulate",
+    "residual": "retrim.live.learner_process:learn",
+    "policy": "retrim.live.learner_process:learn",
+}
+"""Main function of each process, by role."""
+
+
+@dataclass(frozen=True)
+class LiveSpec:
+    """Everything that the processes of one flight are started with."""
+
+    controller: ControllerSource
+    layers: tuple[Layer, ...]
+    """Layers of learning: ``residual``, ``policy``, or none."""
+    start: Path
+    """File with what was learnt before the flight."""
+    reference: str | None
+    scenario: Scenario
+    vehicle: Any
+    """Vehicle of training, by name or specification."""
+    x0: np.ndarray
+    home: np.ndarray
+    limits: Limits
+    low: np.ndarray
+    high: np.ndarray
+    dt: float
+    delay_ticks: int
+    window: int
+    seed: int
+    folder: Path
+    """Where the log goes, and what the processes write to their standard outputs."""
+    floor: float = 0.1
+    """Height at which the vehicle has landed [m]."""
+    mains: Mapping[str, str] = field(default_factory=lambda: MAINS)
+    """What runs as each process; another link to a vehicle is another main function of the plant."""

@@ -1,0 +1,19 @@
+"""Orders of the supervisor."""
+
+from ..errors import MessageError
+from ..transport.bus import Bus
+from .messages import unpack_note
+from .realtime import Lifeline
+
+
+def wait_for_take_off(bus: Bus, parent: Lifeline) -> float | None:
+    """Return when the first tick is, by the monotonic clock [s]; None if the supervisor ended before it said so."""
+    while not parent.gone(0.01):
+        message = bus.latest("order")
+        try:
+            epoch = None if message is None else unpack_note(message.data, "order").get("epoch")
+        except MessageError:
+            continue
+        if epoch is not None:
+            return float(epoch)
+    return None

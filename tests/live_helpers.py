@@ -1,0 +1,74 @@
+"""A controller, a plan and a plant of a few lines each, for tests of live flight."""
+
+from pathlib import Path
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from retrim.config import load
+from retrim.config.setup import Setup
+from retrim.control import AbstractController
+from retrim.live.controllers import plain_source
+from retrim.onboard.control import ControlPlan
+from retrim.onboard.guard import UP, G, Limits
+from retrim.physics import Command, State
+
+DT = 0.02
+LOW, HIGH = np.array([0.0, -6.0, -6.0, -2.0]), np.array([30.0, 6.0, 6.0, 2.0])
+HOME = np.array([0.0, 0.0, 1.0])
+TOPICS = {"sample": 4096, "setpoint": 4096, "fallback": 4096, "order": 4096, "ended": 4096, "status": 65536,
+          "flight": 200_000, "parameters.policy": 300_000, "parameters.residual": 100_000}  # fmt: skip
+
+
+class Holds(AbstractController[Float[Array, ""]]):
+    """Holds HOME by four gains; it counts its ticks."""
+
+    gains: Float[Array, "2"] = eqx.field(default_factory=lambda: jnp.array([4.0, 3.5]))
+
+    def init(self, x: State) -> Float[Array, ""]:
+        return jnp.zeros_like(x.p[0])
+
+    def __call__(self, memory, t, x):
+        a = self.gains[0] * (jnp.asarray(HOME, x.p.dtype) - x.p) - self.gains[1] * x.v
+        force = a + G * jnp.asarray(UP, x.p.dtype)
+        d = x.R.T @ force / jnp.sqrt(force @ force)
+        rates = 8.0 * jnp.stack([-d[1], d[0], jnp.zeros_like(d[0])])
+        return Command(force @ x.R[:, 2], rates), memory + 1.0
+
+
+def setup() -> Setup:
+    return Setup.of(load("hover/retrim"))
+
+
+def plan(controller, *, folder=Path(), parent=0, window=50, delay_ticks=1, **limits) -> ControlPlan:
+    box = Limits(np.array([-3.0, -3.0, -0.3]), np.array([3.0, 3.0, 4.0]), **limits)
+    return ControlPlan(
+        folder, controller, box, LOW, HIGH, DT, delay_ticks, window, 0.1, frozenset({0}), 20, parent
+    )  # fmt: skip
+
+
+def holding(gains=(4.0, 3.5)):
+    return plain_source(setup(), Holds(jnp.array(gains)))
+
+
+def level(p=HOME, *, x=0.0) -> np.ndarray:
+    return np.concatenate([np.asarray(p) + np.array([x, 0.0, 0.0]), np.eye(3).ravel(), np.zeros(3)])
+
+
+def rotation(vector):
+    angle = np.linalg.norm(vector)
+    x, y, z = vector / angle if angle else np.zeros(3)
+    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
+
+
+def moved(x, u, push=(0.0, 0.0, 0.0)):
+    """One tick of a point mass, in steps of a millisecond."""
+    p, R, v = x[:3].copy(), x[3:12].reshape(3, 3).copy(), x[12:].copy()
+    turned = rotation(1e-3 * np.asarray(u[1:]))
+    for _ in range(20):
+        a = u[0] * R[:, 2] - G * UP + np.asarray(push)
+        p, v, R = p + 1e-3 * v, v + 1e-3 * a, R @ turned
+    return np.concatenate([p, R.ravel(), v])

@@ -1,0 +1,263 @@
+"""The loop that flies, without a clock: it is the lockstep flight, tick for tick, and takes nothing that is wrong."""
+
+import dataclasses
+import time
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import random
+
+from helpers import CheapModel
+from live_helpers import DT, HOME, TOPICS, holding, level, moved, plan, setup
+from retrim.adapt.learner import LearnerState
+from retrim.live.controllers import adaptive_source
+from retrim.onboard.control import ControlLoop
+from retrim.onboard.guard import Mode
+from retrim.onboard.messages import COLUMNS, COMMAND, FlightRows, Parameters, Sample, pack_note, unpack_note
+from retrim.physics import Command, State
+from retrim.physics.disturbance import Constant
+from retrim.plants.sim import SimPlant
+from retrim.runtime import ControllerPilot, fly
+from retrim.transport.in_process import InProcessBus
+
+
+class Flight:
+    """A loop on a point mass with a delay of one tick; no clock."""
+
+    def __init__(self, source, *, push=(0.0, 0.0, 0.0), x=None, **options):
+        self.bus = InProcessBus(TOPICS)
+        self.loop = ControlLoop(plan(source, **options), self.bus)
+        self.x, self.push, self.tick = level() if x is None else x, push, 0
+        self.acting = self.accepted = np.array([9.81, 0.0, 0.0, 0.0])
+        self.issued = []
+
+    def step(self, ticks=1, *, late=0.0, change=lambda sample: sample):
+        for _ in range(ticks):
+            now = time.monotonic()
+            sample = Sample(self.tick, self.tick * DT, now - late, 0.0, self.x, self.x, self.accepted)
+            self.bus.publish("sample", change(sample).pack())
+            setpoint = self.loop.tick(now)
+            self.loop.idle()
+            self.issued.append(setpoint.u)
+            self.x = moved(self.x, self.acting, self.push)
+            self.acting = self.accepted = setpoint.u
+            self.tick += 1
+        return self.issued[-1]
+
+    def parameters(self, gains, version, base=None):
+        arrays = {"gains": np.array(gains)}
+        base = self.loop.plan.controller.base if base is None else base
+        return Parameters("policy", version, base, self.tick * DT, arrays).pack()
+
+    @property
+    def status(self):
+        self.loop.report()
+        return unpack_note(self.bus.latest("status").data, "status")
+
+
+def test_it_is_the_lockstep_flight_tick_for_tick():
+    """Frame, observer and regression included, on a plant with a delay, under a push."""
+    made = setup()
+    state = made.learner.init(made.new_policy(random.key(0)), random.key(1))
+    push = Constant(jnp.array([0.3, -0.2, 0.4]))
+    x0 = State.at(jnp.array([0.2, -0.1, 1.1]))
+    log = fly(SimPlant(CheapModel(), push), ControllerPilot(made.controller(state)), x0, ticks=60)
+
+    bus = InProcessBus(TOPICS)
+    loop = ControlLoop(plan(adaptive_source(made, state), window=100), bus)
+    with SimPlant(CheapModel(), push) as plant:
+        measurement, accepted = plant.reset(x0), np.array([9.81, 0.0, 0.0, 0.0])
+        for tick in range(60):
+            x = np.concatenate([np.asarray(leaf).ravel() for leaf in (measurement.p, measurement.R, measurement.v)])
+            now = time.monotonic()
+            bus.publish("sample", Sample(tick, measurement.t, now, 0.0, x, x, accepted).pack())
+            u = loop.tick(now).u
+            measurement, taken = plant.step(Command(jnp.asarray(u[0]), jnp.asarray(u[1:])))
+            accepted = np.asarray(taken.vector())
+    loop.report()
+    rows = FlightRows.unpack(bus.latest("flight").data).rows
+    np.testing.assert_allclose(rows[:, 3:6], log.p[:-1], atol=1e-9)
+    np.testing.assert_allclose(rows[:, COMMAND], log.u[1:], atol=1e-9)
+    np.testing.assert_allclose(rows[:, 1], log.t[:-1], atol=1e-12)
+
+
+def test_a_swap_changes_the_command_little_by_little():
+    flight = Flight(holding(), x=level(x=0.4))
+    flight.step(3)
+    before = flight.issued[-1]
+    flight.bus.publish("parameters.policy", flight.parameters((1.0, 1.0), 1))
+    flight.loop.idle()
+    found = [flight.step() for _ in range(8)]
+    assert flight.status["versions"] == {"policy": 1}
+    whole = np.abs(found[-1] - before).max()
+    jumps = np.abs(np.diff([before, *found], axis=0)).max(1)
+    assert jumps.max() < 0.45 * whole
+    # After the blend it is the new controller's own command.
+    fresh = Flight(holding((1.0, 1.0)), x=flight.x)
+    np.testing.assert_allclose(flight.step(), fresh.step(), atol=1e-12)
+
+
+def test_messages_that_must_not_be_used_are_refused_counted_and_named():
+    flight = Flight(holding())
+    flight.step(2)
+    good = flight.parameters((3.0, 3.0), 5)
+    flight.bus.publish("parameters.policy", good)
+    flight.step()
+    for bad in (
+        flight.parameters((3.0, 3.0), 5),
+        flight.parameters((3.0, 3.0), 4),
+        flight.parameters((3.0, 3.0), 9, base="of another"),
+        flight.parameters((3.0, np.nan), 9),
+        flight.parameters((3.0, 3.0, 3.0), 9),
+        good[:-5],
+    ):
+        flight.bus.publish("parameters.policy", bad)
+        flight.step()
+    assert flight.status["versions"] == {"policy": 5}
+    assert flight.status["refused"] == {"stale policy": 2, "policy": 4}
+    flight.bus.publish("parameters.policy", flight.parameters((3.0, 3.0), 6))
+    flight.step()
+    assert flight.status["versions"] == {"policy": 6}
+
+
+@pytest.mark.parametrize("topic", ["parameters.policy", "sample", "order"])
+def test_damaged_messages_and_random_bytes_are_never_taken(topic):
+    rng, flight = np.random.default_rng(7), Flight(holding())
+    flight.step(3)
+    now = time.monotonic()
+    whole = {
+        "parameters.policy": flight.parameters((-9.0, -9.0), 99),
+        "sample": Sample(999, 99.0, time.monotonic(), 0.0, level([9.0, 9.0, 9.0]), level(), np.zeros(4)).pack(),
+        "order": pack_note("order", order="land"),
+    }[topic]
+    for i in range(600):
+        if i % 2:
+            data = bytearray(whole)
+            for _ in range(rng.integers(1, 4)):
+                at = rng.integers(len(data))
+                data[at] = (data[at] + rng.integers(1, 256)) % 256
+            data = data[: rng.integers(len(data))] if i % 4 == 1 else data
+        else:
+            data = rng.bytes(rng.integers(0, 300))
+        if bytes(data) != whole:
+            flight.bus.publish(topic, bytes(data))
+            flight.loop.idle()
+            flight.loop.tick(now)
+    assert flight.loop.mode == Mode.POLICY
+    assert flight.status["versions"] == {"policy": 0}
+    flight.step(5)
+    np.testing.assert_allclose(flight.x[:3], HOME, atol=1e-6)
+
+
+def test_a_policy_that_flies_clearly_worse_is_taken_back():
+    flight = Flight(holding(), push=(0.3, 0.0, 0.0))
+    flight.step(200)
+    flight.bus.publish("parameters.policy", flight.parameters((-3.0, -1.0), 1))
+    flight.step(120)
+    assert flight.status["rolled_back"] == [0, 1]
+    assert flight.loop.mode == Mode.POLICY
+    flight.step(400)
+    np.testing.assert_allclose(flight.x[:3], HOME + np.array([0.3 / 4.0, 0.0, 0.0]), atol=1e-3)
+    # It is stale from now on; a newer one is not.
+    flight.bus.publish("parameters.policy", flight.parameters((-3.0, -1.0), 1))
+    flight.step()
+    assert flight.status["refused"] == {"stale policy": 1}
+    flight.bus.publish("parameters.policy", flight.parameters((5.0, 4.0), 2))
+    flight.step(10)
+    assert flight.status["versions"] == {"policy": 2}
+
+
+def test_a_world_that_changes_after_a_swap_is_not_the_policys_fault():
+    flight = Flight(holding())
+    flight.step(100)
+    flight.bus.publish("parameters.policy", flight.parameters((3.9, 3.4), 1))
+    flight.step(5)
+    flight.push = (3.0, 0.0, 0.0)
+    flight.step(150)
+    assert np.linalg.norm(flight.x[:3] - HOME) > 0.5
+    assert flight.status["rolled_back"] == [0]
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda s: dataclasses.replace(s, state=level(np.array([3.2, 0.0, 1.0]))), "geofence"),
+        (lambda s: dataclasses.replace(s, state=np.concatenate([s.state[:12], [0.0, 20.0, 0.0]])), "speed"),
+    ],
+)
+def test_a_broken_limit_gives_the_vehicle_to_the_fallback_and_lands_it(change, reason):
+    flight = Flight(holding())
+    flight.step(20)
+    flight.step(1, change=change)
+    assert flight.loop.mode == Mode.HOLD
+    assert flight.status["reason"].startswith(reason)
+    flight.step(400)
+    assert flight.loop.mode == Mode.LANDED
+    assert np.isfinite(flight.issued).all()
+    assert flight.x[2] < 0.2
+
+
+def test_a_command_that_is_not_finite_is_never_issued():
+    source = holding()
+    flight = Flight(dataclasses.replace(source, parameters={"policy": {"gains": np.array([np.nan, 3.5])}}))
+    flight.step(30)
+    assert np.isfinite(flight.issued).all()
+    assert flight.status["reason"] == "the policy's command is not finite"
+
+
+def test_without_measurements_it_levels_then_lands_by_the_clock():
+    flight = Flight(holding(), state_age=0.1)
+    flight.step(20)
+    now = time.monotonic()
+    found = [flight.loop.tick(now + 0.02 * i) for i in range(1, 140)]
+    modes = [setpoint.landed for setpoint in found]
+    assert flight.status["reason"].startswith("the newest measurement is")
+    assert flight.loop.mode == Mode.LANDED
+    assert 100 <= modes.index(True) <= 110
+
+
+def test_a_lost_sample_holds_the_command():
+    flight = Flight(holding(), x=level(x=0.4))
+    flight.step(5)
+    held = flight.loop.tick(time.monotonic())
+    np.testing.assert_array_equal(held.u, flight.issued[-1])
+
+
+def test_the_report_has_the_last_ticks_and_what_the_plant_accepted():
+    flight = Flight(holding(), x=level(x=0.4), window=30)
+    flight.step(20)
+    flight.accepted = flight.accepted + np.eye(4)[0] / 2  # the plant took something else
+    flight.step(20)
+    rows = FlightRows.unpack(flight.bus.latest("flight").data).rows
+    assert rows.shape == (30, len(COLUMNS))
+    np.testing.assert_array_equal(rows[:, 0], np.arange(10, 40))
+    assert rows[9, COMMAND][0] == pytest.approx(flight.issued[19][0] + 0.5)
+
+
+def test_land_is_an_order():
+    flight = Flight(holding())
+    flight.step(20)
+    flight.bus.publish("order", pack_note("order", order="land"))
+    flight.step(250)
+    assert flight.loop.mode == Mode.LANDED
+    assert flight.status["reason"] == "landing"
+    assert flight.x[2] < 0.15
+
+
+def test_parameters_of_a_learner_become_those_of_the_controller():
+    made = setup()
+    state = made.learner.init(made.new_policy(random.key(0)), random.key(1))
+    other = made.new_policy(random.key(5))
+    a = adaptive_source(made, state)
+    b = adaptive_source(made, LearnerState(eqx.tree_at(lambda s: s.policy, state.policy, other), state.residual))
+    assert a.base == b.base
+    flight = Flight(a)
+    flight.step()
+    arrays = b.parameters["policy"]
+    flight.bus.publish("parameters.policy", Parameters("policy", 1, a.base, 0.0, arrays).pack())
+    flight.step(7)
+    fresh = Flight(b, x=flight.x)
+    assert flight.status["versions"]["policy"] == 1
+    assert np.abs(flight.step() - fresh.step()).max() < 0.1

@@ -1,0 +1,123 @@
+"""The guard's limits, and the controller that needs no learning: it holds a place, sinks, and stops."""
+
+import numpy as np
+import pytest
+
+from retrim.onboard.guard import UP, Fallback, GeometricHover, Limits, Mode, turn
+
+DT, G = 0.02, 9.81
+LOW, HIGH = np.array([0.0, -6.0, -6.0, -2.0]), np.array([30.0, 6.0, 6.0, 2.0])
+LIMITS = Limits(np.array([-3.0, -3.0, -0.3]), np.array([3.0, 3.0, 4.0]))
+
+
+def rotation(vector):
+    angle = np.linalg.norm(vector)
+    x, y, z = vector / angle if angle else np.zeros(3)
+    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
+
+
+def state(p=(0.0, 0.0, 1.0), turned=(0.0, 0.0, 0.0), v=(0.0, 0.0, 0.0)):
+    return np.concatenate([p, rotation(np.array(turned)).ravel(), v])
+
+
+def moved(x, u, push):
+    """One tick of a point mass, in steps of a millisecond."""
+    p, R, v = x[:3].copy(), x[3:12].reshape(3, 3).copy(), x[12:].copy()
+    for _ in range(20):
+        a = u[0] * R[:, 2] - G * UP + push
+        p, v, R = p + 1e-3 * v, v + 1e-3 * a, R @ rotation(1e-3 * u[1:])
+    return np.concatenate([p, R.ravel(), v])
+
+
+def flown(x, decide, push, ticks):
+    """Fly with a command delay of one tick; return all states."""
+    found, acting = [x], np.array([G, 0.0, 0.0, 0.0])
+    for _ in range(ticks):
+        u, after = decide(found[-1], acting), moved(found[-1], acting, push)
+        acting = u
+        found.append(after)
+    return np.stack(found)
+
+
+@pytest.mark.parametrize(
+    ("x", "said"),
+    [
+        (state((3.1, 0.0, 1.0)), "geofence: at"),
+        (state((0.0, 0.0, -0.4)), "geofence: at"),
+        (state(turned=(1.5, 0.0, 0.0)), "tilt: 1.50 rad, allowed 1.4"),
+        (state(v=(0.0, 16.0, 0.0)), "speed: 16.0 m/s, allowed 15"),
+        (state(v=(0.0, np.nan, 0.0)), "the state is not finite"),
+    ],
+)
+def test_each_limit_is_named(x, said):
+    assert said in LIMITS.broken(x)
+
+
+def test_a_flight_within_limits_breaks_none():
+    assert LIMITS.broken(state((2.9, -2.9, 0.0), (1.3, 0.0, 0.0), (0.0, 14.0, 0.0))) is None
+
+
+def test_the_turn_is_the_smallest_that_points_the_thrust():
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        R, along = rotation(rng.normal(size=3)), rng.normal(size=3)
+        along /= np.linalg.norm(along)
+        vector = turn(R, along)
+        np.testing.assert_allclose((R @ rotation(vector))[:, 2], along, atol=1e-9)
+        np.testing.assert_allclose(np.linalg.norm(vector), np.arccos(np.clip(R[:, 2] @ along, -1, 1)), atol=1e-7)
+    assert np.linalg.norm(turn(rotation(np.array([np.pi, 0.0, 0.0])), UP)) == pytest.approx(np.pi, abs=1e-6)
+
+
+@pytest.mark.parametrize("push", [(0.0, 0.0, 0.0), (2.0, -2.0, 2.0), (-2.0, 0.0, -2.0)])
+def test_it_holds_a_place_from_a_tumble_and_against_a_push(push):
+    hover, last = GeometricHover(LOW, HIGH, DT), []
+
+    def decide(x, acting):
+        if last:
+            hover.feel(last[-1], x, acting)
+        last.append(x)
+        return hover.command(x, np.array([0.0, 0.0, 1.0]))
+
+    path = flown(state((0.8, -0.5, 1.5), (0.9, -0.6, 0.4), (1.0, -1.0, 0.5)), decide, np.array(push), 500)
+    assert np.abs(path[:, :3]).max() < 4.0
+    assert np.linalg.norm(path[-50:, :3] - [0.0, 0.0, 1.0], axis=1).max() < 0.05
+
+
+@pytest.mark.parametrize("push", [(0.0, 0.0, 0.0), (1.5, 0.0, 2.0)])
+def test_the_fallback_holds_then_sinks_then_stops(push):
+    hover = GeometricHover(LOW, HIGH, DT)
+    fallback, modes, last = Fallback(hover, floor=0.1), [], []
+
+    def decide(x, acting):
+        if last:
+            hover.feel(last[-1], x, acting)
+        last.append(x)
+        u, mode = fallback.step(x, True, np.array([0.0, 0.0, 1.5]), land=False)
+        modes.append(mode)
+        return u
+
+    path = flown(state((0.0, 0.0, 1.5)), decide, np.array(push), 400)
+    landed = modes.index(Mode.LANDED)
+    assert modes[:landed] == sorted(modes[:landed])
+    assert 95 <= modes.index(Mode.DESCEND) <= 101
+    assert path[landed, 2] <= 0.1
+    assert abs(path[landed, 14]) < 0.8
+    assert np.abs(path[:landed, :2]).max() < 0.6
+
+
+def test_blind_it_levels_and_sinks_and_stops_after_two_seconds():
+    fallback = Fallback(GeometricHover(LOW, HIGH, DT), floor=0.1)
+    x = state((0.0, 0.0, 3.0), (0.4, 0.2, 0.0))
+    found = [fallback.step(x, False, x[:3], land=False) for _ in range(102)]
+    assert {mode for _, mode in found[:99]} == {Mode.BLIND}
+    assert found[-1][1] == Mode.LANDED
+    assert found[0][1] == Mode.BLIND
+    R = rotation(np.array([0.4, 0.2, 0.0])) @ rotation(0.05 * found[0][0][1:])
+    assert R[2, 2] > rotation(np.array([0.4, 0.2, 0.0]))[2, 2]
+    assert (found[50][0][1:] == 0.0).all()
+    assert 0.9 * G < found[50][0][0] < G
+    # When the state is known again, the vehicle holds.
+    seen = Fallback(GeometricHover(LOW, HIGH, DT), floor=0.1)
+    seen.step(x, False, x[:3], land=False)
+    assert seen.step(x, True, x[:3], land=False)[1] == Mode.HOLD
