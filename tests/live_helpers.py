@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from live_processes import DT, HOME
 from retrim.config import load
 from retrim.config.setup import Setup
 from retrim.control import AbstractController
@@ -15,9 +16,7 @@ from retrim.onboard.control import ControlPlan
 from retrim.onboard.guard import UP, G, Limits
 from retrim.physics import Command, State
 
-DT = 0.02
 LOW, HIGH = np.array([0.0, -6.0, -6.0, -2.0]), np.array([30.0, 6.0, 6.0, 2.0])
-HOME = np.array([0.0, 0.0, 1.0])
 TOPICS = {"sample": 4096, "setpoint": 4096, "fallback": 4096, "order": 4096, "ended": 4096, "status": 65536,
           "flight": 200_000, "parameters.policy": 300_000, "parameters.residual": 100_000}  # fmt: skip
 
@@ -51,24 +50,3 @@ def plan(controller, *, folder=Path(), parent=0, window=50, delay_ticks=1, **lim
 
 def holding(gains=(4.0, 3.5)):
     return plain_source(setup(), Holds(jnp.array(gains)))
-
-
-def level(p=HOME, *, x=0.0) -> np.ndarray:
-    return np.concatenate([np.asarray(p) + np.array([x, 0.0, 0.0]), np.eye(3).ravel(), np.zeros(3)])
-
-
-def rotation(vector):
-    angle = np.linalg.norm(vector)
-    x, y, z = vector / angle if angle else np.zeros(3)
-    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
-
-
-def moved(x, u, push=(0.0, 0.0, 0.0)):
-    """One tick of a point mass, in steps of a millisecond."""
-    p, R, v = x[:3].copy(), x[3:12].reshape(3, 3).copy(), x[12:].copy()
-    turned = rotation(1e-3 * np.asarray(u[1:]))
-    for _ in range(20):
-        a = u[0] * R[:, 2] - G * UP + np.asarray(push)
-        p, v, R = p + 1e-3 * v, v + 1e-3 * a, R @ turned
-    return np.concatenate([p, R.ravel(), v])

@@ -12,7 +12,7 @@ from retrim import load_learnt, load_policy
 
 pytestmark = pytest.mark.usefixtures("as_a_user")
 
-COMMANDS = ("pretrain", "fly", "demo", "sweep", "gauntlet", "bench", "reproduce", "doctor")
+COMMANDS = ("pretrain", "fly", "demo", "sweep", "live", "gauntlet", "bench", "reproduce", "doctor")
 
 
 @pytest.fixture(scope="module")
@@ -82,6 +82,42 @@ def test_a_flight_repeats_bit_for_bit_and_another_seed_flies_otherwise(folder):
     assert first == second
     assert first[0]["errors"] != other[0]["errors"]
     assert (folder / "a" / "events.jsonl").read_text() == (folder / "b" / "events.jsonl").read_text()
+
+
+def test_live_flies_against_the_clock_learns_and_lands(folder):
+    out = retrim("live", "--policy", "p", "--disturbance", "small", "--seconds", "5", "--out", "l", cwd=folder)
+    assert "flight over: landed" in out
+    found = {row["metric"]: row["value"] for row in results(folder / "l")["rows"]}
+    assert {
+        "missed_ticks",
+        "lateness_p99_ms",
+        "lateness_max_ms",
+        "step_p99_ms",
+        "steady",
+        "recovery_5cm",
+    } <= found.keys()
+    assert found["policies"] >= 1
+    assert found["steady"] < 0.4  # as in lockstep; as it is, this small policy is metres off after five seconds
+    assert (found["refused_messages"], found["restarts"], found["fallback_ticks"]) == (0, 0, 0)
+    assert load_learnt(folder / "l" / "learnt.safetensors")[1].name == "hover/retrim"
+    load_policy(folder / "l" / "adapted.safetensors")
+    assert (folder / "l" / "live.png").stat().st_size > 10_000
+    events = [json.loads(line) for line in (folder / "l" / "events.jsonl").read_text().splitlines()]
+    assert {e["event"] for e in events} == {"residual", "policy", "guard"}
+
+
+def test_live_without_learning_and_what_it_refuses(folder):
+    out = retrim("live", "--policy", "p", "--adapt", "base-do", "--seconds", "2", "--out", "ld", cwd=folder)
+    assert "flight over: landed" in out
+    assert {row["metric"]: row["value"] for row in results(folder / "ld")["rows"]}["policies"] == 0
+    for words, said in (
+        (("--fence", "0.1"), "--fence 0.1 m must be between 0.5 and 1000"),
+        (("--seconds", "0"), "--seconds 0 must be between 1 and 3600"),
+        (("--resume", "f/learnt.safetensors"), "give either --policy FILE or --resume FILE"),
+        (("--adapt", "nothing"), "'nothing'"),
+        (("--plant", "moon"), "'moon'"),
+    ):
+        assert said in retrim("live", "--policy", "p", *words, "--out", "lx", cwd=folder, code=1)
 
 
 def test_fly_as_it_is_and_with_measured_latency(folder):

@@ -78,3 +78,13 @@ def test_while_flying_keeps_what_was_flown(folder):
     assert 0 < found["rows"][0]["n"] < 60
     assert (folder / "half" / "hover_large.png").exists()
     assert len(list((folder / "half" / "logs").iterdir())) == found["rows"][0]["n"]
+
+
+def test_while_live_lands_the_vehicle_and_keeps_the_flight(folder):
+    words = "live", "--policy", "p", "--disturbance", "none", "--adapt", "base-do", "--out", "live"
+    code, out = interrupted(words, folder, after="│ policy".encode())
+    assert code == 130, out
+    assert "Traceback" not in out
+    assert "flight over: landed" in out
+    assert results(folder / "live")["interrupted"]
+    assert (folder / "live" / "flight.csv").exists()

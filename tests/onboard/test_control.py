@@ -10,7 +10,8 @@ import pytest
 from jax import random
 
 from helpers import CheapModel
-from live_helpers import DT, HOME, TOPICS, holding, level, moved, plan, setup
+from live_helpers import TOPICS, holding, plan, setup
+from live_processes import DT, HOME, level, moved
 from retrim.adapt.learner import LearnerState
 from retrim.live.controllers import adaptive_source
 from retrim.onboard.control import ControlLoop
@@ -76,7 +77,7 @@ def test_it_is_the_lockstep_flight_tick_for_tick():
             u = loop.tick(now).u
             measurement, taken = plant.step(Command(jnp.asarray(u[0]), jnp.asarray(u[1:])))
             accepted = np.asarray(taken.vector())
-    loop.report()
+    loop.idle()
     rows = FlightRows.unpack(bus.latest("flight").data).rows
     np.testing.assert_allclose(rows[:, 3:6], log.p[:-1], atol=1e-9)
     np.testing.assert_allclose(rows[:, COMMAND], log.u[1:], atol=1e-9)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from live_processes import moved, rotation
 from retrim.onboard.guard import UP, Fallback, GeometricHover, Limits, Mode, turn
 
 DT, G = 0.02, 9.81
@@ -10,24 +11,8 @@ LOW, HIGH = np.array([0.0, -6.0, -6.0, -2.0]), np.array([30.0, 6.0, 6.0, 2.0])
 LIMITS = Limits(np.array([-3.0, -3.0, -0.3]), np.array([3.0, 3.0, 4.0]))
 
 
-def rotation(vector):
-    angle = np.linalg.norm(vector)
-    x, y, z = vector / angle if angle else np.zeros(3)
-    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
-
-
 def state(p=(0.0, 0.0, 1.0), turned=(0.0, 0.0, 0.0), v=(0.0, 0.0, 0.0)):
     return np.concatenate([p, rotation(np.array(turned)).ravel(), v])
-
-
-def moved(x, u, push):
-    """One tick of a point mass, in steps of a millisecond."""
-    p, R, v = x[:3].copy(), x[3:12].reshape(3, 3).copy(), x[12:].copy()
-    for _ in range(20):
-        a = u[0] * R[:, 2] - G * UP + push
-        p, v, R = p + 1e-3 * v, v + 1e-3 * a, R @ rotation(1e-3 * u[1:])
-    return np.concatenate([p, R.ravel(), v])
 
 
 def flown(x, decide, push, ticks):

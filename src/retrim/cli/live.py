@@ -16,13 +16,14 @@ from ..errors import ConfigError
 from ..experiments.figures import picture
 from ..experiments.interrupts import interrupts_only_set
 from ..experiments.limits import check_seeds
+from ..experiments.outputs import clear_outputs, write_learnt
 from ..experiments.run import INTERRUPTED, Run
 from ..experiments.tables.document import TableSection
 from ..experiments.training import train
 from ..io.trained import load_learnt, load_policy
 from ..live.events import LiveEvents
-from ..live.report import flight_of, histograms, log_folder, results
-from ..live.session import LiveRequest, live_spec
+from ..live.report import complaints, flight_of, histograms, learnt_in, results
+from ..live.session import LEARNING, LiveRequest, live_spec
 from ..live.supervisor import Status, Supervisor
 from .console import RichReporter, console, show_paths, show_table, started
 
@@ -105,6 +106,7 @@ def live(
                 return INTERRUPTED
         method = "base" if adapt == "none" else adapt
         run.folder.mkdir(parents=True, exist_ok=True)
+        clear_outputs(run.folder)
         for old in (*run.folder.glob("*.log"), run.folder / "flight.csv"):
             old.unlink(missing_ok=True)
         request = LiveRequest(setup, weights, scenario, method, seconds or LONGEST, seed, fence, run.folder, state)
@@ -130,18 +132,21 @@ def _fly(request: LiveRequest, run: Run) -> int:
         supervisor.take_off()
         status = _watched(supervisor, request, run, events)
         supervisor.finish()
+        learnt = learnt_in(request, supervisor.bus) if request.method in LEARNING else None
     console.print(f"flight over: {status.ended}", markup=False, soft_wrap=True)
-    flight, rows = flight_of(request, events.all, status)
+    flight, rows = flight_of(request, events.all, status, learnt)
     found = results(request, flight, rows, status)
     run.write_results(
         found, seeds=[request.seed], preset=request.setup.preset.name, seconds=float(flight.log.t[-1]),
         ended=status.ended, scheduling=supervisor.refused, histograms_ms=histograms(rows),
     )  # fmt: skip
-    run.write_text("events.jsonl", "".join(json.dumps(event._asdict()) + "\n" for event in events.all))
+    said = [{"event": event.kind, "t": round(event.t, 6), "note": event.note} for event in events.all]
+    run.write_text("events.jsonl", "".join(json.dumps(line) + "\n" for line in said))
+    write_learnt([flight], request.setup.preset, run.folder)
     lines = tuple((row["metric"], UNITS.get(row["metric"], ""), _shown(row["value"])) for row in found)
     show_table(TableSection(("figure", "unit", "value"), lines, f"live, {flight.log.t[-1]:.1f} s"))
     drawn = picture([flight], request.setup, request.scenario, run.folder, stem="live")
-    show_paths([*drawn[:1], run.folder / "results.json", run.folder / "flight.csv", *log_folder(run.folder)])
+    show_paths([*drawn[:1], run.folder / "results.json", run.folder / "flight.csv", *complaints(run.folder)])
     return run.exit_code
 
 

@@ -107,7 +107,7 @@ def _answer(bus: Bus, tick: int, until: float) -> Setpoint | None:
                 found = Setpoint.unpack(message.data)
             except MessageError:
                 continue
-            if found.tick == tick:
+            if found.tick == tick or found.landed:
                 return found
         if time.monotonic() >= until:
             return None

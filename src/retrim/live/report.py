@@ -6,29 +6,36 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import PlantError
+from ..adapt.learner import LearnerState
+from ..adapt.updates import PolicyUpdate, ResidualUpdate, unpack_update
+from ..errors import MessageError, PlantError
 from ..experiments.flights import Flight
 from ..experiments.flying import scored, until_terminated
 from ..experiments.recovery import change_times, recoveries
+from ..io.trained import load_learnt
 from ..onboard.accounts import EDGES_MS, summary
 from ..onboard.guard import Mode
 from ..onboard.messages import COMMAND, MEASURED, TRUE
 from ..onboard.recorder import read_log
 from ..runtime.events import Event
 from ..runtime.flight import Log, States
-from .session import LiveRequest
+from ..transport.bus import Bus
+from .session import LAYERS, LiveRequest
 from .supervisor import Status
 
 HOVER = np.array([9.81, 0.0, 0.0, 0.0])
 
 
-def flight_of(request: LiveRequest, events: Sequence[Event], status: Status) -> tuple[Flight, np.ndarray]:
+def flight_of(
+    request: LiveRequest, events: Sequence[Event], status: Status, learnt: LearnerState | None
+) -> tuple[Flight, np.ndarray]:
     """Return the flight that a log holds, up to its landing, and the rows of the log.
 
     Args:
         request: What was flown.
         events: What happened.
         status: The last one.
+        learnt: What the learners knew at the end.
 
     Raises:
         PlantError: The log holds no flight.
@@ -44,7 +51,7 @@ def flight_of(request: LiveRequest, events: Sequence[Event], status: Status) -> 
     log = Log(
         shown[:, 1], _states(shown[:, TRUE]), _states(shown[:, MEASURED]), u, dt, False, tuple(events), shown[:, 2]
     )
-    return scored(request.setup, request.flight, until_terminated(request.setup.flown, log)), rows
+    return scored(request.setup, request.flight, until_terminated(request.setup.flown, log), learnt), rows
 
 
 def results(request: LiveRequest, flight: Flight, rows: np.ndarray, status: Status) -> list[dict[str, Any]]:
@@ -103,6 +110,23 @@ def _finite(value: Any) -> Any:
     return None if value is None or not np.isfinite(value) else value
 
 
-def log_folder(folder: Path) -> list[Path]:
+def learnt_in(request: LiveRequest, bus: Bus) -> LearnerState | None:
+    """Return what the learners published last; None if nothing was learnt, or what they said cannot be used."""
+    state = load_learnt(request.folder / "start.safetensors")[0]
+    found = False
+    for layer in LAYERS:
+        message = bus.latest(f"update.{layer}")
+        try:
+            update = None if message is None else unpack_update(message.data, state, source=layer)
+        except MessageError:
+            continue
+        if isinstance(update, ResidualUpdate):
+            state, found = LearnerState(state.policy, update.state), True
+        elif isinstance(update, PolicyUpdate):
+            state, found = LearnerState(update.state, state.residual), True
+    return state if found else None
+
+
+def complaints(folder: Path) -> list[Path]:
     """Return what the processes of a flight have written to their standard outputs, where it is not empty."""
     return [path for path in sorted(folder.glob("*.log")) if path.stat().st_size]

@@ -119,13 +119,13 @@ class ControlLoop:
         for half in self.plan.controller.parameters:
             self._poll(half)
         self._ticks += 1
-        if self._ticks % REPORT_EVERY == 0 or self.mode == Mode.LANDED:
+        if self.rows:  # each tick, so that the log has the last one, whenever this process dies
+            self.bus.publish("flight", FlightRows(np.stack(self.rows)).pack())
+        if self._ticks % REPORT_EVERY == 1 or self.mode == Mode.LANDED:
             self.report()
 
     def report(self) -> None:
-        """Publish the last ticks and the state of the flight."""
-        if self.rows:
-            self.bus.publish("flight", FlightRows(np.stack(self.rows)).pack())
+        """Publish the state of the flight."""
         self.bus.publish("status", pack_note("status", **self._status()))
 
     def _status(self) -> dict[str, Any]:

@@ -22,6 +22,15 @@ def be_punctual(priority: int, cores: set[int]) -> list[str]:
         What was refused, in words; empty if nothing was.
     """
     refused = []
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    # Touching all its memory takes a while: before the process is more important than others.
+    try:
+        if ctypes.CDLL(None, use_errno=True).mlockall(LOCK_NOW_AND_LATER) != 0:
+            refused.append(f"locked memory: {os.strerror(ctypes.get_errno())}")
+    except (OSError, AttributeError) as error:
+        refused.append(f"locked memory: {error}")
     try:
         os.sched_setaffinity(0, cores)
     except (OSError, AttributeError) as error:
@@ -30,14 +39,6 @@ def be_punctual(priority: int, cores: set[int]) -> list[str]:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
     except (OSError, AttributeError) as error:
         refused.append(f"SCHED_FIFO: {error}")
-    try:
-        if ctypes.CDLL(None, use_errno=True).mlockall(LOCK_NOW_AND_LATER) != 0:
-            refused.append(f"locked memory: {os.strerror(ctypes.get_errno())}")
-    except (OSError, AttributeError) as error:
-        refused.append(f"locked memory: {error}")
-    gc.collect()
-    gc.freeze()
-    gc.disable()
     return refused
 
 

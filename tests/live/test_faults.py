@@ -1,0 +1,157 @@
+"""The fault drill: any process may die at any time; the flight goes on, or ends in the defined fallback."""
+
+import os
+import signal
+import time
+from dataclasses import replace
+from subprocess import Popen
+
+import numpy as np
+import pytest
+
+from live_helpers import HIGH, LOW, holding, plan
+from live_processes import DT, HOME, DrillPlan, level
+from retrim.config import Scenario
+from retrim.live.events import LiveEvents
+from retrim.live.spec import MAINS, LiveSpec
+from retrim.live.supervisor import Supervisor
+from retrim.onboard.guard import Mode
+from retrim.onboard.launch import launch
+from retrim.onboard.messages import COMMAND, Setpoint
+from retrim.onboard.recorder import read_log
+
+DRILL = {"plant": "live_processes:plant", "residual": "live_processes:learner", "policy": "live_processes:learner"}
+SECONDS = 1.5
+
+
+class Drill(Supervisor):
+    """Its plant and learners are those of the drill."""
+
+    def _plan(self, role):
+        if role in DRILL:
+            spec = self.spec
+            return DrillPlan(self.bus.folder, os.getpid(), role, spec.x0, spec.controller.base)
+        return super()._plan(role)
+
+
+def supervise(spec):
+    """A supervisor in a process of its own, for a drill in which it dies."""
+    with Drill(spec) as drill:
+        for _ in drill.warm_up():
+            pass
+        drill.take_off()
+        while drill.watch().ended is None:
+            time.sleep(0.02)
+
+
+@pytest.fixture(scope="module")
+def controller():
+    return holding()
+
+
+def spec_in(folder, controller, **changes):
+    start = folder / "start.safetensors"
+    start.write_bytes(b"")
+    made = plan(controller)
+    return replace(
+        LiveSpec(
+            controller, ("residual", "policy"), start, None, Scenario(), "small", level(np.array([0.0, 0.0, 0.5])),
+            HOME, made.limits, LOW, HIGH, DT, 1, 50, 0, folder, mains=MAINS | DRILL,
+        ),
+        **changes,
+    )  # fmt: skip
+
+
+def flown(spec, kill=None, at=0.0, seconds=SECONDS):
+    """Fly, and kill a process on the way; return the last status, the events, and how long the watchdog took."""
+    events, took = LiveEvents(), None
+    with Drill(spec) as drill:
+        for _ in drill.warm_up():
+            pass
+        drill.take_off()
+        until = time.monotonic() + 20.0
+        while (status := drill.watch()).ended is None and time.monotonic() < until:
+            events.take(status)
+            if kill and status.t >= at:
+                os.kill(drill.processes[kill].pid, signal.SIGKILL)
+                took = _first_fallback(drill.bus, time.monotonic()) if kill == "control" else None
+                kill = None
+            if status.t > seconds:
+                drill.land()
+            time.sleep(0.02)
+        drill.finish()
+        events.take(status)
+        folder = drill.bus.folder
+    assert not folder.exists()
+    assert all(process.poll() is not None for process in drill.processes.values())
+    return status, events.all, took
+
+
+def _first_fallback(bus, killed):
+    while (message := bus.latest("fallback")) is None and time.monotonic() < killed + 1.0:
+        time.sleep(1e-3)
+    return Setpoint.unpack(message.data).sent - killed
+
+
+def whole_log(folder, status=None):
+    """Return the log, after asserting that it has every tick that was flown, and that every command is finite."""
+    rows = read_log(folder / "flight.csv")
+    assert len(rows) > 10
+    ticks = rows[:, 0]
+    assert ticks[0] == 0
+    assert (np.diff(ticks) >= 1).all()
+    # A tick whose sample came too late, or that was missed, is counted and has no row.
+    lost = 2 if status is None else status.control["missed"] + status.control["late_samples"]
+    assert ticks[-1] + 1 - len(ticks) <= lost
+    assert np.isfinite(rows).all()
+    return rows
+
+
+def test_a_flight_without_faults(tmp_path, controller):
+    status, events, _ = flown(spec_in(tmp_path, controller))
+    rows = whole_log(tmp_path, status)
+    assert status.ended == "landed"
+    assert rows[-1, -1] == Mode.LANDED
+    assert rows[-1, 5] <= 0.1
+    assert next(e.note for e in events if e.kind == "guard") == "descend: landing"
+    assert sum(e.kind == "policy" for e in events) >= 3
+    assert np.linalg.norm(rows[rows[:, 1] > 1.2][0, 3:6] - HOME) < 0.2
+
+
+@pytest.mark.parametrize("seed", range(int(os.environ.get("RETRIM_DRILLS", "1"))))  # `make drill` flies four
+@pytest.mark.parametrize("role", ["control", "watchdog", "recorder", "plant", "residual", "policy"])
+def test_each_process_is_killed_at_a_random_time(tmp_path, controller, role, seed):
+    at = np.random.default_rng([seed, len(role)]).uniform(0.0, SECONDS)
+    status, events, took = flown(spec_in(tmp_path, controller), role, at)
+    rows = whole_log(tmp_path, status)
+    if role == "plant":
+        assert status.ended.startswith("the plant process is gone")
+        assert abs(rows[-1, 1] - at) < 0.3
+        return
+    assert status.ended == "landed"
+    assert np.abs(rows[:, 3:5]).max() < 0.3
+    if role == "control":
+        assert took < 0.04
+        assert rows[-1, -1] == Mode.WATCHDOG
+        assert any(e.note.startswith("watchdog: the control process is gone") for e in events)
+    else:
+        assert status.restarts == {role: 1}
+        assert rows[-1, -1] == Mode.LANDED
+        assert (rows[rows[:, 1] < SECONDS, -1] == Mode.POLICY).all()
+
+
+def test_without_its_supervisor_the_vehicle_lands_and_the_log_is_whole(tmp_path, controller):
+    spec = spec_in(tmp_path, controller)
+    process: Popen[bytes] = launch("live.test_faults:supervise", spec, tmp_path / "supervisor.log")
+    log = tmp_path / "flight.csv"
+    until = time.monotonic() + 30.0
+    while (not log.exists() or len(log.read_text().splitlines()) < 20) and time.monotonic() < until:
+        time.sleep(0.05)
+    process.kill()
+    process.wait()
+    while time.monotonic() < until and (not len(read_log(log)) or read_log(log)[-1, -1] != Mode.LANDED):
+        time.sleep(0.1)
+    rows = whole_log(tmp_path)
+    assert rows[-1, -1] == Mode.LANDED
+    assert Mode.DESCEND in rows[:, -1]
+    assert np.isfinite(rows[:, COMMAND]).all()

@@ -1,0 +1,85 @@
+"""Processes for drills: a plant and learners of a few lines, in NumPy, so that twenty flights cost little."""
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from retrim.onboard.guard import UP, G
+from retrim.onboard.messages import Parameters, Sample, Setpoint, pack_note
+from retrim.onboard.orders import wait_for_take_off
+from retrim.onboard.realtime import Lifeline, be_punctual, sleep_until
+from retrim.transport.shared_memory import SharedMemoryBus
+
+DT = 0.02
+HOME = np.array([0.0, 0.0, 1.0])
+
+
+def level(p=HOME, *, x=0.0) -> np.ndarray:
+    return np.concatenate([np.asarray(p) + np.array([x, 0.0, 0.0]), np.eye(3).ravel(), np.zeros(3)])
+
+
+def rotation(vector):
+    angle = np.linalg.norm(vector)
+    x, y, z = vector / angle if angle else np.zeros(3)
+    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
+
+
+def moved(x, u, push=(0.0, 0.0, 0.0)):
+    """One tick of a point mass, in steps of a millisecond."""
+    p, R, v = x[:3].copy(), x[3:12].reshape(3, 3).copy(), x[12:].copy()
+    turned = rotation(1e-3 * np.asarray(u[1:]))
+    for _ in range(20):
+        a = u[0] * R[:, 2] - G * UP + np.asarray(push)
+        p, v, R = p + 1e-3 * v, v + 1e-3 * a, R @ turned
+    return np.concatenate([p, R.ravel(), v])
+
+
+@dataclass(frozen=True)
+class DrillPlan:
+    """What a process of a drill is started with."""
+
+    folder: Path
+    parent: int
+    role: str
+    x0: np.ndarray
+    base: str
+
+
+def plant(plan: DrillPlan) -> None:
+    """A point mass with a delay of a tick, against the clock."""
+    bus, parent = SharedMemoryBus(plan.folder), Lifeline(plan.parent)
+    bus.publish("ready.plant", pack_note("ready", refused=be_punctual(20, {0})))
+    if (epoch := wait_for_take_off(bus, parent)) is None:
+        return
+    x, tick, acting = plan.x0, 0, np.array([G, 0.0, 0.0, 0.0])
+    accepted = acting
+    while True:
+        sleep_until(epoch + tick * DT)
+        bus.publish("sample", Sample(tick, tick * DT, time.monotonic(), 0.0, x, x, accepted).pack())
+        while time.monotonic() < epoch + (tick + 0.6) * DT:
+            found = [Setpoint.unpack(m.data) for m in map(bus.latest, ("setpoint", "fallback")) if m is not None]
+            now = [each for each in found if each.tick == tick or each.landed]
+            if now:
+                accepted = now[0].u
+                if now[0].landed:
+                    bus.publish("ended", pack_note("ended", reason="landed"))
+                    return
+                break
+            time.sleep(5e-4)
+        x, acting, tick = moved(x, acting), accepted, tick + 1
+
+
+def learner(plan: DrillPlan) -> None:
+    """Gains near those that are flown, now and then."""
+    bus, parent = SharedMemoryBus(plan.folder), Lifeline(plan.parent)
+    bus.publish(f"ready.{plan.role}", pack_note("ready"))
+    topic, rng = "parameters.policy", np.random.default_rng()
+    while not parent.gone(0.1) and bus.latest("ended") is None:
+        before = bus.latest(topic)
+        version = 1 if before is None else before.version + 1
+        gains = np.array([4.0, 3.5]) + 0.1 * rng.normal(size=2)
+        if plan.role == "policy":
+            bus.publish(topic, Parameters("policy", version, plan.base, 0.0, {"gains": gains}).pack())
