@@ -7,7 +7,7 @@ STAMP := $(VENV)/.installed
 
 DEV := $(VENV)/.installed-dev
 
-.PHONY: setup dev demo test check docs wheel mutants bench tables pins clean
+.PHONY: setup dev demo test check docs wheel mutants drill bench tables pins clean
 
 setup: $(STAMP)
 
@@ -41,6 +41,10 @@ wheel: | $(UV)
 # Faults planted in the wiring, and the share of them that the tests notice.
 mutants: dev
 	$(BIN)/python tools/mutants.py
+
+# Live flights in which each process is killed at random times, four times each.
+drill: dev
+	RETRIM_DRILLS=4 $(BIN)/pytest tests/live/test_faults.py
 
 bench: setup
 	$(BIN)/retrim bench

@@ -4,13 +4,12 @@ import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from ..adapt.learner import LearnerState
 from ..config.loading import changed, overlaid
 from ..config.presets import Preset
 from ..config.scenario import Scenario
 from ..config.setup import Latency, Setup
-from ..control.policy import Policy
 from ..errors import ConfigError
+from ..experiments.asked import flown_reference, loaded, same_policy
 from ..experiments.figures import picture
 from ..experiments.fleet import Fleet, told_by
 from ..experiments.flights import Flight
@@ -19,8 +18,6 @@ from ..experiments.metrics import cell, rows
 from ..experiments.outputs import clear_outputs, write_events, write_learnt, write_logs
 from ..experiments.run import INTERRUPTED, Run
 from ..experiments.tables.document import TableSection
-from ..io.checkpoint import load_delta
-from ..io.trained import load_learnt, load_policy
 from .console import RichReporter, console, show_paths, show_table, started
 
 
@@ -80,14 +77,14 @@ def fly(
     """
 
     def ordered(stop: threading.Event) -> int:
-        weights, preset, state = _loaded(policy, resume, delta)
+        weights, preset, state = loaded(policy, resume, delta)
         if config is not None:
-            preset = _same_policy(preset, overlaid(preset, config), config)
+            preset = same_policy(preset, overlaid(preset, config), config)
         if residual is not None:
             if state is not None:
                 raise ConfigError(f"--residual {residual}: a resumed flight goes on with its own residual")
             preset = changed(preset, adapt={"residual": residual})
-        follows = _flown_reference(preset, reference)
+        follows = flown_reference(preset, reference)
         scenario = Scenario(disturbance, plant, vehicle, sensors, thrust_error, follows, delay)
         methods: tuple[str, ...] = ("base",) if adapt in ("none", "base") else ("base", adapt)
         fleet = Fleet(
@@ -137,58 +134,8 @@ def _notes(flights: Sequence[Flight], preset: Preset) -> None:
         console.print(f"no policy update took effect; with fixed latencies the first one comes at {first:g} s")
 
 
-def _loaded(policy: Path | None, resume: Path | None, delta: Path | None) -> tuple[Policy, Preset, LearnerState | None]:
-    """Weights, preset, and what an earlier flight learnt."""
-    if (policy is None) == (resume is None):
-        raise ConfigError("give either --policy FILE or --resume FILE; `retrim pretrain hover --out h` makes h")
-    if resume is not None:
-        if delta is not None:
-            raise ConfigError("--delta goes with --policy; --resume holds its own")
-        state, preset = load_learnt(resume)
-        return state.policy.policy.merged(), preset, state
-    assert policy is not None
-    weights, preset = load_policy(policy)
-    return (load_delta(delta, weights).merged() if delta is not None else weights), preset, None
-
-
-def _flown_reference(preset: Preset, name: str | None) -> str | None:
-    """The reference of a tracking flight.
-
-    Raises:
-        ConfigError: The policy cannot follow it.
-    """
-    if preset.track is None:
-        if name is not None:
-            raise ConfigError(f"--reference {name}: a {preset.task} policy follows none")
-        return None
-    trained_on = preset.track.reference
-    if name is None and "+" in trained_on:
-        raise ConfigError(f"the policy was trained on {trained_on}: say which to fly, as --reference circle")
-    if name is not None and name != trained_on and preset.track.observation == "state":
-        raise ConfigError(
-            f"--reference {name}: this policy does not see its reference, and was trained on {trained_on}"
-        )
-    return name or trained_on
-
-
 def _warn(setup: Setup, scenario: Scenario) -> None:
     """Say what the vehicle that flies cannot fly of the reference."""
     if wrong := setup.limits_exceeded(scenario.make_vehicle(setup.preset.vehicle)):
         who = scenario.vehicle_name(setup.preset.vehicle)
         console.print(f"[yellow]warning:[/] vehicle {who} cannot fly all of reference {scenario.reference}: {wrong}")
-
-
-def _same_policy(trained: Preset, changed_one: Preset, config: Path) -> Preset:
-    """``changed_one``, unless it changes what the weights were trained for."""
-    for name in ("task", "vehicle", "dt", "command_history", "pretrain"):
-        before, after = getattr(trained, name), getattr(changed_one, name)
-        if before != after:
-            shown = (f"{name} = {after!r}, but the policy was trained with {before!r}"
-                     if name != "pretrain" else "[pretrain] cannot change for a policy that is trained")  # fmt: skip
-            raise ConfigError(f"{config}: {shown}")
-    before_sees, after_sees = (p.track and p.track.observation for p in (trained, changed_one))
-    if before_sees != after_sees:
-        raise ConfigError(
-            f"{config}: track.observation = {after_sees!r}, but the policy was trained with {before_sees!r}"
-        )
-    return changed_one

@@ -2,7 +2,6 @@
 
 import json
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from ..config.loading import changed, load_for
 from ..config.scenario import Scenario
 from ..config.setup import Setup
 from ..errors import ConfigError
+from ..experiments.asked import flown_reference, loaded
 from ..experiments.figures import picture
 from ..experiments.interrupts import interrupts_only_set
 from ..experiments.limits import check_seeds
@@ -20,16 +20,16 @@ from ..experiments.outputs import clear_outputs, write_learnt
 from ..experiments.run import INTERRUPTED, Run
 from ..experiments.tables.document import TableSection
 from ..experiments.training import train
-from ..io.trained import load_learnt, load_policy
 from ..live.events import LiveEvents
 from ..live.report import complaints, flight_of, histograms, learnt_in, results
 from ..live.session import LEARNING, LiveRequest, live_spec
 from ..live.supervisor import Status, Supervisor
+from ..live.watching import watched
+from ..runtime.events import Event
 from .console import RichReporter, console, show_paths, show_table, started
 
 LONGEST = 3600.0  # [s]
 LINE_EVERY = 5.0  # [s], where the output is no terminal
-LANDING = 60.0  # [s], after which processes are ended
 UNITS = {"steady": "m", "recovery_5cm": "s", "flight_to_swap_s": "s"}
 
 
@@ -80,26 +80,17 @@ def live(
             raise ConfigError(f"--fence {fence:g} m must be between 0.5 and 1000")
         if seconds is not None and not 1.0 <= seconds <= LONGEST:
             raise ConfigError(f"--seconds {seconds:g} must be between 1 and {LONGEST:g}")
-        if policy is not None and resume is not None:
-            raise ConfigError("give either --policy FILE or --resume FILE")
-        state = None
-        if resume is not None:
-            state, chosen = load_learnt(resume)
-            weights = state.policy.policy.merged()
-        elif policy is not None:
-            weights, chosen = load_policy(policy)
-        else:
-            chosen = load_for(preset.partition("/")[0], preset)
+        state, weights, chosen = None, None, load_for(preset.partition("/")[0], preset)
+        if policy is not None or resume is not None:
+            weights, chosen, state = loaded(policy, resume)
         if residual is not None:
             if state is not None:
                 raise ConfigError(f"--residual {residual}: a resumed flight goes on with its own residual")
             chosen = changed(chosen, adapt={"residual": residual})
-        if chosen.track is not None and reference is None and "+" in chosen.track.reference:
-            raise ConfigError(f"the policy tracks {chosen.track.reference}: say which to fly, as --reference circle")
-        follows = reference or (chosen.track.reference if chosen.track is not None else None)
+        follows = flown_reference(chosen, reference)
         scenario = Scenario(disturbance, plant, vehicle, sensors, thrust_error, follows, delay)
         setup, run = Setup.of(chosen, follows), started(Run("live", out, stop=stop))
-        if policy is None and resume is None:
+        if weights is None:
             weights, losses = train(Setup.of(chosen), seed, reporter=RichReporter(), stop=stop)
             if run.interrupted:
                 console.print(f"interrupted while pretraining, after {len(losses)} steps; nothing has flown")
@@ -129,9 +120,8 @@ def _fly(request: LiveRequest, run: Run) -> int:
         for role, refused in supervisor.refused.items():
             for what in refused:
                 console.print(f"{role}: no {what}", markup=False, soft_wrap=True)
-        supervisor.take_off()
-        status = _watched(supervisor, request, run, events)
-        supervisor.finish()
+        with Live(console=console, auto_refresh=False) as screen:
+            status = watched(supervisor, request.seconds, events, _shown_on(screen, events), run.stop)
         learnt = learnt_in(request, supervisor.bus) if request.method in LEARNING else None
     console.print(f"flight over: {status.ended}", markup=False, soft_wrap=True)
     flight, rows = flight_of(request, events.all, status, learnt)
@@ -150,27 +140,21 @@ def _fly(request: LiveRequest, run: Run) -> int:
     return run.exit_code
 
 
-def _watched(supervisor: Supervisor, request: LiveRequest, run: Run, events: LiveEvents) -> Status:
-    """Show the flight until it is over; Ctrl-C, or the end of its time, lands it."""
-    landed_by, last = float("inf"), float("-inf")
-    with Live(console=console, refresh_per_second=5, auto_refresh=False) as screen:
-        while True:
-            status = supervisor.watch()
-            new = events.take(status)
-            if status.ended is not None or time.monotonic() > landed_by:
-                return status
-            if (run.interrupted or status.t >= request.seconds) and landed_by == float("inf"):
-                supervisor.land()
-                landed_by = time.monotonic() + LANDING
-            if console.is_terminal:
-                screen.update(_screen(status, events), refresh=True)
-            elif status.t - last >= LINE_EVERY:
-                last = status.t
-                console.print(_line(status), markup=False, soft_wrap=True)
-            for event in new:
-                if event.kind not in ("policy", "residual"):
-                    screen.console.print(f"{event.t:.1f} s {event.kind}: {event.note}", markup=False, soft_wrap=True)
-            time.sleep(0.05)
+def _shown_on(screen: Live, events: LiveEvents) -> Callable[[Status, list[Event]], None]:
+    """Show a flight as a table in a terminal, and as a line now and then elsewhere; events as they come."""
+    last = [float("-inf")]
+
+    def show(status: Status, new: list[Event]) -> None:
+        if console.is_terminal:
+            screen.update(_screen(status, events), refresh=True)
+        elif status.t - last[0] >= LINE_EVERY:
+            last[0] = status.t
+            console.print(_line(status), markup=False, soft_wrap=True)
+        for event in new:
+            if event.kind not in ("policy", "residual"):
+                screen.console.print(f"{event.t:.1f} s {event.kind}: {event.note}", markup=False, soft_wrap=True)
+
+    return show
 
 
 def _line(status: Status) -> str:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -43,7 +44,9 @@ class PlantPlan:
 
 def simulate(plan: PlantPlan) -> None:
     """Fly until the vehicle has landed: the main function of the process."""
-    os.sched_setaffinity(0, set(plan.cores)) if hasattr(os, "sched_setaffinity") else None
+    jax.config.update("jax_cpu_enable_async_dispatch", False)  # a tick is computed here and now, by no pool of threads
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, set(plan.cores))
     enable_compile_cache()
     bus, parent = SharedMemoryBus(plan.folder), Lifeline(plan.parent)
     x0 = State(*map(jnp.asarray, _parts(plan.x0)))

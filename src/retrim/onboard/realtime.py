@@ -32,14 +32,23 @@ def be_punctual(priority: int, cores: set[int]) -> list[str]:
     except (OSError, AttributeError) as error:
         refused.append(f"locked memory: {error}")
     try:
-        os.sched_setaffinity(0, cores)
+        for thread in _threads():
+            os.sched_setaffinity(thread, cores)
     except (OSError, AttributeError) as error:
         refused.append(f"cores {sorted(cores)}: {error}")
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+        for thread in _threads():  # a pool that computes for this process is as urgent as it
+            os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(priority))
     except (OSError, AttributeError) as error:
         refused.append(f"SCHED_FIFO: {error}")
     return refused
+
+
+def _threads() -> list[int]:
+    """Threads of this process; the calling one last."""
+    with contextlib.suppress(OSError):
+        return [int(name) for name in os.listdir("/proc/self/task") if int(name) != os.getpid()] + [0]
+    return [0]
 
 
 def cores_of(role: str) -> set[int]:
