@@ -9,11 +9,13 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jax import random
 from jax.extend.core import ClosedJaxpr, Jaxpr, Var
 
 from ..errors import ConfigError
-from ..onboard import lax
+from ..onboard import lax, threefry
 from ..onboard.program import ProgramSource
 from .primitives import EXPRESSIONS
 
@@ -42,6 +44,13 @@ def numpy_program(function: Callable[..., Any], parameters: Any, inputs: Any) ->
     return ProgramSource(writer.source(given, outputs), writer.constants)
 
 
+def plain(value: Any) -> np.ndarray:
+    """Return a leaf as NumPy has it; a random key becomes its two words."""
+    if isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
+        value = random.key_data(value)
+    return np.asarray(value)
+
+
 class _Writer:
     """Collects lines and constants."""
 
@@ -49,11 +58,11 @@ class _Writer:
         self.constants: dict[str, Any] = {}
         self.lines: list[tuple[str, str, int, tuple[str, ...]]] = []
         self._known: dict[str, Ref] = {}
-        self._scope: dict[str, Any] = {"np": np, "lax": lax}
+        self._scope: dict[str, Any] = {"np": np, "lax": lax, "threefry": threefry}
 
     def constant(self, value: Any) -> Ref:
         """Return the name of a constant."""
-        array = np.asarray(value)
+        array = plain(value)
         key = f"{array.dtype} {array.shape} {array.tobytes().hex()}"
         if key not in self._known:
             name = f"c{len(self.constants)}"

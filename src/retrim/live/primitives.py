@@ -3,6 +3,8 @@
 from collections.abc import Callable
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.lax import GatherScatterMode
 
@@ -26,11 +28,12 @@ def _same(eqn: Any, x: str) -> str:
 
 
 def _shape(eqn: Any) -> tuple[int, ...]:
-    return tuple(eqn.outvars[0].aval.shape)
+    aval = eqn.outvars[0].aval
+    return (*aval.shape, 2) if jnp.issubdtype(aval.dtype, jax.dtypes.prng_key) else tuple(aval.shape)
 
 
 def _reshape(eqn: Any, x: str) -> str:
-    return x if tuple(eqn.invars[0].aval.shape) == _shape(eqn) else f"{x}.reshape({_shape(eqn)})"
+    return x if eqn.invars[0].aval.shape == eqn.outvars[0].aval.shape else f"{x}.reshape({_shape(eqn)})"
 
 
 def _broadcast(eqn: Any, x: str) -> str:
@@ -165,6 +168,14 @@ EXPRESSIONS: dict[str, Expression] = {
     "cumsum": lambda eqn, x: f"np.cumsum({x}, axis={eqn.params['axis']})",
     "argmin": _index("np.argmin"),
     "argmax": _index("np.argmax"),
+    "erf_inv": _call("lax.erf_inv"),
+    "shift_right_logical": _infix(">>"),
+    "shift_left": _infix("<<"),
+    "bitcast_convert_type": lambda eqn, x: f"np.asarray({x}).view({np.dtype(eqn.params['new_dtype']).name!r})",
+    "random_seed": _call("threefry.seed"),
+    "random_fold_in": _call("threefry.fold_in"),
+    "random_split": lambda eqn, key: f"threefry.split({key}, {tuple(eqn.params['shape'])})",
+    "random_bits": lambda eqn, key: f"threefry.bits({key}, {tuple(eqn.params['shape'])}, {eqn.params['bit_width']})",
     "dot_general": _dot,
     "gather": _gather,
     "scatter": _scatter,

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from scipy import special
 
 Index = tuple[int, ...]
 
@@ -11,6 +12,11 @@ Index = tuple[int, ...]
 def logistic(x: Any) -> Any:
     """Return the logistic function."""
     return 1 / (1 + np.exp(-x))
+
+
+def erf_inv(x: Any) -> Any:
+    """Return the inverse of the error function."""
+    return special.erfinv(x)
 
 
 def integer_div(a: Any, b: Any) -> Any:

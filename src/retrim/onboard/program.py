@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from . import lax
+from . import lax, threefry
 
 Arrays = list[Any]
 """Leaves of a pytree, in its order: NumPy arrays and scalars."""
@@ -25,7 +25,7 @@ class NumpyProgram:
     """The two functions of a program."""
 
     def __init__(self, source: ProgramSource) -> None:
-        scope: dict[str, Any] = {"np": np, "lax": lax, **source.constants}
+        scope: dict[str, Any] = {"np": np, "lax": lax, "threefry": threefry, **source.constants}
         exec(compile(source.text, "<controller>", "exec"), scope)  # never text from a message
         self._prepare: Callable[[Sequence[Any]], Arrays] = scope["prepare"]
         self._step: Callable[[Sequence[Any], Sequence[Any]], Arrays] = scope["step"]
