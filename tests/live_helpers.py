@@ -11,14 +11,15 @@ from live_processes import DT, HOME
 from retrim.config import load
 from retrim.config.setup import Setup
 from retrim.control import AbstractController
-from retrim.live.controllers import plain_source
-from retrim.onboard.control import ControlPlan
+from retrim.live.controllers import _source, plain_source
 from retrim.onboard.guard import UP, G, Limits
+from retrim.onboard.plan import ControlPlan
 from retrim.physics import Command, State
+from retrim.physics.dynamics import f_a
 
 LOW, HIGH = np.array([0.0, -6.0, -6.0, -2.0]), np.array([30.0, 6.0, 6.0, 2.0])
 TOPICS = {"sample": 4096, "setpoint": 4096, "fallback": 4096, "order": 4096, "ended": 4096, "status": 65536,
-          "flight": 200_000, "parameters.policy": 300_000, "parameters.residual": 100_000}  # fmt: skip
+          "flight": 300_000, "parameters.policy": 300_000, "parameters.residual": 100_000}  # fmt: skip
 
 
 class Holds(AbstractController[Float[Array, ""]]):
@@ -41,12 +42,21 @@ def setup() -> Setup:
     return Setup.of(load("hover/retrim"))
 
 
-def plan(controller, *, folder=Path(), parent=0, window=50, delay_ticks=1, **limits) -> ControlPlan:
+def plan(controller, *, folder=Path(), parent=0, window=50, delay_ticks=1, seconds=1e9, **limits) -> ControlPlan:
     box = Limits(np.array([-3.0, -3.0, -0.3]), np.array([3.0, 3.0, 4.0]), **limits)
     return ControlPlan(
-        folder, controller, box, LOW, HIGH, DT, delay_ticks, window, 0.1, frozenset({0}), 20, parent
+        folder, controller, box, LOW, HIGH, DT, delay_ticks, window, 0.1, seconds, frozenset({0}), 20, parent
     )  # fmt: skip
 
 
-def holding(gains=(4.0, 3.5)):
-    return plain_source(setup(), Holds(jnp.array(gains)))
+def holding(gains=(4.0, 3.5), *, fitted=False):
+    """The controller as programs; ``fitted``: with a half that is fitted, which does nothing."""
+    if not fitted:
+        return plain_source(setup(), Holds(jnp.array(gains)))
+    arrays, fixed = eqx.partition(Holds(jnp.array(gains)), eqx.is_array)
+    parameters = {"policy": arrays, "residual": {"fit": jnp.array(0.0)}}
+
+    def predicted(parameters, inputs):
+        return f_a(*inputs, jnp.zeros(3)).v + 0.0 * parameters["residual"]["fit"]
+
+    return _source(setup(), lambda found: eqx.combine(found["policy"], fixed), predicted, parameters)

@@ -8,11 +8,13 @@ from jax import random
 
 from helpers import tiny_preset
 from live_helpers import DT, TOPICS
-from retrim.adapt.updates import PolicyUpdate, unpack_update
+from retrim.adapt.updates import PolicyUpdate, Rejection, pack_update, unpack_update
 from retrim.config.setup import Setup
 from retrim.io.trained import save_learnt
+from retrim.learn.bptt import PolicyState
 from retrim.live.controllers import adaptive_source
 from retrim.live.learner_process import LearnerLoop, LearnerPlan
+from retrim.live.published import slot
 from retrim.onboard.messages import COLUMNS, COMMAND, MEASURED, FlightRows, Parameters, pack_note
 from retrim.transport.in_process import InProcessBus
 
@@ -32,23 +34,23 @@ def start(tmp_path_factory):
 
 
 class Beside:
-    """A loop of each layer on one bus; rows of a vehicle that hovers under a push that it does not feel."""
+    """Loops of the layers on one bus; rows of a vehicle that hovers under a push that it does not feel."""
 
     def __init__(self, start, *layers):
         self.path, self.controller, self.state = start
-        room = {"update.residual": 5_000_000, "update.policy": 5_000_000, "parameters.residual": 2_000_000}
+        room = {f"update.{layer}.{i}": 5_000_000 for layer in ("residual", "policy") for i in (0, 1)}
+        room |= {"said.residual": 8192, "said.policy": 8192, "parameters.residual": 2_000_000}
         self.bus = InProcessBus(TOPICS | room)
-        self.loops = {layer: self.learner(layer) for layer in layers}
         self.tick, self.now = 0, 100.0
+        self.loops = {layer: self.learner(layer) for layer in layers}
 
     def learner(self, layer):
-        return LearnerLoop(
-            LearnerPlan(self.path.parent, layer, self.path, None, 3, self.controller.base, frozenset({0}), 0), self.bus
-        )
+        plan = LearnerPlan(self.path.parent, layer, self.path, None, 3, self.controller.base, 0)
+        return LearnerLoop(plan, self.bus, lambda: self.now)
 
     def fly(self, ticks=60):
         self.tick += ticks
-        self.now += ticks * DT
+        self.now += 100.0
         rows = np.zeros((ticks, len(COLUMNS)))
         rows[:, 0] = np.arange(self.tick - ticks, self.tick)
         rows[:, 1] = DT * rows[:, 0]
@@ -56,82 +58,152 @@ class Beside:
         rows[:, COMMAND] = np.array([10.3, 0.0, 0.0, 0.0]) + 0.01 * np.sin(rows[:, :1])
         self.bus.publish("flight", FlightRows(rows).pack())
 
-    def says(self, **status):
-        self.bus.publish("status", pack_note("status", **status))
+    def says(self, newest, given_up=()):
+        self.bus.publish("status", pack_note("status", newest={"policy": newest}, given_up=list(given_up)))
 
     def parameters(self, half, after=0):
         message = self.bus.latest(f"parameters.{half}")
         expected, base = self.controller.parameters[half], self.controller.base
         return Parameters.unpack(message.data, expected, half=half, base=base, after=after)
 
-    def update(self, layer):
-        return unpack_update(self.bus.latest(f"update.{layer}").data, self.state, source=layer)
+    def update(self, layer, version):
+        data = self.bus.latest(slot(layer, version)).data
+        assert int.from_bytes(data[:8], "little") == version
+        return unpack_update(data[8:], self.state, source=layer)
+
+
+def improving(loop, meanwhile=lambda: None):
+    """Let a loop learn a policy a little other than its last one, each time, at once."""
+
+    def learn(window):
+        meanwhile()
+        was = loop._worker._policy
+        nudged = jax.tree.map(lambda leaf: leaf + 0.01, was.policy.params)
+        state = PolicyState(was.policy.with_params(nudged), was.optimiser)
+        return PolicyUpdate(float(window.t[-1]), 1.0, 2.0, state)
+
+    loop._worker.learn = learn
+    return loop
 
 
 def weights(tree):
     return np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(eqx.filter(tree, eqx.is_array))])
 
 
+def base_of(loop):
+    """The policy that the next update starts from."""
+    return weights(loop._worker._policy.policy)
+
+
 def test_a_window_becomes_parameters_that_the_controller_takes(start):
     beside = Beside(start, "residual")
     loop = beside.loops["residual"]
-    assert not loop.step(beside.now)
+    assert not loop.step()
     beside.fly()
-    assert loop.step(beside.now)
+    assert loop.step()
     found = beside.parameters("residual")
-    assert (found.version, found.computed_from) == (1, pytest.approx(59 * DT))
-    assert not loop.step(beside.now)  # nothing new, and not time
+    assert (found.version, found.parent, found.computed_from) == (1, 0, pytest.approx(59 * DT))
+    assert not loop.step()  # nothing new
     beside.fly()
-    beside.now += 10.0
-    assert loop.step(beside.now)
+    beside.now -= 99.99
+    assert not loop.step()  # not time
+    beside.now += 99.99
+    assert loop.step()
     assert beside.parameters("residual", after=1).version == 2
 
 
 def test_a_policy_goes_on_from_what_is_flown(start):
     beside = Beside(start, "policy")
-    loop = beside.loops["policy"]
+    loop = improving(beside.loops["policy"])
     beside.fly()
-    assert loop.step(beside.now)
-    first = beside.update("policy")
-    assert isinstance(first, PolicyUpdate), first
+    assert loop.step()
+    first = beside.update("policy", 1)
+    assert isinstance(first, PolicyUpdate)
     beside.fly()
-    beside.now += 100.0
-    beside.says(versions={"policy": 1}, rolled_back=[0])
-    assert loop.step(beside.now)
-    np.testing.assert_array_equal(weights(loop._flown[-1][1].state.policy), weights(first.state.policy))
-    # The second one was taken back: the next starts from the first again.
-    beside.says(versions={"policy": 2}, rolled_back=[0])
-    loop.step(beside.now)
-    beside.says(versions={"policy": 1}, rolled_back=[0, 2])
-    loop.step(beside.now)
-    np.testing.assert_array_equal(weights(loop._worker._policy.policy), weights(first.state.policy))
+    beside.says(newest=1)
+    assert loop.step()
+    np.testing.assert_array_equal(base_of(loop), weights(first.state.policy))
+    assert beside.parameters("policy", after=1).parent == 1
+    # The second one was flown and taken back: the next starts from the first again.
+    beside.says(newest=2)
+    loop.step()
+    np.testing.assert_array_equal(base_of(loop), weights(beside.update("policy", 2).state.policy))
+    beside.fly()
+    beside.says(newest=2, given_up=[2])
+    assert loop.step()
+    np.testing.assert_array_equal(base_of(loop), weights(first.state.policy))
+    assert beside.parameters("policy", after=2).parent == 1
 
 
-def test_a_policy_that_nobody_flies_is_not_waited_for(start):
+def test_one_that_is_taken_back_at_once_is_not_gone_on_from(start):
     beside = Beside(start, "policy")
-    loop = beside.loops["policy"]
+    loop = improving(beside.loops["policy"])
     beside.fly()
-    assert loop.step(beside.now)
+    assert loop.step()
     beside.fly()
-    beside.says(versions={"policy": 0}, rolled_back=[0])
-    beside.now += 0.5
-    assert not loop.step(beside.now)
-    beside.now += 100.0
-    assert loop.step(beside.now)
-    np.testing.assert_array_equal(weights(loop._worker._policy.policy), weights(beside.state.policy.policy))
+    beside.says(newest=1, given_up=[1])
+    assert loop.step()
+    np.testing.assert_array_equal(base_of(loop), weights(beside.state.policy.policy))
 
 
-def test_one_that_was_started_again_goes_on_from_what_was_published(start):
+def test_what_was_learnt_from_a_policy_that_is_taken_back_meanwhile_is_dropped(start):
+    beside = Beside(start, "policy")
+    loop = improving(beside.loops["policy"])
+    beside.fly()
+    assert loop.step()
+    beside.fly()
+    beside.says(newest=1)
+    improving(loop, lambda: beside.says(newest=1, given_up=[1]))
+    assert loop.step()
+    assert beside.bus.latest("parameters.policy").version == 1
+    np.testing.assert_array_equal(base_of(loop), weights(beside.state.policy.policy))
+
+
+def test_an_update_that_takes_seconds_is_waited_for(start):
+    beside = Beside(start, "policy")
+    loop = improving(beside.loops["policy"])
+
+    def seconds():
+        beside.now += 5.0
+
+    improving(loop, seconds)
+    beside.fly()
+    beside.says(newest=0)
+    assert loop.step()
+    beside.now += 0.1
+    assert not loop.step()
+    beside.says(newest=1)
+    loop.step()
+    np.testing.assert_array_equal(base_of(loop), weights(beside.update("policy", 1).state.policy))
+
+
+def test_a_policy_that_nobody_takes_is_not_waited_for_for_ever(start):
+    beside = Beside(start, "policy")
+    loop = improving(beside.loops["policy"])
+    beside.fly()
+    assert loop.step()
+    beside.fly()
+    beside.says(newest=0)
+    assert loop.step()
+    np.testing.assert_array_equal(base_of(loop), weights(beside.state.policy.policy))
+
+
+def test_one_that_was_started_again_goes_on_from_what_is_flown(start):
     beside = Beside(start, "residual", "policy")
     beside.fly()
+    improving(beside.loops["policy"])
     for loop in beside.loops.values():
-        assert loop.step(beside.now)
+        assert loop.step()
+    beside.bus.publish("said.policy", pack_update(Rejection(1.0, "policy", "worse")))
+    beside.says(newest=0)
+    unflown = beside.learner("policy")
+    unflown.catch_up()
+    np.testing.assert_array_equal(base_of(unflown), weights(beside.state.policy.policy))
+    beside.says(newest=1)
     again = beside.learner("policy")
     again.catch_up()
-    np.testing.assert_array_equal(weights(again._worker._residual), weights(beside.update("residual").state))
-    np.testing.assert_array_equal(weights(again._worker._policy.policy), weights(beside.update("policy").state.policy))
+    np.testing.assert_array_equal(weights(again._worker._residual), weights(beside.update("residual", 1).state))
+    np.testing.assert_array_equal(base_of(again), weights(beside.update("policy", 1).state.policy))
     beside.fly()
-    beside.says(versions={"policy": 1}, rolled_back=[0])
-    beside.now += 100.0
-    assert again.step(beside.now)
-    assert beside.parameters("policy", after=1).version == 2
+    assert improving(again).step()
+    assert beside.parameters("policy", after=1).parent == 1

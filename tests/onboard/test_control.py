@@ -10,10 +10,10 @@ import pytest
 from jax import random
 
 from helpers import CheapModel
-from live_helpers import TOPICS, holding, plan, setup
+from live_helpers import TOPICS, Holds, holding, plan, setup
 from live_processes import DT, HOME, level, moved
 from retrim.adapt.learner import LearnerState
-from retrim.live.controllers import adaptive_source
+from retrim.live.controllers import adaptive_source, plain_source
 from retrim.onboard.control import ControlLoop
 from retrim.onboard.guard import Mode
 from retrim.onboard.messages import COLUMNS, COMMAND, FlightRows, Parameters, Sample, pack_note, unpack_note
@@ -47,10 +47,10 @@ class Flight:
             self.tick += 1
         return self.issued[-1]
 
-    def parameters(self, gains, version, base=None):
-        arrays = {"gains": np.array(gains)}
+    def parameters(self, gains, version, base=None, *, half="policy", parent=0):
+        arrays = {"gains": np.array(gains)} if half == "policy" else {"fit": np.array(gains)}
         base = self.loop.plan.controller.base if base is None else base
-        return Parameters("policy", version, base, self.tick * DT, arrays).pack()
+        return Parameters(half, version, base, self.tick * DT, arrays, parent).pack()
 
     @property
     def status(self):
@@ -79,9 +79,10 @@ def test_it_is_the_lockstep_flight_tick_for_tick():
             accepted = np.asarray(taken.vector())
     loop.idle()
     rows = FlightRows.unpack(bus.latest("flight").data).rows
-    np.testing.assert_allclose(rows[:, 3:6], log.p[:-1], atol=1e-9)
-    np.testing.assert_allclose(rows[:, COMMAND], log.u[1:], atol=1e-9)
-    np.testing.assert_allclose(rows[:, 1], log.t[:-1], atol=1e-12)
+    # A tick is reported when the next measurement says what the plant took.
+    np.testing.assert_allclose(rows[:, 3:6], log.p[:-2], atol=1e-9)
+    np.testing.assert_allclose(rows[:, COMMAND], log.u[1:-1], atol=1e-9)
+    np.testing.assert_allclose(rows[:, 1], log.t[:-2], atol=1e-12)
 
 
 def test_a_swap_changes_the_command_little_by_little():
@@ -133,7 +134,7 @@ def test_damaged_messages_and_random_bytes_are_never_taken(topic):
         "sample": Sample(999, 99.0, time.monotonic(), 0.0, level([9.0, 9.0, 9.0]), level(), np.zeros(4)).pack(),
         "order": pack_note("order", order="land"),
     }[topic]
-    for i in range(600):
+    for i in range(2000):
         if i % 2:
             data = bytearray(whole)
             for _ in range(rng.integers(1, 4)):
@@ -157,7 +158,7 @@ def test_a_policy_that_flies_clearly_worse_is_taken_back():
     flight.step(200)
     flight.bus.publish("parameters.policy", flight.parameters((-3.0, -1.0), 1))
     flight.step(120)
-    assert flight.status["rolled_back"] == [0, 1]
+    assert flight.status["given_up"] == [1]
     assert flight.loop.mode == Mode.POLICY
     flight.step(400)
     np.testing.assert_allclose(flight.x[:3], HOME + np.array([0.3 / 4.0, 0.0, 0.0]), atol=1e-3)
@@ -165,9 +166,91 @@ def test_a_policy_that_flies_clearly_worse_is_taken_back():
     flight.bus.publish("parameters.policy", flight.parameters((-3.0, -1.0), 1))
     flight.step()
     assert flight.status["refused"] == {"stale policy": 1}
-    flight.bus.publish("parameters.policy", flight.parameters((5.0, 4.0), 2))
+    assert flight.status["versions"] == {"policy": 0}
+    # One that was trained from it is not taken; another one is.
+    flight.bus.publish("parameters.policy", flight.parameters((5.0, 4.0), 2, parent=1))
+    flight.step()
+    assert flight.status["given_up"] == [1, 2]
+    flight.bus.publish("parameters.policy", flight.parameters((5.0, 4.0), 3))
     flight.step(10)
-    assert flight.status["versions"] == {"policy": 2}
+    assert flight.status["versions"] == {"policy": 3}
+
+
+def test_it_is_taken_back_while_fits_and_policies_keep_coming():
+    flight = Flight(holding(fitted=True), push=(0.3, 0.0, 0.0))
+    flight.step(200)
+    for i in range(1, 120):
+        if i % 10 == 1:
+            flight.bus.publish("parameters.residual", flight.parameters(0.1 * i, i, half="residual"))
+        if i % 25 == 1:
+            flight.bus.publish("parameters.policy", flight.parameters((-3.0, -1.0), i, parent=max(0, i - 25)))
+        flight.step()
+        if flight.status["given_up"]:
+            break
+    assert flight.status["versions"]["policy"] == 0
+    assert flight.status["versions"]["residual"] >= 11
+    flight.step(300)
+    assert flight.loop.mode == Mode.POLICY
+    np.testing.assert_allclose(flight.x[:3], HOME + np.array([0.3 / 4.0, 0.0, 0.0]), atol=1e-3)
+
+
+def test_a_second_swap_during_a_blend_does_not_jump():
+    flight = Flight(holding(), x=level(x=0.4))
+    flight.step(3)
+    before = flight.issued[-1]
+    for version, gains in ((1, (1.0, 1.0)), (2, (1.0, 1.0)), (3, (1.0, 1.0))):
+        flight.bus.publish("parameters.policy", flight.parameters(gains, version))
+        flight.loop.idle()
+        flight.step(2)
+    flight.step(8)
+    whole = np.abs(flight.issued[-1] - before).max()
+    assert np.abs(np.diff(flight.issued[2:], axis=0)).max() < 0.45 * whole
+
+
+def test_a_clipped_command_is_what_the_controller_remembers():
+    class Remembers(Holds):
+        def init(self, x):
+            return jnp.zeros_like(x.p)
+
+        def __call__(self, memory, t, x):
+            return Command(jnp.full_like(x.p[0], 99.0), jnp.zeros_like(x.p)), jnp.full_like(x.p, 99.0)
+
+        def accepted(self, memory, u):
+            return jnp.full_like(memory, 1.0) * u.c
+
+    flight = Flight(plain_source(setup(), Remembers()))
+    flight.step()
+    assert flight.issued[-1][0] == 30.0
+    np.testing.assert_array_equal(flight.loop.pilot._memory[0], 30.0)
+
+
+def test_after_a_silence_the_policy_does_not_fly_on():
+    flight = Flight(holding())
+    flight.step(20)
+    flight.tick += 10
+    flight.step(1)
+    assert flight.loop.mode == Mode.HOLD
+    assert flight.status["missed"] == 10
+    assert flight.status["reason"] == "10 measurements were not answered"
+
+
+def test_a_missed_tick_is_counted_and_gets_no_row_of_another():
+    flight = Flight(holding(), x=level(x=0.4))
+    flight.step(10)
+    flight.tick += 2
+    flight.accepted = flight.accepted + np.eye(4)[0]
+    flight.step(3)
+    rows = FlightRows.unpack(flight.bus.latest("flight").data).rows
+    assert flight.status["missed"] == 2
+    np.testing.assert_array_equal(rows[:, 0], [*range(10), 12, 13])
+    np.testing.assert_allclose(rows[9, COMMAND], flight.issued[9], atol=1e-12)
+
+
+def test_it_lands_by_itself_after_its_time():
+    flight = Flight(holding(), seconds=1.0)
+    flight.step(52)
+    assert flight.loop.mode != Mode.POLICY
+    assert flight.status["reason"] == "landing"
 
 
 def test_a_world_that_changes_after_a_swap_is_not_the_policys_fault():
@@ -178,7 +261,7 @@ def test_a_world_that_changes_after_a_swap_is_not_the_policys_fault():
     flight.push = (3.0, 0.0, 0.0)
     flight.step(150)
     assert np.linalg.norm(flight.x[:3] - HOME) > 0.5
-    assert flight.status["rolled_back"] == [0]
+    assert flight.status["given_up"] == []
 
 
 @pytest.mark.parametrize(
@@ -233,8 +316,8 @@ def test_the_report_has_the_last_ticks_and_what_the_plant_accepted():
     flight.step(20)
     rows = FlightRows.unpack(flight.bus.latest("flight").data).rows
     assert rows.shape == (30, len(COLUMNS))
-    np.testing.assert_array_equal(rows[:, 0], np.arange(10, 40))
-    assert rows[9, COMMAND][0] == pytest.approx(flight.issued[19][0] + 0.5)
+    np.testing.assert_array_equal(rows[:, 0], np.arange(9, 39))
+    assert rows[10, COMMAND][0] == pytest.approx(flight.issued[19][0] + 0.5)
 
 
 def test_land_is_an_order():
@@ -261,4 +344,5 @@ def test_parameters_of_a_learner_become_those_of_the_controller():
     flight.step(7)
     fresh = Flight(b, x=flight.x)
     assert flight.status["versions"]["policy"] == 1
-    assert np.abs(flight.step() - fresh.step()).max() < 0.1
+    np.testing.assert_array_equal(flight.loop.pilot._parameters["policy"][0], fresh.loop.pilot._parameters["policy"][0])
+    np.testing.assert_allclose(flight.step(), fresh.step(), atol=0.02)

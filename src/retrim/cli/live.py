@@ -23,7 +23,8 @@ from ..experiments.training import train
 from ..live.events import LiveEvents
 from ..live.report import complaints, flight_of, histograms, learnt_in, results
 from ..live.session import LEARNING, LiveRequest, live_spec
-from ..live.supervisor import Status, Supervisor
+from ..live.status import Status
+from ..live.supervisor import Supervisor
 from ..live.watching import watched
 from ..runtime.events import Event
 from .console import RichReporter, console, show_paths, show_table, started
@@ -122,10 +123,10 @@ def _fly(request: LiveRequest, run: Run) -> int:
                 console.print(f"{role}: no {what}", markup=False, soft_wrap=True)
         with Live(console=console, auto_refresh=False) as screen:
             status = watched(supervisor, request.seconds, events, _shown_on(screen, events), run.stop)
-        learnt = learnt_in(request, supervisor.bus) if request.method in LEARNING else None
+        learnt = learnt_in(request, supervisor.bus, status) if request.method in LEARNING else None
     console.print(f"flight over: {status.ended}", markup=False, soft_wrap=True)
     flight, rows = flight_of(request, events.all, status, learnt)
-    found = results(request, flight, rows, status)
+    found = results(request, flight, rows, status, events)
     run.write_results(
         found, seeds=[request.seed], preset=request.setup.preset.name, seconds=float(flight.log.t[-1]),
         ended=status.ended, scheduling=supervisor.refused, histograms_ms=histograms(rows),
@@ -176,6 +177,8 @@ def _screen(status: Status, events: LiveEvents) -> Table:
     for half, version in control.get("versions", {}).items():
         table.add_row(f"{half} swaps", str(version))
     table.add_row("missed ticks", str(control.get("missed", 0)))
+    if refused := control.get("refused"):
+        table.add_row("refused messages", ", ".join(f"{what}: {n}" for what, n in refused.items()))
     table.add_row("late samples, held commands", f"{status.world.get('late', 0)}, {status.world.get('held', 0)}")
     table.add_row("processes", ", ".join(role if alive else f"{role} (dead)" for role, alive in status.alive.items()))
     if events.all:

@@ -1,9 +1,10 @@
 """The process of one layer of learning: windows of flight come in, parameters go out."""
 
-import os
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +13,7 @@ from jax import random
 
 from ..adapt.buffer import RollingBuffer
 from ..adapt.learner import LearnerState
-from ..adapt.updates import Layer, PolicyUpdate, ResidualUpdate, Update, pack_update, unpack_update
+from ..adapt.updates import Layer, PolicyUpdate, ResidualUpdate, Update, pack_update
 from ..adapt.workers import PolicyWorker, ResidualWorker, Worker
 from ..config.setup import Setup
 from ..errors import MessageError
@@ -25,9 +26,11 @@ from ..transport import wire
 from ..transport.bus import Bus
 from ..transport.shared_memory import SharedMemoryBus
 from .controllers import flown
+from .published import flown_update, keep, newest_update
 
 CHECK_EVERY = 0.005  # [s]
-VERDICT = 1.0  # [s] that a policy waits to be flown; after it, it counts as lost
+VERDICT = 1.0  # [s] that a policy waits to be taken or refused; after it, it counts as lost
+REMEMBERED = 8  # policies that were flown
 
 
 @dataclass(frozen=True)
@@ -42,21 +45,20 @@ class LearnerPlan:
     seed: int
     base: str
     """Hash of the controller that flies."""
-    cores: frozenset[int]
     parent: int
 
 
 class LearnerLoop:
-    """One layer beside the flight. :meth:`step` is the whole of it, so that a test needs no clock."""
+    """One layer beside the flight. :meth:`step` is the whole of it; a test gives it a clock."""
 
-    def __init__(self, plan: LearnerPlan, bus: Bus) -> None:
+    def __init__(self, plan: LearnerPlan, bus: Bus, clock: Callable[[], float] = time.monotonic) -> None:
         state, preset = load_learnt(plan.start)
-        self.plan, self.bus, self.state = plan, bus, state
+        self.plan, self.bus, self.state, self._clock = plan, bus, state, clock
         self.setup = Setup.of(preset, plan.reference)
         self.every = preset.adapt.fit_every if plan.layer == "residual" else preset.adapt.update_every
         self._buffer = RollingBuffer(preset.adapt.window)
         self._worker = self._new_worker()
-        self._last_tick, self._new_ticks, self._began = -1, 0, 0.0
+        self._last_tick, self._new_ticks, self._began = -1, 0, float("-inf")
         self._known: dict[str, int] = {}
         self._pending: tuple[int, PolicyUpdate, float] | None = None
         self._flown: list[tuple[int, Update]] = []
@@ -75,22 +77,28 @@ class LearnerLoop:
         self._worker = self._new_worker()
 
     def catch_up(self) -> None:
-        """Go on from what an earlier process of this layer published last."""
-        for layer in ("residual", "policy"):
-            self._take(layer)
+        """Go on from what an earlier process of this layer published and control flies."""
+        self._take_residual()
+        if (
+            self.plan.layer == "policy"
+            and (found := flown_update(self.bus, self.state, "policy", self._status())) is not None
+        ):
+            self._flown = [found]
+            self._worker.receive(found[1])
 
-    def step(self, now: float) -> bool:
+    def step(self) -> bool:
         """Take what is new and learn if it is time; return whether something was learnt."""
         self._look()
         if self.plan.layer == "policy":
-            self._take("residual")
-            self._judge(now)
-        if self._pending is not None or len(self._buffer) < 2 or now - self._began < self.every:
+            self._take_residual()
+            self._judge()
+        if self._pending is not None or not self._new_ticks or self._clock() - self._began < self.every:
             return False
-        if self._new_ticks == 0:
-            return False
-        self._began, self._new_ticks = now, 0
-        self._publish(self._worker.learn(self._buffer.window()), now)
+        self._began, self._new_ticks = self._clock(), 0
+        update = self._worker.learn(self._buffer.window())
+        if self.plan.layer == "policy" and self._judge():
+            return True  # the policy that it was trained from was taken back meanwhile
+        self._publish(update)
         return True
 
     def _look(self) -> None:
@@ -109,19 +117,21 @@ class LearnerLoop:
             self._buffer.push(float(row[1]), state, Command(jnp.asarray(u[0]), jnp.asarray(u[1:])), float(row[2]))
             self._last_tick, self._new_ticks = int(row[0]), self._new_ticks + 1
 
-    def _publish(self, update: Update, now: float) -> None:
+    def _publish(self, update: Update) -> None:
         layer = self.plan.layer
-        self.bus.publish(f"update.{layer}", pack_update(update))
         if not isinstance(update, ResidualUpdate | PolicyUpdate):
+            self.bus.publish(f"said.{layer}", pack_update(update))
             return
         topic = f"parameters.{layer}"
         before = self.bus.latest(topic)
-        version = 1 if before is None else before.version + 1
+        version, parent = (1 if before is None else before.version + 1), (self._flown[-1][0] if self._flown else 0)
         whole = self._learnt_by(update)
         arrays = wire.names(flown(whole.policy.policy.merged(), whole.residual)[layer])
-        self.bus.publish(topic, Parameters(layer, version, self.plan.base, update.computed_from, arrays).pack())
+        keep(self.bus, layer, version, update)
+        found = Parameters(layer, version, self.plan.base, update.computed_from, arrays, parent)
+        self.bus.publish(topic, found.pack())
         if isinstance(update, PolicyUpdate):
-            self._pending = version, update, now
+            self._pending = version, update, self._clock()
         else:
             self._worker.receive(update)
 
@@ -131,38 +141,40 @@ class LearnerLoop:
         assert isinstance(update, ResidualUpdate)
         return LearnerState(self.state.policy, update.state)
 
-    def _judge(self, now: float) -> None:
-        """Go on from a policy once it is flown, and from the one before if it was taken back."""
-        message = self.bus.latest("status")
-        if message is None:
-            return
-        try:
-            status = unpack_note(message.data, "status")
-        except MessageError:
-            return
-        taken_back = status.get("rolled_back", [])
-        while self._flown and self._flown[-1][0] in taken_back:
+    def _judge(self) -> bool:
+        """Go on from a policy once it is flown, and from the last that still is; return whether one was taken back."""
+        status = self._status()
+        given_up, back = status.get("given_up", []), False
+        while self._flown and self._flown[-1][0] in given_up:
             self._flown.pop()
+            back = True
+        if back:
             self._worker.receive(self._flown[-1][1] if self._flown else _start(self.state))
         if self._pending is None:
-            return
+            return back
         version, update, published = self._pending
-        if status.get("versions", {}).get("policy", 0) >= version:
+        if version in given_up:
+            self._pending = None
+        elif status.get("newest", {}).get("policy", 0) >= version:
             self._worker.receive(update)
-            self._flown = [*self._flown[-3:], (version, update)]
-            self._pending = None
-        elif now - published > VERDICT:
-            self._pending = None
+            self._flown, self._pending = [*self._flown[-REMEMBERED:], (version, update)], None
+        elif self._clock() - published > VERDICT:
+            self._pending = None  # it was damaged on the way, or nobody takes policies any more
+        return back
 
-    def _take(self, layer: str) -> None:
-        """Take note of the newest update of a layer, if it is new."""
-        data = self._fresh(f"update.{layer}")
-        if data is None:
-            return
+    def _status(self) -> dict[str, Any]:
+        message = self.bus.latest("status")
         try:
-            self._worker.receive(unpack_update(data, self.state, source=f"update.{layer}"))
+            return {} if message is None else unpack_note(message.data, "status")
         except MessageError:
-            return
+            return {}
+
+    def _take_residual(self) -> None:
+        """Take note of the newest fit, if it is new."""
+        found = newest_update(self.bus, self.state, "residual", after=self._known.get("fit", 0))
+        if found is not None:
+            self._known["fit"] = found[0]
+            self._worker.receive(found[1])
 
     def _fresh(self, topic: str) -> bytes | None:
         message = self.bus.latest(topic, self._known.get(topic, 0))
@@ -178,8 +190,6 @@ def _start(state: LearnerState) -> PolicyUpdate:
 
 def learn(plan: LearnerPlan) -> None:
     """Learn until the flight is over: the main function of the process."""
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, set(plan.cores))
     enable_compile_cache()
     bus, parent = SharedMemoryBus(plan.folder), Lifeline(plan.parent)
     loop = LearnerLoop(plan, bus)
@@ -187,5 +197,5 @@ def learn(plan: LearnerPlan) -> None:
     loop.catch_up()
     bus.publish(f"ready.{plan.layer}", pack_note("ready", device=jax.devices()[0].platform))
     while not parent.gone() and bus.latest("ended") is None:
-        if not loop.step(time.monotonic()):
+        if not loop.step():
             time.sleep(CHECK_EVERY)

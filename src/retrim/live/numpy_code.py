@@ -97,7 +97,10 @@ class _Writer:
 
     def _write(self, eqn: Any, operands: list[Ref]) -> list[Ref]:
         names, kind = [name for name, _ in operands], max((kind for _, kind in operands), default=CONSTANT)
-        text = EXPRESSIONS[eqn.primitive.name](eqn, *names)
+        try:
+            text = EXPRESSIONS[eqn.primitive.name](eqn, *names)
+        except NotImplementedError as error:
+            raise ConfigError(f"{error}: it has no NumPy form, so this controller cannot fly live") from error
         many = eqn.primitive.multiple_results
         if text in names:  # nothing happens to it
             return [operands[names.index(text)]]

@@ -1,6 +1,5 @@
 """The process of a simulated plant: it keeps wall-clock time, as a vehicle does."""
 
-import os
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,11 +16,12 @@ from ..onboard.messages import Sample, Setpoint, pack_note
 from ..onboard.orders import wait_for_take_off
 from ..onboard.realtime import Lifeline, be_punctual, sleep_until
 from ..physics.state import Command, State
-from ..plants.plant import Measurement
+from ..plants.plant import Measurement, Plant
 from ..transport.bus import Bus
 from ..transport.shared_memory import SharedMemoryBus
 
 SHARE = 0.6  # of a tick, for which a command is waited for; the rest is for the simulation
+ALONE = 5.0  # [s] without a command, after which a plant without a supervisor ends
 GROUND = -0.5  # [m]; below it a vehicle has crashed
 
 
@@ -45,8 +45,6 @@ class PlantPlan:
 def simulate(plan: PlantPlan) -> None:
     """Fly until the vehicle has landed: the main function of the process."""
     jax.config.update("jax_cpu_enable_async_dispatch", False)  # a tick is computed here and now, by no pool of threads
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, set(plan.cores))
     enable_compile_cache()
     bus, parent = SharedMemoryBus(plan.folder), Lifeline(plan.parent)
     x0 = State(*map(jnp.asarray, _parts(plan.x0)))
@@ -62,15 +60,15 @@ def simulate(plan: PlantPlan) -> None:
             epoch = wait_for_take_off(bus, parent)
             if epoch is None:
                 return
-            reason = _flown(plan, plant, bus, measurement, epoch)
+            reason = _flown(plan, plant, bus, parent, measurement, epoch)
     except PlantError as error:
         reason = f"plant lost: {error}"
     bus.publish("ended", pack_note("ended", reason=reason))
 
 
-def _flown(plan: PlantPlan, plant: Any, bus: Bus, measurement: Measurement, epoch: float) -> str:
+def _flown(plan: PlantPlan, plant: Plant, bus: Bus, parent: Lifeline, measurement: Measurement, epoch: float) -> str:
     """Fly, and return why the flight ended."""
-    tick, late, held = 0, 0, 0
+    tick, late, held, unanswered = 0, 0, 0, 0
     u = accepted = np.asarray(Command.hover().vector(), dtype=float)
     while True:
         sleep_until(epoch + tick * plan.dt)
@@ -82,8 +80,11 @@ def _flown(plan: PlantPlan, plant: Any, bus: Bus, measurement: Measurement, epoc
         if not np.isfinite(sample.truth).all() or sample.truth[2] < GROUND:
             return "crashed"
         setpoint = _answer(bus, tick, epoch + (tick + SHARE) * plan.dt)
+        unanswered = 0 if setpoint is not None else unanswered + 1
         if setpoint is None:
             held += 1  # a vehicle goes on with the last one, too
+            if unanswered * plan.dt > ALONE and parent.gone():
+                return "nobody commands, and the supervisor is gone"
         elif setpoint.landed:
             return "landed"
         else:

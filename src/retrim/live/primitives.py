@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.lax import GatherScatterMode
+from jax.lax import GatherScatterMode, RoundingMethod
 
 Expression = Callable[..., str]
 
@@ -96,15 +96,34 @@ def _power(eqn: Any, x: str) -> str:
 
 def _gather(eqn: Any, x: str, at: str) -> str:
     d, fill = eqn.params["dimension_numbers"], GatherScatterMode.FILL_OR_DROP
+    if d.operand_batching_dims:
+        raise NotImplementedError("gather with batches")
     axes = (d.offset_dims, d.collapsed_slice_dims, d.start_index_map, eqn.params["slice_sizes"])
     mode = GatherScatterMode.from_any(eqn.params["mode"])
     return f"lax.gather({x}, {at}, {', '.join(str(tuple(each)) for each in axes)}, fill={mode == fill})"
 
 
 def _scatter(eqn: Any, x: str, at: str, updates: str) -> str:
-    d = eqn.params["dimension_numbers"]
+    d, mode = eqn.params["dimension_numbers"], GatherScatterMode.from_any(eqn.params["mode"])
+    if d.operand_batching_dims or mode == GatherScatterMode.CLIP:
+        raise NotImplementedError("scatter with batches or clipped indices")
     axes = f"{tuple(d.update_window_dims)}, {tuple(d.inserted_window_dims)}, {tuple(d.scatter_dims_to_operand_dims)}"
     return f"lax.scatter({x}, {at}, {updates}, {axes})"
+
+
+def _round(eqn: Any, x: str) -> str:
+    if eqn.params["rounding_method"] != RoundingMethod.TO_NEAREST_EVEN:
+        raise NotImplementedError("rounding away from zero")
+    return f"np.round({x})"
+
+
+def _cumsum(eqn: Any, x: str) -> str:
+    axis = eqn.params["axis"]
+    return (
+        f"np.flip(np.cumsum(np.flip({x}, {axis}), {axis}), {axis})"
+        if eqn.params["reverse"]
+        else f"np.cumsum({x}, {axis})"
+    )
 
 
 def _split(eqn: Any, x: str) -> str:
@@ -146,7 +165,7 @@ EXPRESSIONS: dict[str, Expression] = {
     "neg": lambda eqn, x: f"-{x}",
     "rsqrt": lambda eqn, x: f"1 / np.sqrt({x})",
     "logistic": _call("lax.logistic"),
-    "round": lambda eqn, x: f"np.round({x})",
+    "round": _round,
     "div": _div,
     "integer_pow": _power,
     "clamp": lambda eqn, low, x, high: f"np.minimum(np.maximum({x}, {low}), {high})",
@@ -165,7 +184,7 @@ EXPRESSIONS: dict[str, Expression] = {
     "tile": lambda eqn, x: f"np.tile({x}, {tuple(eqn.params['reps'])})",
     "pad": _pad,
     "iota": _iota,
-    "cumsum": lambda eqn, x: f"np.cumsum({x}, axis={eqn.params['axis']})",
+    "cumsum": _cumsum,
     "argmin": _index("np.argmin"),
     "argmax": _index("np.argmax"),
     "erf_inv": _call("lax.erf_inv"),

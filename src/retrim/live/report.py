@@ -7,23 +7,23 @@ from typing import Any
 import numpy as np
 
 from ..adapt.learner import LearnerState
-from ..adapt.updates import PolicyUpdate, ResidualUpdate, unpack_update
-from ..errors import MessageError, PlantError
+from ..adapt.updates import PolicyUpdate, ResidualUpdate
+from ..errors import PlantError
 from ..experiments.flights import Flight
 from ..experiments.flying import scored, until_terminated
 from ..experiments.recovery import change_times, recoveries
 from ..io.trained import load_learnt
 from ..onboard.accounts import EDGES_MS, summary
-from ..onboard.guard import Mode
-from ..onboard.messages import COMMAND, MEASURED, TRUE
+from ..onboard.guard import HOVER, Mode
+from ..onboard.messages import ACCOUNTS, COMMAND, MEASURED, TRUE
 from ..onboard.recorder import read_log
 from ..runtime.events import Event
 from ..runtime.flight import Log, States
 from ..transport.bus import Bus
+from .events import LiveEvents
+from .published import flown_update
 from .session import LAYERS, LiveRequest
-from .supervisor import Status
-
-HOVER = np.array([9.81, 0.0, 0.0, 0.0])
+from .status import Status
 
 
 def flight_of(
@@ -62,39 +62,41 @@ def flight_of(
     return scored(request.setup, request.flight, until_terminated(request.setup.flown, log), learnt), rows
 
 
-def results(request: LiveRequest, flight: Flight, rows: np.ndarray, status: Status) -> list[dict[str, Any]]:
-    """Return the rows of ``results.json``.
+def results(
+    request: LiveRequest, flight: Flight, rows: np.ndarray, status: Status, events: LiveEvents
+) -> list[dict[str, Any]]:
+    """Return the rows of ``results.json``; nothing of the landing counts.
 
     Args:
         request: What was flown.
         flight: How.
         rows: All of its log, the landing too.
         status: The last one.
+        events: What happened.
     """
     scenario, log = request.scenario, flight.log
-    home = request.setup.flown.home()
-    changes = change_times(scenario.disturbance, home, request.seconds)
+    end = float(log.t[-1])
+    changes = change_times(scenario.disturbance, request.setup.flown.home(), end)
     back = recoveries(log.t, flight.error, changes, 0.05, terminated=log.terminated)
-    late, step = summary(rows[:, -3]), summary(rows[:, -2])
-    policies = [swap for swap in status.control.get("swaps", []) if swap[1] == "policy"]
+    flown = rows[rows[:, 1] <= end]
+    by = {name: summary(flown[flown[:, -1] != Mode.WATCHDOG, column]) for name, column in ACCOUNTS.items()}
+    policies = [swap for swap in events.swaps if swap[1] == "policy" and swap[0] <= end]
+    given_up = status.control.get("given_up", [])
     values = {
         "missed_ticks": status.control.get("missed"),
-        "lateness_p50_ms": late["p50"],
-        "lateness_p99_ms": late["p99"],
-        "lateness_max_ms": late["max"],
-        "step_p50_ms": step["p50"],
-        "step_p99_ms": step["p99"],
-        "step_max_ms": step["max"],
+        **{f"{name}_{q}_ms": by[name][q] for name in ("lateness", "step", "idle") for q in ("p50", "p99", "max")},
+        "state_age_p99_ms": by["state_age"]["p99"],
+        "policy_age_p50_s": None if by["policy_age"]["p50"] is None else 1e-3 * by["policy_age"]["p50"],
         "steady": None if log.terminated else flight.steady,
         "recovery_5cm": float(np.mean(back)),
-        "policies": status.control.get("versions", {}).get("policy", 0),
+        "policies": len(policies),
         "flight_to_swap_s": float(np.median([swap[3] for swap in policies])) if policies else None,
         "samples_late": status.world.get("late"),
         "commands_held": status.world.get("held"),
         "restarts": sum(status.restarts.values()),
         "refused_messages": sum(status.control.get("refused", {}).values()),
-        "rollbacks": len(status.control.get("rolled_back", [0])) - 1,
-        "fallback_ticks": int(np.sum(rows[rows[:, 1] < request.seconds, -1] != Mode.POLICY)),
+        "taken_back": len(given_up),
+        "fallback_ticks": int(np.sum(flown[:, -1] != Mode.POLICY)),
     }
     about = {"scenario": scenario.disturbance, "method": request.method, "plant": scenario.plant, "n": 1,
              "crashes": int(log.terminated)}  # fmt: skip
@@ -103,10 +105,9 @@ def results(request: LiveRequest, flight: Flight, rows: np.ndarray, status: Stat
 
 def histograms(rows: np.ndarray) -> dict[str, Any]:
     """Return how late steps began and how long they took, as histograms [ms]."""
-    return {
-        "edges_ms": list(EDGES_MS),
-        "lateness": summary(rows[:, -3])["histogram"],
-        "step": summary(rows[:, -2])["histogram"],
+    flown = rows[rows[:, -1] != Mode.WATCHDOG]
+    return {"edges_ms": list(EDGES_MS)} | {
+        name: summary(flown[:, ACCOUNTS[name]])["histogram"] for name in ("lateness", "step", "idle")
     }
 
 
@@ -118,21 +119,15 @@ def _finite(value: Any) -> Any:
     return None if value is None or not np.isfinite(value) else value
 
 
-def learnt_in(request: LiveRequest, bus: Bus) -> LearnerState | None:
-    """Return what the learners published last; None if nothing was learnt, or what they said cannot be used."""
+def learnt_in(request: LiveRequest, bus: Bus, status: Status) -> LearnerState | None:
+    """Return what was learnt and flown last; None if nothing was."""
     state = load_learnt(request.folder / "start.safetensors")[0]
-    found = False
-    for layer in LAYERS:
-        message = bus.latest(f"update.{layer}")
-        try:
-            update = None if message is None else unpack_update(message.data, state, source=layer)
-        except MessageError:
-            continue
-        if isinstance(update, ResidualUpdate):
-            state, found = LearnerState(state.policy, update.state), True
-        elif isinstance(update, PolicyUpdate):
-            state, found = LearnerState(update.state, state.residual), True
-    return state if found else None
+    fit, policy = (flown_update(bus, state, layer, status.control) for layer in LAYERS)
+    if fit is not None and isinstance(fit[1], ResidualUpdate):
+        state = LearnerState(state.policy, fit[1].state)
+    if policy is not None and isinstance(policy[1], PolicyUpdate):
+        state = LearnerState(policy[1].state, state.residual)
+    return None if fit is None and policy is None else state
 
 
 def complaints(folder: Path) -> list[Path]:

@@ -18,6 +18,7 @@ from ..errors import ConfigError
 from ..experiments.flights import FlightSpec
 from ..io.trained import save_learnt
 from ..onboard.guard import Limits
+from ..onboard.messages import MOST_TICKS
 from ..runtime.pilot import ControllerPilot
 from .controllers import adaptive_source, plain_source
 from .spec import LiveSpec
@@ -59,6 +60,9 @@ def live_spec(request: LiveRequest) -> LiveSpec:
         ConfigError: The method cannot be flown live.
     """
     setup, preset = request.setup, request.setup.preset
+    window = max(preset.adapt.window, round(3.0 / preset.dt))
+    if window > MOST_TICKS:
+        raise ConfigError(f"adapt.window = {window} ticks: a live flight reports at most {MOST_TICKS}")
     k_residual = random.split(request.flight.key())[0]
     start = request.folder / "start.safetensors"
     if request.method in LEARNING:
@@ -88,7 +92,8 @@ def live_spec(request: LiveRequest) -> LiveSpec:
         high=np.asarray(vehicle.command_max.vector(), dtype=float),
         dt=preset.dt,
         delay_ticks=preset.plant_delay_ticks,
-        window=max(preset.adapt.window, round(3.0 / preset.dt)),
+        window=window,
+        seconds=request.seconds,
         seed=request.flight.plant_seed,
         folder=request.folder,
     )

@@ -44,6 +44,8 @@ class LiveSpec:
     dt: float
     delay_ticks: int
     window: int
+    seconds: float
+    """After which the vehicle lands [s]."""
     seed: int
     folder: Path
     """Where the log goes, and what the processes write to their standard outputs."""

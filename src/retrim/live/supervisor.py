@@ -1,6 +1,7 @@
 """Starts the processes of a live flight, arms it when all are ready, brings back those that die, and ends it."""
 
 import contextlib
+import json
 import os
 import time
 from collections.abc import Iterator
@@ -10,34 +11,25 @@ from typing import Any
 
 from ..adapt.updates import Layer
 from ..errors import MessageError, PlantError
-from ..onboard.control import ControlPlan
 from ..onboard.launch import launch
 from ..onboard.messages import COLUMNS, pack_note, unpack_note
+from ..onboard.plan import ControlPlan
 from ..onboard.realtime import cores_of
 from ..onboard.recorder import RecorderPlan
 from ..onboard.watchdog import WatchdogPlan
+from ..transport.message import describe
 from ..transport.shared_memory import SharedMemoryBus
 from .learner_process import LearnerPlan
 from .plant_process import PlantPlan
+from .published import SLOTS, slot
 from .spec import LiveSpec
+from .status import Status
 
+LANDING = 60.0  # [s], after which processes are ended wherever the vehicle is
+ATTEMPTS = 5  # to bring a process back
 READY_S = 300.0  # [s], compiling included
 RESTARTED = ("residual", "policy", "watchdog", "recorder")
 PRIORITIES = {"control": 30, "watchdog": 40, "plant": 20}
-
-
-@dataclass
-class Status:
-    """A flight as the supervisor sees it."""
-
-    t: float
-    """Time since take-off [s]."""
-    control: dict[str, Any]
-    world: dict[str, Any]
-    alive: dict[str, bool]
-    restarts: dict[str, int]
-    ended: str | None
-    """Why the flight is over; None while it is not."""
 
 
 @dataclass
@@ -50,7 +42,8 @@ class Supervisor:
     refused: dict[str, list[str]] = field(default_factory=dict)
     """What the operating system refused to which process."""
     epoch: float | None = None
-    _landing: float | None = None
+    _landing: bool = False
+    _said: dict[str, int] = field(default_factory=dict)
 
     def __enter__(self) -> "Supervisor":
         """Make the bus."""
@@ -60,17 +53,28 @@ class Supervisor:
         rows = 8 * len(COLUMNS) * self.spec.window + 10_000
         roles = ("control", "plant", "watchdog", "recorder", "residual", "policy")
         learnt = self.spec.start.stat().st_size + 200_000
+        self._cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else None
+        if self._cores:
+            os.sched_setaffinity(0, cores_of("learn"))
         self.bus = SharedMemoryBus.create(
             {"sample": 4096, "setpoint": 4096, "fallback": 4096, "order": 4096, "ended": 4096, "world": 4096}
             | {"status": 65536, "flight": rows}
             | {f"ready.{role}": 8192 for role in roles}
             | {f"parameters.{name}": size + 100_000 for name, size in half.items()}
-            | {"update.residual": learnt, "update.policy": learnt}
+            | {slot(layer, i): learnt for layer in ("residual", "policy") for i in range(SLOTS)}
+            | {"said.residual": 8192, "said.policy": 8192}
         )
         return self
 
     def __exit__(self, *_: object) -> None:
-        """End what still runs, and take the bus away."""
+        """Land what still flies, end what still runs, and take the bus away."""
+        if self.epoch is not None and self._alive("plant") and not self._note("ended"):
+            self.land()
+            until = time.monotonic() + LANDING
+            while self._alive("plant") and not self._note("ended") and time.monotonic() < until:
+                time.sleep(0.05)
+        if self._cores:
+            os.sched_setaffinity(0, self._cores)
         for process in self.processes.values():
             if process.poll() is None:
                 process.terminate()
@@ -94,27 +98,30 @@ class Supervisor:
         self._start("watchdog")
         self._start("recorder")
         while waiting := [role for role in self.processes if self.bus.latest(f"ready.{role}") is None]:
-            for role in waiting:
-                if self.processes[role].poll() is not None:
-                    raise PlantError(f"the {role} process ended before take-off: {self._last_words(role)}")
+            self._check_alive()
             if time.monotonic() - began > READY_S:
                 raise PlantError(f"not ready after {READY_S:g} s: {', '.join(waiting)}; nothing has flown")
             yield ", ".join(waiting), time.monotonic() - began
             time.sleep(0.1)
+        if failed := self._note("ready.recorder", "ready").get("failed"):
+            raise PlantError(f"the flight cannot be written down: {failed}")
         for role in ("control", "plant", "watchdog"):
-            message = self.bus.latest(f"ready.{role}")
-            assert message is not None
-            self.refused[role] = unpack_note(message.data, "ready").get("refused", [])
+            self.refused[role] = self._note(f"ready.{role}", "ready").get("refused", [])
 
     def take_off(self) -> None:
-        """Give the order; the first tick is half a second away, the same for all."""
+        """Give the order; the first tick is half a second away, the same for all.
+
+        Raises:
+            PlantError: A process has ended since it was ready.
+        """
+        self._check_alive()
         self.epoch = time.monotonic() + 0.5
         self.bus.publish("order", pack_note("order", epoch=self.epoch))
 
     def land(self) -> None:
         """Give the order to land, once."""
-        if self._landing is None:
-            self._landing = time.monotonic()
+        if not self._landing:
+            self._landing = True
             self.bus.publish("order", pack_note("order", epoch=self.epoch, order="land"))
 
     def watch(self) -> Status:
@@ -122,14 +129,18 @@ class Supervisor:
         assert self.epoch is not None
         ended = self._note("ended").get("reason")
         for role, process in self.processes.items():
-            if role in RESTARTED and process.poll() is not None and ended is None and not self._over(role):
+            again = role in RESTARTED and process.poll() is not None and ended is None and not self._over(role)
+            if again and self.restarts.get(role, 0) < ATTEMPTS:
                 self.restarts[role] = self.restarts.get(role, 0) + 1
-                self._start(role)
+                with contextlib.suppress(OSError):  # the flight goes on without it
+                    self._start(role)
         if ended is None and self.processes["plant"].poll() is not None:
             ended = f"the plant process is gone: {self._last_words('plant')}"
         alive = {role: process.poll() is None for role, process in self.processes.items()}
         control, world = self._note("status"), self._note("world")
-        return Status(time.monotonic() - self.epoch, control, world, alive, dict(self.restarts), ended)
+        failed = self._note("ready.recorder", "ready").get("failed")
+        t, watchdog = time.monotonic() - self.epoch, self.bus.latest("fallback") is not None
+        return Status(t, control, world, alive, dict(self.restarts), ended, self._rejections(), watchdog, failed)
 
     def finish(self, patience: float = 3.0) -> None:
         """Wait until the log is written."""
@@ -141,21 +152,40 @@ class Supervisor:
 
     def _over(self, role: str) -> bool:
         """Whether a process ended because the flight did."""
-        return role in ("watchdog", "recorder") and (
-            self._note("status").get("mode") == "landed" or self.processes["control"].poll() is not None
-        )
+        return role in ("watchdog", "recorder") and self._note("status").get("mode") == "landed"
+
+    def _alive(self, role: str) -> bool:
+        return role in self.processes and self.processes[role].poll() is None
+
+    def _check_alive(self) -> None:
+        for role in self.processes:
+            if not self._alive(role):
+                why = self._note("ended").get("reason") or self._last_words(role)
+                raise PlantError(f"the {role} process ended before take-off: {why}")
+
+    def _rejections(self) -> list[str]:
+        found = []
+        for layer in self.spec.layers:
+            message = self.bus.latest(f"said.{layer}", self._said.get(layer, 0))
+            if message is None:
+                continue
+            self._said[layer] = message.version
+            with contextlib.suppress(MessageError, KeyError, ValueError):
+                said = json.loads(describe(message.data, kind="rejected", source=layer)["update"])
+                found.append(f"{layer}: {said['reason']}")
+        return found
 
     def _start(self, role: str) -> None:
-        complaints = self.spec.folder / f"{role}.log"
-        self.processes[role] = launch(self.spec.mains[role], self._plan(role), complaints)
+        cores = cores_of("learn" if role in (*self.spec.layers, "recorder") else "fly", self._cores)
+        self.processes[role] = launch(self.spec.mains[role], self._plan(role), self.spec.folder / f"{role}.log", cores)
 
     def _plan(self, role: str) -> Any:
         s, bus, parent = self.spec, self.bus.folder, os.getpid()
-        fly, learn = frozenset(cores_of("fly")), frozenset(cores_of("learn"))
+        fly = frozenset(cores_of("fly", self._cores))
         if role == "control":
             return ControlPlan(
-                bus, s.controller, s.limits, s.low, s.high, s.dt, s.delay_ticks, s.window, s.floor, fly,
-                PRIORITIES[role], parent,
+                bus, s.controller, s.limits, s.low, s.high, s.dt, s.delay_ticks, s.window, s.floor, s.seconds,
+                fly, PRIORITIES[role], parent,
             )  # fmt: skip
         if role == "plant":
             return PlantPlan(bus, s.scenario, s.vehicle, s.x0, s.dt, s.seed, fly, PRIORITIES[role], parent)
@@ -167,12 +197,12 @@ class Supervisor:
         if role == "recorder":
             return RecorderPlan(bus, s.folder / "flight.csv", s.dt, self.processes["control"].pid, parent)
         layer: Layer = "residual" if role == "residual" else "policy"
-        return LearnerPlan(bus, layer, s.start, s.reference, s.seed, s.controller.base, learn, parent)
+        return LearnerPlan(bus, layer, s.start, s.reference, s.seed, s.controller.base, parent)
 
-    def _note(self, topic: str) -> dict[str, Any]:
+    def _note(self, topic: str, kind: str | None = None) -> dict[str, Any]:
         message = self.bus.latest(topic)
         try:
-            return {} if message is None else unpack_note(message.data, topic)
+            return {} if message is None else unpack_note(message.data, kind or topic)
         except MessageError:
             return {}
 

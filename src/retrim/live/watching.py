@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 from ..runtime.events import Event
 from .events import LiveEvents
-from .supervisor import Status, Supervisor
+from .status import Status
+from .supervisor import LANDING, Supervisor
 
-LANDING = 60.0  # [s], after which processes are ended
 EVERY = 0.05  # [s]
 
 
@@ -35,7 +35,12 @@ def watched(
     landed_by = float("inf")
     while True:
         status = supervisor.watch()
-        show(status, events.take(status))
+        new = events.take(status)
+        try:
+            show(status, new)
+        except (OSError, SystemExit):  # nobody reads any more: whoever is in the air lands
+            stop.set()
+            show = _nobody
         if status.ended is not None or time.monotonic() > landed_by:
             supervisor.finish()
             return status
@@ -43,3 +48,7 @@ def watched(
             supervisor.land()
             landed_by = time.monotonic() + LANDING
         time.sleep(EVERY)
+
+
+def _nobody(status: Status, new: list[Event]) -> None:
+    del status, new

@@ -2,45 +2,20 @@
 
 import time
 from collections import deque
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..errors import MessageError
 from ..transport.bus import Bus
-from .guard import Fallback, GeometricHover, Limits, Mode
-from .messages import COMMAND, FlightRows, Parameters, Sample, Setpoint, pack_note, unpack_note
-from .pilot import ControllerSource, LivePilot
-from .rollback import FlownError
+from .guard import Fallback, GeometricHover, Mode
+from .intake import Intake
+from .messages import ACCOUNTS, COMMAND, FlightRows, Sample, Setpoint, pack_note, unpack_note
+from .pilot import LivePilot
+from .plan import ControlPlan
 
 REPORT_EVERY = 5  # ticks
-
-
-@dataclass(frozen=True)
-class ControlPlan:
-    """Everything that the process is started with."""
-
-    folder: Path
-    """Of the bus."""
-    controller: ControllerSource
-    limits: Limits
-    low: np.ndarray
-    """Smallest command that the vehicle takes."""
-    high: np.ndarray
-    """Largest one."""
-    dt: float
-    delay_ticks: int
-    """Declared command delay of the plant."""
-    window: int
-    """Ticks that are published for those who learn and for the log."""
-    floor: float
-    """Height at which the vehicle has landed [m]."""
-    cores: frozenset[int]
-    priority: int
-    parent: int
-    """Process whose end lands the vehicle."""
+LANDING = "landing"
 
 
 class ControlLoop:
@@ -49,102 +24,112 @@ class ControlLoop:
     def __init__(self, plan: ControlPlan, bus: Bus) -> None:
         self.plan, self.bus = plan, bus
         self.pilot = LivePilot(plan.controller)
+        self.intake = Intake(self.pilot, bus, plan.controller.base, plan.dt)
         self.mode, self.reason = Mode.POLICY, ""
         self.rows: deque[np.ndarray] = deque(maxlen=plan.window)
-        self.error = 0.0
-        self.missed, self.late_samples, self.rolled_back = 0, 0, [0]
-        self.refused: dict[str, int] = {}
-        self.swaps: deque[list[Any]] = deque(maxlen=20)
-        self._fallback = Fallback(GeometricHover(plan.low, plan.high, plan.dt), plan.floor)
-        self._flown = FlownError(plan.dt)
-        self._sample: Sample | None = None
-        self._start, self._issued = 0.0, np.array([])
-        self._commands: deque[np.ndarray] = deque(maxlen=plan.delay_ticks + 1)
-        self._known = {"sample": 0, "order": 0} | {f"parameters.{half}": 0 for half in plan.controller.parameters}
-        self._landing, self._learnt, self._ticks = False, 0.0, 0
-
-    @property
-    def sample(self) -> Sample | None:
+        self.sample: Sample | None = None
         """The newest measurement."""
-        return self._sample
+        self.error = 0.0
+        self.missed, self.late_samples = 0, 0
+        self._fallback = Fallback(GeometricHover(plan.low, plan.high, plan.dt), plan.floor)
+        self._row: np.ndarray | None = None
+        self._start, self._issued, self._target = 0.0, np.array([]), np.zeros(3)
+        self._commands: deque[np.ndarray] = deque(maxlen=plan.delay_ticks + 1)
+        self._known = {"sample": 0, "order": 0}
+        self._landing, self._gap, self._ticks = "", "", 0
 
     def new_sample(self) -> bool:
-        """Return whether there is one that has not been answered."""
+        """Return whether there is a measurement that has not been answered."""
         return self.bus.latest("sample", self._known["sample"]) is not None
 
     def warm_up(self) -> None:
-        """Touch everything once, before it is urgent."""
+        """Touch every program once, before it is urgent."""
         x = np.concatenate([np.zeros(3), np.eye(3).ravel(), np.zeros(3)])
         self.pilot.reset(x)
         for i in range(20):
-            self.pilot.predicted(x, self.pilot.act(self.plan.dt * i, 0.0, x))
+            u = self.pilot.act(self.plan.dt * i, 0.0, x)
+            self.pilot.accepted(u)
+            self.pilot.predicted(x, u)
             self.pilot.target(0.0)
             self._fallback.hover.command(x, x[:3])
-        self._fallback.hover.integral[:] = 0.0
+        self._fallback.rest()
 
     def tick(self, now: float, lateness: float = 0.0) -> Setpoint | None:
         """Take the newest sample, decide, and return what was published; None before the first sample."""
         began, new = time.monotonic(), self._receive()
-        sample = self._sample
+        sample = self.sample
         if sample is None:
             return None
         t, age = sample.t - self._start, sample.age + now - sample.sent
         fresh = age <= self.plan.limits.state_age
-        if self.mode == Mode.POLICY:
-            wrong = None if fresh else f"the newest measurement is {age:.3f} s old"
-            wrong = wrong or self.plan.limits.broken(sample.state)
-            if t - self._learnt > self.plan.limits.policy_age:
-                wrong = wrong or f"the policy was learnt {t - self._learnt:.1f} s ago"
-            u = self._issued if not new and len(self._issued) else None
-            if wrong is None and u is None:
-                u = self.pilot.act(t, sample.age, sample.state)
-                wrong = None if np.isfinite(u).all() else "the policy's command is not finite"
-            if wrong or self._landing:
-                self.mode, self.reason = Mode.HOLD, wrong or "landing"
-        if self.mode != Mode.POLICY:
-            u, self.mode = self._fallback.step(sample.state, fresh, self.pilot.target(t), land=self._landing)
-        assert u is not None
-        self._issued = np.clip(u, self.plan.low, self.plan.high) if self.mode != Mode.LANDED else u
-        setpoint = Setpoint(sample.tick, time.monotonic(), self._issued, self.mode == Mode.LANDED)
+        u = self._policy(sample, t, age, new) if self.mode == Mode.POLICY else None
+        if u is None:
+            u, self.mode = self._fallback.step(sample.state, fresh, self._target, land=bool(self._landing))
+            self._issued = u if self.mode == Mode.LANDED else np.clip(u, self.plan.low, self.plan.high)
+        setpoint = Setpoint(sample.tick, time.monotonic(), self._issued, self._target, self.mode == Mode.LANDED)
         self.bus.publish("setpoint", setpoint.pack())
         if new:
-            self.error = float(np.linalg.norm(sample.state[:3] - self.pilot.target(t)))
-            self._note(sample, t, lateness, time.monotonic() - began)
+            accounts = [lateness, time.monotonic() - began, 0.0, age, t - self.intake.learnt, self.mode]
+            head = [sample.tick, t, sample.age]
+            self._row = np.concatenate([head, sample.state, sample.truth, self._issued, accounts])
         return setpoint
 
     def idle(self) -> None:
         """Do what is not urgent: orders, new parameters, reports."""
+        began = time.monotonic()
+        t = 0.0 if self.sample is None else self.sample.t - self._start
         if (order := self._new("order")) is not None and order.get("order") == "land":
-            self._landing = True
-        for half in self.plan.controller.parameters:
-            self._poll(half)
+            self.land(LANDING)
+        if t >= self.plan.seconds - 0.5 * self.plan.dt:
+            self.land(LANDING)
+        if self.mode == Mode.POLICY:
+            self.intake.poll(t)
         self._ticks += 1
+        if self.mode == Mode.LANDED:
+            self._finish_row(None)
         if self.rows:  # each tick, so that the log has the last one, whenever this process dies
             self.bus.publish("flight", FlightRows(np.stack(self.rows)).pack())
         if self._ticks % REPORT_EVERY == 1 or self.mode == Mode.LANDED:
             self.report()
+        if self._row is not None:
+            self._row[ACCOUNTS["idle"]] += time.monotonic() - began
 
     def report(self) -> None:
         """Publish the state of the flight."""
-        self.bus.publish("status", pack_note("status", **self._status()))
-
-    def _status(self) -> dict[str, Any]:
-        return {
-            "mode": self.mode.name.lower(),
-            "reason": self.reason,
-            "error": self.error,
-            "versions": self.pilot.versions,
-            "missed": self.missed,
-            "late_samples": self.late_samples,
-            "refused": self.refused,
-            "rolled_back": self.rolled_back,
-            "swaps": list(self.swaps),
-        }
+        intake = self.intake
+        self.bus.publish("status", pack_note(
+            "status", mode=self.mode.name.lower(), reason=self.reason, error=self.error, versions=self.pilot.versions,
+            newest=intake.newest, given_up=intake.given_up, refused=intake.refused, swaps=list(intake.swaps),
+            missed=self.missed, late_samples=self.late_samples,
+        ))  # fmt: skip
 
     def land(self, reason: str) -> None:
         """Land from now on."""
-        if not self._landing:
-            self._landing, self.reason = True, reason
+        self._landing = self._landing or reason
+
+    def _policy(self, sample: Sample, t: float, age: float, new: bool) -> np.ndarray | None:
+        """Return the policy's command, or None, with the reason noted, if it must not fly any more."""
+        limits = self.plan.limits
+        wrong = self._landing or self._gap
+        if age > limits.state_age:
+            wrong = wrong or f"the newest measurement is {age:.3f} s old"
+        wrong = wrong or limits.broken(sample.state) or ""
+        if t - self.intake.learnt > limits.policy_age:
+            wrong = wrong or f"the policy was learnt {t - self.intake.learnt:.1f} s ago"
+        if not wrong and not new and len(self._issued):
+            return self._issued
+        if not wrong:
+            u = self.pilot.act(t, sample.age, sample.state)
+            self._target = self.pilot.target(t)
+            if np.isfinite(u).all():
+                self._issued = np.clip(u, self.plan.low, self.plan.high)
+                if (self._issued != u).any():
+                    self.pilot.accepted(self._issued)
+                self.error = float(np.linalg.norm(sample.state[:3] - self._target))
+                return self._issued
+            wrong = "the policy's command is not finite"
+        self.mode, self.reason = Mode.HOLD, wrong
+        return None
 
     def _receive(self) -> bool:
         message = self.bus.latest("sample", self._known["sample"])
@@ -154,60 +139,48 @@ class ControlLoop:
         try:
             sample = Sample.unpack(message.data)
         except MessageError:
-            self._refuse("sample")
+            self.intake.refuse("sample")
             return False
-        if self._sample is None:
+        before = self.sample
+        if before is None:
             self._start = sample.t
             self.pilot.reset(sample.state)
-        elif sample.tick <= self._sample.tick:
-            self._refuse("stale sample")
+            self._target = self.pilot.target(0.0)
+        elif sample.tick <= before.tick:
+            self.intake.refuse("stale sample")
             return False
-        elif len(self._issued):
-            accepted = np.asarray(sample.accepted)
-            if np.abs(accepted - self._issued).max() > 1e-4:
-                self.pilot.accepted(accepted)
-                if self.rows:
-                    self.rows[-1][COMMAND] = accepted
-            self._watch(sample, accepted)
-        self._sample = sample
+        else:
+            self._follow(before, sample)
+        self.sample = sample
         return True
 
-    def _watch(self, sample: Sample, accepted: np.ndarray) -> None:
-        """Compare flown and predicted, and take the policy back if it is clearly worse."""
-        before = self._sample
-        assert before is not None
+    def _follow(self, before: Sample, sample: Sample) -> None:
+        """Take note of what the plant says of the tick that has ended."""
+        accepted, lost = np.asarray(sample.accepted), sample.tick - before.tick - 1
+        self.missed += lost
+        if lost * self.plan.dt > self.plan.limits.state_age:
+            self._gap = f"{lost} measurements were not answered"
+        if self.mode == Mode.POLICY and np.abs(accepted - self._issued).max() > 1e-4:
+            self.pilot.accepted(accepted)
+        self._finish_row(None if lost else accepted)
         self._commands.append(accepted)
-        if sample.tick == before.tick + 1:
-            self._fallback.hover.feel(before.state, sample.state, self._commands[0])
-        if self.mode != Mode.POLICY or sample.tick != before.tick + 1:
+        if lost:
             return
-        a = (sample.state[12:] - before.state[12:]) / self.plan.dt
-        missed = float(np.linalg.norm(a - self.pilot.predicted(before.state, self._commands[0])))
-        error = float(np.linalg.norm(sample.state[:3] - self.pilot.target(sample.t - self._start)))
-        if self._flown.worse(error, missed) and (version := self.pilot.back("policy")) is not None:
-            self.rolled_back.append(version)
+        self._fallback.hover.feel(before.state, sample.state, self._commands[0])
+        if self.mode == Mode.POLICY:
+            a = (sample.state[12:] - before.state[12:]) / self.plan.dt
+            missed = float(np.linalg.norm(a - self.pilot.predicted(before.state, self._commands[0])))
+            target = self.pilot.target(sample.t - self._start)
+            self.intake.watch(float(np.linalg.norm(sample.state[:3] - target)), missed)
 
-    def _poll(self, half: str) -> None:
-        """Take new parameters of a half, if there are any that may be used."""
-        topic = f"parameters.{half}"
-        message = self.bus.latest(topic, self._known[topic])
-        if message is None:
+    def _finish_row(self, accepted: np.ndarray | None) -> None:
+        """Add the last tick to the report, with the command that the plant took where it is known."""
+        if self._row is None:
             return
-        self._known[topic] = message.version
-        try:
-            found = Parameters.unpack(
-                message.data, self.pilot.expected(half), half=half, base=self.plan.controller.base,
-                after=max(self.pilot.versions[half], self.rolled_back[-1] if half == "policy" else 0),
-            )  # fmt: skip
-        except MessageError as error:
-            self._refuse(str(error).split(":")[0] if "stale" not in str(error) else f"stale {half}")
-            return
-        self.pilot.swap(found)
-        now = 0.0 if self._sample is None else self._sample.t - self._start
-        self.swaps.append([now, half, found.version, now - found.computed_from])
-        if half == "policy":
-            self._learnt = found.computed_from
-            self._flown.swapped()
+        if accepted is not None:
+            self._row[COMMAND] = accepted
+        self.rows.append(self._row)
+        self._row = None
 
     def _new(self, topic: str) -> dict[str, Any] | None:
         message = self.bus.latest(topic, self._known[topic])
@@ -217,12 +190,5 @@ class ControlLoop:
         try:
             return unpack_note(message.data, topic)
         except MessageError:
-            self._refuse(topic)
+            self.intake.refuse(topic)
             return None
-
-    def _refuse(self, what: str) -> None:
-        self.refused[what] = self.refused.get(what, 0) + 1
-
-    def _note(self, sample: Sample, t: float, lateness: float, duration: float) -> None:
-        head, tail = [sample.tick, t, sample.age], [lateness, duration, self.mode]
-        self.rows.append(np.concatenate([head, sample.state, sample.truth, self._issued, tail]))

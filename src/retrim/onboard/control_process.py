@@ -4,14 +4,16 @@ import math
 import time
 
 from ..transport.shared_memory import SharedMemoryBus
-from .control import ControlLoop, ControlPlan
+from .control import ControlLoop
 from .guard import Mode
 from .messages import Sample, pack_note
 from .orders import wait_for_take_off
+from .plan import ControlPlan
 from .realtime import Lifeline, be_punctual, sleep_until
 
-PHASE = 0.002  # [s] after the plant's tick
-PATIENCE = 0.005  # [s] that a late sample is waited for
+PHASE = 0.1  # of a tick, after that of the plant
+PATIENCE = 0.25  # of a tick, for which a late sample is waited for
+LATE = 0.5  # of a tick, after which a step is left out
 
 
 class Schedule:
@@ -19,34 +21,33 @@ class Schedule:
 
     def __init__(self, epoch: float, dt: float) -> None:
         self._epoch, self._dt, self._tick = epoch, dt, 0
+        self._behind = 0
 
     def next(self) -> float:
         """Return when the next step is due [s]."""
-        return self._epoch + self._tick * self._dt + PHASE
+        return self._epoch + (self._tick + PHASE) * self._dt
 
-    def done(self, now: float, sample: Sample | None) -> int:
-        """Take note of the sample that the step answered; return how many steps should have begun since."""
+    def done(self, now: float, sample: Sample | None) -> None:
+        """Take note of the sample that the step answered, and of how late it is."""
         answered = self._tick
         if sample is not None:
             drift = sample.sent - sample.tick * self._dt - self._epoch
-            if drift > PHASE:  # the plant stood still
-                self._epoch, answered = self._epoch + drift, sample.tick
-            else:
+            self._behind = self._behind + 1 if drift > PHASE * self._dt else 0
+            if self._behind >= 3:  # one late sample is a late sample; if all are, the plant stood still
+                self._epoch, answered, self._behind = self._epoch + drift, sample.tick, 0
+            elif drift <= PHASE * self._dt:
                 self._epoch += 0.1 * drift
-        due = math.floor((now - self._epoch - PHASE) / self._dt)
-        missed = max(0, due - answered)
-        self._tick = answered + missed + 1
-        return missed
+        due = math.floor((now - self._epoch) / self._dt - PHASE - LATE)
+        self._tick = max(answered, due) + 1
 
 
 def fly(plan: ControlPlan) -> None:
     """Fly until the vehicle has landed: the main function of the process."""
     refused = be_punctual(plan.priority, set(plan.cores))
-    bus = SharedMemoryBus(plan.folder)
+    bus, parent = SharedMemoryBus(plan.folder), Lifeline(plan.parent)
     loop = ControlLoop(plan, bus)
     loop.warm_up()
     bus.publish("ready.control", pack_note("ready", refused=refused))
-    parent = Lifeline(plan.parent)
     epoch = wait_for_take_off(bus, parent)
     if epoch is None:
         return
@@ -55,13 +56,12 @@ def fly(plan: ControlPlan) -> None:
         scheduled = schedule.next()
         sleep_until(scheduled)
         woke = time.monotonic()
-        while not loop.new_sample() and time.monotonic() < scheduled + PATIENCE:
+        while not loop.new_sample() and time.monotonic() < scheduled + PATIENCE * plan.dt:
             time.sleep(2e-4)
         loop.late_samples += time.monotonic() - woke > 2e-4
         loop.tick(time.monotonic(), woke - scheduled)
         if parent.gone():
             loop.land("the supervisor is gone")
         loop.idle()
-        loop.missed += schedule.done(time.monotonic(), loop.sample)
-    loop.report()
+        schedule.done(time.monotonic(), loop.sample)
     time.sleep(2 * plan.dt)  # the last command is taken

@@ -9,6 +9,7 @@ G = 9.81  # [m/s^2]
 HOVER = np.array([G, 0.0, 0.0, 0.0])
 UP = np.array([0.0, 0.0, 1.0])
 FELT_TAU = 0.2  # [s]
+BLIND_S = 2.0  # [s], after which a vehicle whose state nobody knows is stopped
 
 
 class Mode(IntEnum):
@@ -125,8 +126,9 @@ class Fallback:
     hold_s: float = 2.0
     sink: float = 0.5
     """[m/s]"""
-    longest: float = 30.0
-    """Time after which it stops wherever it is [s]."""
+    still_s: float = 0.0
+    """Time for which it has sunk without moving [s]: it stands on something."""
+    sinking_s: float = 0.0
     since: float = 0.0
     """Time for which it has flown [s]."""
     blind_s: float = 0.0
@@ -135,7 +137,7 @@ class Fallback:
 
     def rest(self) -> None:
         """Take note that somebody else flies: the next step is the first one of a new sequence."""
-        self.since, self.blind_s, self.place = 0.0, 0.0, None
+        self.since, self.blind_s, self.sinking_s, self.still_s, self.place = 0.0, 0.0, 0.0, 0.0, None
         self.hover.integral[:] = 0.0
 
     def step(self, x: np.ndarray, fresh: bool, target: np.ndarray, *, land: bool) -> tuple[np.ndarray, Mode]:
@@ -151,13 +153,22 @@ class Fallback:
             self.place = target.copy()
         self.since += self.hover.dt
         self.blind_s = 0.0 if fresh else self.blind_s + self.hover.dt
-        if self.since > self.longest or self.blind_s > 2.0 or (fresh and x[2] <= self.floor):
+        if self.blind_s > BLIND_S or self._down(x, fresh):
             return HOVER * 0.0, Mode.LANDED
         if not fresh:
             # Turned level within a quarter of a second of what was known; after that, straight on and gently down.
             rates = 4.0 * turn(x[3:12].reshape(3, 3), UP) if self.blind_s <= 0.25 else np.zeros(3)
             return np.clip(np.concatenate([[0.95 * G], rates]), self.hover.low, self.hover.high), Mode.BLIND
         if land or self.since > self.hold_s:
+            self.sinking_s += self.hover.dt
             self.place[2] = min(self.place[2], x[2] + 0.3) - self.hover.dt * self.sink
             return self.hover.command(x, self.place, -self.sink * UP), Mode.DESCEND
         return self.hover.command(x, self.place), Mode.HOLD
+
+    def _down(self, x: np.ndarray, fresh: bool) -> bool:
+        """Whether a vehicle that has been sinking is at the floor, or stands on something."""
+        if not fresh or self.sinking_s < 0.2:
+            return False
+        moving = float(np.abs(x[12:15]).max()) > 0.1
+        self.still_s = 0.0 if moving else self.still_s + self.hover.dt
+        return bool(x[2] <= self.floor) or self.still_s > 2.0

@@ -1,5 +1,6 @@
 """Processes of a live flight: started with a plan, deaf to Ctrl-C, which is the supervisor's to answer."""
 
+import contextlib
 import importlib
 import os
 import pickle
@@ -9,13 +10,14 @@ from pathlib import Path
 from typing import Any
 
 
-def launch(main: str, plan: Any, complaints: Path) -> "subprocess.Popen[bytes]":
+def launch(main: str, plan: Any, complaints: Path, cores: set[int] | None = None) -> "subprocess.Popen[bytes]":
     """Start a process of this machine.
 
     Args:
         main: ``module:function`` that takes the plan.
         plan: What it is started with; it travels from this process to its own child and to nobody else.
         complaints: File for what it writes to its standard outputs.
+        cores: Where it may run, from the start: importing is work, too. None for anywhere.
 
     Returns:
         The process.
@@ -31,8 +33,11 @@ def launch(main: str, plan: Any, complaints: Path) -> "subprocess.Popen[bytes]":
             start_new_session=True,
             env=os.environ | quiet | {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p)},
         )
+    if cores is not None and hasattr(os, "sched_setaffinity"):
+        with contextlib.suppress(OSError):
+            os.sched_setaffinity(process.pid, cores)
     assert process.stdin is not None
-    with process.stdin as pipe:
+    with contextlib.suppress(BrokenPipeError), process.stdin as pipe:  # it has died already; whoever waits will see
         pickle.dump(plan, pipe)
     return process
 

@@ -13,6 +13,10 @@ from ..transport.message import ArrayLike, describe, pack_arrays, unpack_arrays
 STATE = 15  # p, R by rows, v
 
 
+class StaleError(MessageError):
+    """A whole message that is not newer than what is known."""
+
+
 @dataclass(frozen=True)
 class Sample:
     """What the plant measured at the end of a tick."""
@@ -30,7 +34,7 @@ class Sample:
     truth: np.ndarray
     """The same, true where the plant knows it; for scores, never for pilots."""
     accepted: np.ndarray
-    """Command [c, omega] that acted for the tick that has ended, as the plant accepted it."""
+    """Command [c, omega] that was taken for the tick that has ended; a delay of the plant lets it act later."""
 
     def pack(self) -> bytes:
         """Return the bytes; the inverse of :meth:`unpack`."""
@@ -59,12 +63,14 @@ class Setpoint:
     """Monotonic clock [s]."""
     u: np.ndarray
     """c [m/s^2], omega [rad/s]."""
+    target: np.ndarray
+    """Where the vehicle should be now, world [m]; who takes over holds it there."""
     landed: bool = False
     """The vehicle has landed, or fallen: the plant shall stop."""
 
     def pack(self) -> bytes:
         """Return the bytes; the inverse of :meth:`unpack`."""
-        row = np.concatenate([[self.tick, self.sent, self.landed], self.u])
+        row = np.concatenate([[self.tick, self.sent, self.landed], self.u, self.target])
         return pack_arrays({"row": row}, kind="setpoint", about={})
 
     @classmethod
@@ -74,8 +80,8 @@ class Setpoint:
         Raises:
             MessageError: The bytes are not one, or a number is not finite.
         """
-        row = unpack_arrays(data, {"row": np.empty(7)}, kind="setpoint", source="setpoint")["row"]
-        return cls(int(row[0]), float(row[1]), row[3:], bool(row[2]))
+        row = unpack_arrays(data, {"row": np.empty(10)}, kind="setpoint", source="setpoint")["row"]
+        return cls(int(row[0]), float(row[1]), row[3:7], row[7:], bool(row[2]))
 
 
 COLUMNS = (
@@ -83,9 +89,13 @@ COLUMNS = (
     *(f"x{i}" for i in range(STATE)),
     *(f"true{i}" for i in range(STATE)),
     *("c", "omega0", "omega1", "omega2"),
-    *("lateness", "duration", "mode"),
+    *("lateness", "step", "idle", "state_age", "policy_age", "mode"),
 )
-MEASURED, TRUE, COMMAND = slice(3, 3 + STATE), slice(3 + STATE, 3 + 2 * STATE), slice(-7, -3)
+"""Of a tick in a report and in the log: idle is how long the work took that is not urgent; times are in seconds."""
+MEASURED, TRUE = slice(3, 3 + STATE), slice(3 + STATE, 3 + 2 * STATE)
+COMMAND = slice(3 + 2 * STATE, 7 + 2 * STATE)
+ACCOUNTS = {name: COLUMNS.index(name) for name in ("lateness", "step", "idle", "state_age", "policy_age")}
+MOST_TICKS = 10_000  # in a report
 
 
 @dataclass(frozen=True)
@@ -107,8 +117,8 @@ class FlightRows:
             MessageError: The bytes are none.
         """
         ticks = describe(data, kind="flight", source="flight").get("ticks", "")
-        if not ticks.isdecimal() or int(ticks) > 10_000:
-            raise MessageError(f"flight: {ticks!r} ticks")
+        if not ticks.isdecimal() or len(ticks) > 6 or int(ticks) > MOST_TICKS:
+            raise MessageError(f"flight: {ticks[:20]!r} ticks")
         expected = {"rows": np.empty((int(ticks), len(COLUMNS)))}
         return cls(unpack_arrays(data, expected, kind="flight", source="flight")["rows"])
 
@@ -125,10 +135,13 @@ class Parameters:
     computed_from: float
     """Flight time of the newest measurement that they were learnt from [s]."""
     arrays: Mapping[str, Any] = field(repr=False)
+    parent: int = 0
+    """Version that they were trained from; 0 for that of take-off."""
 
     def pack(self) -> bytes:
         """Return the bytes; the inverse of :meth:`unpack`."""
         about = {"version": str(self.version), "base": self.base, "computed_from": repr(self.computed_from)}
+        about["parent"] = str(self.parent)
         return pack_arrays(self.arrays, kind=f"parameters of {self.half}", about=about)
 
     @classmethod
@@ -142,10 +155,11 @@ class Parameters:
             expected: Shape and type of each array.
             half: Which half they should be for.
             base: Hash that they should name.
-            after: Version that is flown now.
+            after: Newest version that was looked at.
 
         Raises:
-            MessageError: They are truncated, damaged, foreign, stale or not finite.
+            MessageError: They are truncated, damaged, foreign or not finite.
+            StaleError: They are not newer than ``after``.
         """
         kind = f"parameters of {half}"
         header = describe(data, kind=kind, source=half)
@@ -153,12 +167,13 @@ class Parameters:
             raise MessageError(f"{half}: parameters for another controller, {header.get('base', 'unnamed')!r}")
         version, computed = header.get("version", ""), header.get("computed_from", "")
         try:
-            number, learnt = int(version), float(computed)
+            number, learnt, parent = int(version[:20]), float(computed[:40]), int(header.get("parent", "")[:20])
         except ValueError as error:
-            raise MessageError(f"{half}: version {version!r}, computed from {computed!r}") from error
+            raise MessageError(f"{half}: version {version[:20]!r}, computed from {computed[:40]!r}") from error
+        arrays = unpack_arrays(data, expected, kind=kind, source=half)
         if number <= after or not np.isfinite(learnt):
-            raise MessageError(f"{half}: version {number} is stale, {after} is flown")
-        return cls(half, number, base, learnt, unpack_arrays(data, expected, kind=kind, source=half))
+            raise StaleError(f"{half}: version {number} is stale, {after} was taken")
+        return cls(half, number, base, learnt, arrays, parent)
 
 
 def pack_note(kind: str, **fields: Any) -> bytes:

@@ -45,7 +45,7 @@ class LivePilot:
         self._where = self._target.prepare(())
         self._parameters = {half: list(arrays.values()) for half, arrays in source.parameters.items()}
         self.versions = dict.fromkeys(source.parameters, 0)
-        self._before: tuple[str, int, Arrays] | None = None
+        self._policies: dict[int, Arrays] = {0: self._parameters["policy"]}  # the last proven one, and all after it
         self._memory: Arrays = []
         self._prepared = self._prepare()
         self._old = self._prepared[1]
@@ -54,7 +54,7 @@ class LivePilot:
     def reset(self, x: np.ndarray) -> None:
         """Start a flight in the state ``x`` (p, R by rows, v)."""
         self._memory = self._init.step(self._prepared[0], self._state(x))
-        self._left, self._swapped = 0, False
+        self._left, self._swapped, self._jump = 0, False, np.zeros(4)
 
     def target(self, t: float) -> np.ndarray:
         """Return where the vehicle should be at time ``t`` of the flight [s], world [m]."""
@@ -74,7 +74,8 @@ class LivePilot:
         u = np.concatenate([[c], omega]).astype(float)
         if self._swapped:
             before, rates, *_ = self._decide.step(self._old, [*memory, *inputs])
-            self._jump, self._left, self._swapped = np.concatenate([[before], rates]).astype(float) - u, BLEND, False
+            going = np.concatenate([[before], rates]).astype(float) + self._jump * self._left / BLEND
+            self._jump, self._left, self._swapped = going - u, BLEND, False
         if self._left:
             u = u + self._jump * self._left / BLEND
             self._left -= 1
@@ -94,26 +95,26 @@ class LivePilot:
     def swap(self, parameters: Parameters) -> None:
         """Fly with new parameters from the next tick on; the command goes over to theirs within a few ticks."""
         half = parameters.half
-        self._before = half, self.versions[half], self._parameters[half]
         self._parameters[half] = list(parameters.arrays.values())
         self.versions[half] = parameters.version
+        if half == "policy":
+            self._policies[parameters.version] = self._parameters[half]
         self._change()
 
     def expected(self, half: str) -> Mapping[str, Any]:
         """Return what parameters of a half look like."""
         return self._source.parameters[half]
 
-    def back(self, half: str) -> int | None:
-        """Fly with the parameters of before the last swap of ``half`` again.
+    def proven(self, version: int) -> None:
+        """Take note that a policy has flown long enough without harm: there is no way back to an earlier one."""
+        self._policies = {v: leaves for v, leaves in self._policies.items() if v >= version}
 
-        Returns:
-            The version that is given up, or None if there is none to go back to.
-        """
-        if self._before is None or self._before[0] != half:
-            return None
-        given_up = self.versions[half]
-        _, _, self._parameters[half] = self._before
-        self._before = None
+    def back(self) -> list[int]:
+        """Fly the last proven policy again; return the versions that are given up."""
+        version = min(self._policies)
+        given_up = sorted(v for v in self._policies if v > version)
+        self._policies = {version: self._policies[version]}
+        self._parameters["policy"], self.versions["policy"] = self._policies[version], version
         self._change()
         return given_up
 

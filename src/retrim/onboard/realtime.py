@@ -51,9 +51,15 @@ def _threads() -> list[int]:
     return [0]
 
 
-def cores_of(role: str) -> set[int]:
-    """Return the cores of a role: the first one flies, the others learn; with a single core all share it."""
-    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [0]
+def cores_of(role: str, allowed: set[int] | None = None) -> set[int]:
+    """Return the cores of a role: the first one flies, the others learn; with a single core all share it.
+
+    Args:
+        role: ``fly`` or ``learn``.
+        allowed: Cores to share out; by default those of this process.
+    """
+    mine = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else {0}
+    cores = sorted(allowed or mine)
     return {cores[0]} if role == "fly" or len(cores) == 1 else set(cores[1:])
 
 

@@ -13,7 +13,7 @@ from .guard import Mode
 from .messages import COLUMNS, FlightRows, Sample, Setpoint, pack_note, unpack_note
 from .realtime import Lifeline
 
-EVERY = 0.1  # [s]
+SOME = 5  # ticks
 SILENCE = 1.0  # [s] without a sample, after which a flight without its pilot is over
 
 
@@ -38,6 +38,7 @@ class Recorder:
     def __init__(self, path: Path, bus: Bus, dt: float) -> None:
         self._path, self._bus, self._version, self._dt = path, bus, 0, dt
         self._start: float | None = None
+        self._following = False
         self.failed: str | None = None
         self._last = -1
         try:
@@ -55,7 +56,9 @@ class Recorder:
             rows = FlightRows.unpack(message.data).rows
         except MessageError:
             return 0
-        return self._append(rows[rows[:, 0] > self._last])
+        new = self._append(rows[rows[:, 0] > self._last])
+        self._following = self._following and not new
+        return new
 
     def follow(self) -> int:
         """Write what the plant says and the watchdog commands, where nobody reports any more; return how many ticks."""
@@ -64,13 +67,26 @@ class Recorder:
             return 0
         try:
             said = Sample.unpack(sample.data)
-            u = said.accepted if command is None else Setpoint.unpack(command.data).u
+            answer = None if command is None else Setpoint.unpack(command.data)
         except MessageError:
             return 0
+        u = answer.u if answer is not None and answer.tick == said.tick else said.accepted
         self._start = said.t - said.tick * self._dt if self._start is None else self._start
-        head, tail = [said.tick, said.t - self._start, said.age], [0.0, 0.0, Mode.WATCHDOG]
+        head, tail = [said.tick, said.t - self._start, said.age], [0.0, 0.0, 0.0, said.age, 0.0, Mode.WATCHDOG]
         row = np.concatenate([head, said.state, said.truth, u, tail])
-        return self._append(row[None]) if said.tick > self._last else 0
+        if said.tick <= self._last:
+            return 0
+        self._following = True
+        return self._append(row[None])
+
+    def behind(self) -> bool:
+        """Return whether the plant is some ticks ahead of the reports: the process that flies hangs."""
+        sample = self._bus.latest("sample")
+        try:
+            ahead = 0 if sample is None else Sample.unpack(sample.data).tick - self._last
+        except MessageError:
+            return False
+        return self._following or ahead > SOME
 
     def _append(self, new: np.ndarray) -> int:
         try:
@@ -113,14 +129,16 @@ def record(plan: RecorderPlan) -> None:
     bus = SharedMemoryBus(plan.folder)
     recorder, control = Recorder(plan.path, bus, plan.dt), Lifeline(plan.control)
     bus.publish("ready.recorder", pack_note("ready", failed=recorder.failed))
-    while not (control.gone(EVERY) or _landed(bus)):
-        recorder.step()
-    recorder.step()
     heard = time.monotonic()
-    while not _landed(bus) and bus.latest("ended") is None and time.monotonic() < heard + SILENCE:
-        if recorder.follow():
+    while not (_landed(bus) or bus.latest("ended")) and time.monotonic() < heard + SILENCE:
+        silent = control.gone(plan.dt / 4)
+        if recorder.step() or ((silent or recorder.behind()) and recorder.follow()):
             heard = time.monotonic()
-        time.sleep(plan.dt / 5)
+        if silent:
+            time.sleep(plan.dt / 4)
+        elif bus.latest("sample") is None:
+            heard = time.monotonic()  # on the ground
+    recorder.step()
     if Lifeline(plan.parent).gone():
         bus.remove()
 

@@ -26,7 +26,7 @@ class WatchdogPlan:
     high: np.ndarray
     dt: float
     home: np.ndarray
-    """Where to hold, world [m]."""
+    """Where to hold if control never said, world [m]."""
     state_age: float
     floor: float
     cores: frozenset[int]
@@ -49,6 +49,7 @@ class Watchdog:
         self._sample: Sample | None = None
         self._seen = 0
         self._next = 0.0
+        self._target = plan.home
 
     def check(self, now: float, gone: bool) -> Setpoint | None:
         """Return the command that was published, if one was due.
@@ -60,18 +61,28 @@ class Watchdog:
         if (message := self.bus.latest("setpoint", self._version)) is not None:
             self._version, self.heard = message.version, now
             self._fallback.rest()
-            self.done = self.done or _landed(message.data)
+            self._hear(message.data)
         new = self._look()
+        if self.heard is None and self._sample is not None:
+            self.heard = now  # from the first measurement on, somebody has to answer
         silent = self.heard is not None and (gone or now - self.heard > PATIENCE * self.plan.dt)
         if not silent or self.done or self._sample is None or not (new or now >= self._next):
             return None
         self._next = now + 1.5 * self.plan.dt  # at the latest, should no sample come
         fresh = self._sample.age + now - self._sample.sent <= self.plan.state_age
-        u, mode = self._fallback.step(self._sample.state, fresh, self.plan.home, land=False)
+        u, mode = self._fallback.step(self._sample.state, fresh, self._target, land=False)
         self.done = mode == Mode.LANDED
-        setpoint = Setpoint(self._sample.tick, now, u, self.done)
+        setpoint = Setpoint(self._sample.tick, now, u, self._target, self.done)
         self.bus.publish("fallback", setpoint.pack())
         return setpoint
+
+    def _hear(self, data: bytes) -> None:
+        """Take note of where the vehicle should be, and whether it has landed."""
+        try:
+            said = Setpoint.unpack(data)
+        except MessageError:
+            return
+        self._target, self.done = said.target, self.done or said.landed
 
     def _look(self) -> bool:
         """Take a new sample, if there is one."""
@@ -87,13 +98,6 @@ class Watchdog:
             self._fallback.hover.feel(self._sample.state, sample.state, sample.accepted)
         self._sample = sample
         return True
-
-
-def _landed(data: bytes) -> bool:
-    try:
-        return Setpoint.unpack(data).landed
-    except MessageError:
-        return False
 
 
 def watch(plan: WatchdogPlan) -> None:

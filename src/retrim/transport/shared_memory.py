@@ -9,6 +9,7 @@ import contextlib
 import json
 import mmap
 import os
+import shutil
 import tempfile
 import zlib
 from collections.abc import Mapping
@@ -52,14 +53,21 @@ class SharedMemoryBus(Bus):
 
         Args:
             capacities: Longest message of each topic [bytes].
+
+        Raises:
+            OSError: There is no room for it.
         """
         base = Path("/dev/shm")
         folder = Path(tempfile.mkdtemp(prefix="retrim-", dir=base if os.access(base, os.W_OK) else None))
-        for topic, capacity in capacities.items():
-            with (folder / topic).open("wb") as file:
-                file.truncate(HEADER + 2 * _room(capacity))
-        (folder / PLAN).write_text(json.dumps(dict(capacities)))
-        return cls(folder)
+        try:
+            for topic, capacity in capacities.items():
+                with (folder / topic).open("wb") as file:  # all of it now: memory that is missing in flight is a signal
+                    os.posix_fallocate(file.fileno(), 0, HEADER + 2 * _room(capacity))
+            (folder / PLAN).write_text(json.dumps(dict(capacities)))
+            return cls(folder)
+        except BaseException:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
 
     def publish(self, topic: str, data: bytes) -> None:
         """Replace the last message of ``topic``."""

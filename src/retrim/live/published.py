@@ -1,0 +1,56 @@
+"""What learners keep on the bus beside parameters: whole updates, with optimiser states, to go on from.
+
+The last two versions of each layer stay, since the last one may not be flown.
+"""
+
+import contextlib
+from collections.abc import Callable
+from typing import Any
+
+from ..adapt.learner import LearnerState
+from ..adapt.updates import Update, pack_update, unpack_update
+from ..errors import MessageError
+from ..transport.bus import Bus
+
+PREFIX = 8  # bytes of the version before an update
+SLOTS = 2
+
+
+def slot(layer: str, version: int) -> str:
+    """Return the topic of an update."""
+    return f"update.{layer}.{version % SLOTS}"
+
+
+def keep(bus: Bus, layer: str, version: int, update: Update) -> None:
+    """Publish an update in place of the one before the last."""
+    bus.publish(slot(layer, version), version.to_bytes(PREFIX, "little") + pack_update(update))
+
+
+def newest_update(bus: Bus, state: LearnerState, layer: str, after: int = 0) -> tuple[int, Update] | None:
+    """Return the newest update of a layer with its version, if it is newer than ``after``."""
+    return _newest(bus, state, layer, lambda version: version > after)
+
+
+def flown_update(bus: Bus, state: LearnerState, layer: str, status: dict[str, Any]) -> tuple[int, Update] | None:
+    """Return the newest update of a layer that is flown, with its version; None if there is none any more.
+
+    Args:
+        bus: Where updates are published.
+        state: What they should look like.
+        layer: Which one.
+        status: Last report of the process that flies.
+    """
+    newest = status.get("newest", {}).get(layer, 0)
+    given_up = status.get("given_up", []) if layer == "policy" else []
+    return _newest(bus, state, layer, lambda version: version <= newest and version not in given_up)
+
+
+def _newest(bus: Bus, state: LearnerState, layer: str, wanted: Callable[[int], bool]) -> tuple[int, Update] | None:
+    found: list[tuple[int, Update]] = []
+    for i in range(SLOTS):
+        message = bus.latest(slot(layer, i))
+        if message is None or not wanted(version := int.from_bytes(message.data[:PREFIX], "little")):
+            continue
+        with contextlib.suppress(MessageError):
+            found.append((version, unpack_update(message.data[PREFIX:], state, source=layer)))
+    return max(found, key=lambda each: each[0], default=None)

@@ -1,0 +1,24 @@
+"""How a live flight stands."""
+
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass
+class Status:
+    """A flight as the supervisor sees it."""
+
+    t: float
+    """Time since take-off [s]."""
+    control: dict[str, Any]
+    world: dict[str, Any]
+    alive: dict[str, bool]
+    restarts: dict[str, int]
+    ended: str | None
+    """Why the flight is over; None while it is not."""
+    rejections: list[str]
+    """What learners said since the last look of results that must not be used."""
+    watchdog_flies: bool
+    """The watchdog has commanded."""
+    log_failed: str | None
+    """Why the flight is no longer written down; None while it is."""

@@ -1,0 +1,81 @@
+"""What comes from the learners: taken if it may be flown, refused, counted and named if not, taken back if it harms."""
+
+from collections import deque
+from typing import Any
+
+from ..errors import MessageError
+from ..transport.bus import Bus
+from .messages import Parameters, StaleError
+from .pilot import LivePilot
+from .rollback import FlownError
+
+REMEMBERED = 50  # swaps in a report, which comes ten times a second
+
+
+class Intake:
+    """New parameters of the controller that flies."""
+
+    def __init__(self, pilot: LivePilot, bus: Bus, base: str, dt: float) -> None:
+        """Build an intake.
+
+        Args:
+            pilot: What flies.
+            bus: Where parameters come from.
+            base: Hash of the controller.
+            dt: Control tick [s].
+        """
+        self.pilot, self.learnt = pilot, 0.0
+        self.refused: dict[str, int] = {}
+        self.given_up: list[int] = []
+        self.newest = dict.fromkeys(pilot.versions, 0)
+        self.swaps: deque[list[Any]] = deque(maxlen=REMEMBERED)
+        self._bus, self._base = bus, base
+        self._known = dict.fromkeys(pilot.versions, 0)
+        self._flown = FlownError(dt)
+
+    def poll(self, t: float) -> None:
+        """Take what has come by time ``t`` of the flight [s], if it may be flown."""
+        for half in self._known:
+            message = self._bus.latest(f"parameters.{half}", self._known[half])
+            if message is None:
+                continue
+            self._known[half] = message.version
+            try:
+                found = Parameters.unpack(
+                    message.data, self.pilot.expected(half), half=half, base=self._base, after=self.newest[half]
+                )
+            except StaleError:
+                self.refuse(f"stale {half}")
+            except MessageError:
+                self.refuse(half)
+            else:
+                self._take(found, t)
+
+    def watch(self, error: float, missed: float) -> None:
+        """Take what a tick of the policy says, and take back what flies clearly worse.
+
+        Args:
+            error: Distance from the target [m].
+            missed: By how much the corrected model misses the acceleration [m/s^2].
+        """
+        found = self._flown.take(error, missed)
+        if found.proven is not None:
+            self.pilot.proven(found.proven)
+        if found.worse:
+            self.given_up = [*self.given_up, *self.pilot.back()][-REMEMBERED:]
+
+    def refuse(self, what: str) -> None:
+        """Count a message that must not be used."""
+        self.refused[what] = self.refused.get(what, 0) + 1
+
+    def _take(self, found: Parameters, t: float) -> None:
+        self.newest[found.half] = found.version
+        if found.half == "policy" and found.parent in self.given_up:
+            self.given_up.append(found.version)
+            self.refuse("trained from a policy that was taken back")
+            return
+        self.pilot.swap(found)
+        self.swaps.append([t, found.half, found.version, t - found.computed_from])
+        if found.half == "policy":
+            self.learnt = found.computed_from
+            self._flown.swapped(found.version)

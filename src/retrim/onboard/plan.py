@@ -1,0 +1,36 @@
+"""What the process that flies is started with."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from .guard import Limits
+from .pilot import ControllerSource
+
+
+@dataclass(frozen=True)
+class ControlPlan:
+    """Everything that the process is started with."""
+
+    folder: Path
+    """Of the bus."""
+    controller: ControllerSource
+    limits: Limits
+    low: np.ndarray
+    """Smallest command that the vehicle takes."""
+    high: np.ndarray
+    """Largest one."""
+    dt: float
+    delay_ticks: int
+    """Declared command delay of the plant."""
+    window: int
+    """Ticks that are published for those who learn and for the log."""
+    floor: float
+    """Height at which the vehicle has landed [m]."""
+    seconds: float
+    """After which it lands by itself [s]."""
+    cores: frozenset[int]
+    priority: int
+    parent: int
+    """Process whose end lands the vehicle."""

@@ -1,0 +1,211 @@
+"""The clock of the process that flies, the watchdog, the recorder and the accounts, without a clock."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from live_helpers import HIGH, LOW, TOPICS
+from live_processes import DT, HOME, level, moved
+from retrim.onboard.accounts import summary
+from retrim.onboard.control_process import PATIENCE, PHASE, Schedule
+from retrim.onboard.guard import G, Mode
+from retrim.onboard.messages import COLUMNS, COMMAND, FlightRows, Sample, Setpoint
+from retrim.onboard.realtime import Lifeline, cores_of
+from retrim.onboard.recorder import Recorder, read_log
+from retrim.onboard.watchdog import Watchdog, WatchdogPlan
+from retrim.transport.in_process import InProcessBus
+
+
+def sample(tick, sent, x=None):
+    state = level() if x is None else x
+    return Sample(tick, tick * DT, sent, 0.0, state, state, np.array([G, 0.0, 0.0, 0.0]))
+
+
+def steps(sent, work=0.001, ticks=60):
+    """When steps begin, for samples that are sent at ``sent(tick)``, and which sample each sees."""
+    schedule, seen, found = Schedule(0.0, DT), None, []
+    now = 0.0
+    for _ in range(ticks):
+        now = max(now, schedule.next())
+        until, last = now + PATIENCE * DT, -1 if seen is None else seen.tick
+        coming = [k for k in range(last + 1, last + 40) if sent(k) <= until]
+        if coming:
+            seen = sample(coming[-1], sent(coming[-1]))
+            now = max(now, seen.sent)
+        found.append((now, None if seen is None else seen.tick))
+        now += work
+        schedule.done(now, seen)
+    return np.array(found, dtype=float)
+
+
+def test_steps_follow_the_samples_of_the_plant_one_by_one():
+    found = steps(lambda k: k * DT)
+    np.testing.assert_array_equal(found[:, 1], np.arange(60))
+    np.testing.assert_allclose(found[:, 0], (np.arange(60) + PHASE) * DT, atol=1e-9)
+
+
+@pytest.mark.parametrize("rate", [0.999, 1.001])
+def test_a_clock_that_drifts_is_followed(rate):
+    found = steps(lambda k: k * DT * rate, ticks=500)
+    np.testing.assert_array_equal(found[:, 1], np.arange(500))
+    assert np.abs(found[:, 0] - found[:, 1] * DT * rate - PHASE * DT).max() < 1e-3
+
+
+@pytest.mark.parametrize("pause", [0.003, 0.009, 0.05, 1.0])
+def test_a_plant_that_stands_still_and_goes_on_is_followed_again(pause):
+    found = steps(lambda k: k * DT + (pause if k >= 20 else 0.0), ticks=160)
+    last = found[-20:]
+    np.testing.assert_array_equal(np.diff(last[:, 1]), 1.0)
+    assert (last[:, 0] - (last[:, 1] * DT + pause) < (PHASE + PATIENCE) * DT).all()
+    answered = set(found[:, 1])
+    assert set(range(int(last[-1, 1]))) - answered <= set(range(20, 30))
+
+
+def test_one_late_sample_moves_nothing():
+    found = steps(lambda k: k * DT + (0.0045 if k == 20 else 0.0))
+    np.testing.assert_array_equal(found[:, 1], np.arange(60))
+    np.testing.assert_allclose(found[21:, 0], (np.arange(21, 60) + PHASE) * DT, atol=1e-9)
+
+
+def test_a_step_that_ends_in_the_next_tick_leaves_nothing_out():
+    found = steps(lambda k: k * DT, work=DT + 1e-4)
+    assert np.diff(found[:, 1]).max() <= 2.0
+    short = steps(lambda k: k * DT, work=0.9 * DT)
+    np.testing.assert_array_equal(short[:, 1], np.arange(60))
+
+
+class Watched:
+    def __init__(self):
+        self.bus = InProcessBus(TOPICS)
+        plan = WatchdogPlan(Path(), LOW, HIGH, DT, HOME, 0.1, 0.1, frozenset({0}), 40, os.getpid(), os.getpid())
+        self.watchdog = Watchdog(plan, self.bus)
+
+    def says(self, tick, now, target=HOME):
+        self.bus.publish("setpoint", Setpoint(tick, now, np.array([G, 0.0, 0.0, 0.0]), np.array(target)).pack())
+
+
+def test_the_watchdog_is_silent_while_control_speaks():
+    watched = Watched()
+    for k in range(50):
+        watched.bus.publish("sample", sample(k, k * DT).pack())
+        watched.says(k, k * DT)
+        assert watched.watchdog.check(k * DT, gone=False) is None
+
+
+@pytest.mark.parametrize(("gone", "within"), [(True, 0.001), (False, 0.04)])
+def test_it_commands_soon_after_control_is_gone_or_silent(gone, within):
+    watched = Watched()
+    watched.bus.publish("sample", sample(0, 0.0, level((1.0, 2.0, 1.5))).pack())
+    watched.says(0, 0.0, target=(1.0, 2.0, 1.5))
+    watched.watchdog.check(0.0, gone=False)
+    now, found = 0.0, None
+    while found is None and now < 1.0:
+        now += 0.001
+        if round(now / DT, 6) == round(now / DT):
+            watched.bus.publish("sample", sample(round(now / DT), now, level((1.0, 2.0, 1.5))).pack())
+        found = watched.watchdog.check(now, gone=gone)
+    assert now <= within
+    np.testing.assert_allclose(found.u, [G, 0.0, 0.0, 0.0], atol=1e-6)  # it holds where the vehicle should be
+
+
+def test_it_commands_if_control_never_spoke():
+    watched, found = Watched(), []
+    for k in range(20):
+        watched.bus.publish("sample", sample(k, k * DT).pack())
+        found.append(watched.watchdog.check(k * DT, gone=True))
+    assert sum(each is not None for each in found) >= 18
+
+
+def test_it_lands_the_vehicle_and_is_done():
+    watched = Watched()
+    x, acting, modes = level((0.0, 0.0, 0.6)), np.array([G, 0.0, 0.0, 0.0]), []
+    for k in range(400):
+        watched.bus.publish("sample", sample(k, k * DT, x).pack())
+        found = watched.watchdog.check(k * DT, gone=True)
+        if watched.watchdog.done:
+            break
+        u = acting if found is None else found.u
+        x, acting = moved(x, acting), u
+        modes.append(x[2])
+    assert watched.watchdog.done
+    assert 0.0 < x[2] < 0.15
+
+
+def rows(first, n, mode=Mode.POLICY):
+    made = np.zeros((n, len(COLUMNS)))
+    made[:, 0] = np.arange(first, first + n)
+    made[:, -1] = mode
+    return FlightRows(made).pack()
+
+
+def test_the_recorder_fills_gaps_from_reports_and_goes_on_after_a_kill(tmp_path):
+    bus, path = InProcessBus(TOPICS), tmp_path / "flight.csv"
+    recorder = Recorder(path, bus, DT)
+    bus.publish("flight", rows(0, 10))
+    assert recorder.step() == 10
+    assert recorder.step() == 0
+    bus.publish("flight", rows(5, 20))
+    assert recorder.step() == 15
+    with path.open("a") as file:
+        file.write("25,0.5,0")  # torn
+    again = Recorder(path, bus, DT)
+    bus.publish("flight", rows(10, 30))
+    assert again.step() == 15
+    np.testing.assert_array_equal(read_log(path)[:, 0], np.arange(40))
+
+
+def test_it_follows_the_plant_when_nobody_reports_any_more(tmp_path):
+    bus = InProcessBus(TOPICS)
+    recorder = Recorder(tmp_path / "flight.csv", bus, DT)
+    bus.publish("flight", rows(0, 3))
+    recorder.step()
+    u = np.array([9.0, 0.1, 0.2, 0.3])
+    for k in range(3, 12):
+        bus.publish("sample", sample(k, k * DT).pack())
+        assert recorder.behind() == (k > 7)
+        if k > 7:
+            bus.publish("fallback", Setpoint(k, k * DT, u, HOME).pack())
+            assert recorder.follow() == 1
+            assert recorder.follow() == 0
+    found = read_log(tmp_path / "flight.csv")
+    np.testing.assert_array_equal(found[:, 0], [0, 1, 2, 8, 9, 10, 11])
+    assert (found[3:, -1] == Mode.WATCHDOG).all()
+    np.testing.assert_allclose(found[-1, COMMAND], u)
+
+
+def test_a_full_disk_ends_the_log_and_nothing_else(tmp_path):
+    bus = InProcessBus(TOPICS | {"ready.recorder": 4096})
+    recorder = Recorder(tmp_path / "gone" / "flight.csv", bus, DT)
+    assert recorder.failed
+    bus.publish("flight", rows(0, 3))
+    assert recorder.step() == 0
+    assert recorder.follow() == 0
+
+
+def test_a_lifeline_tells_at_once():
+    process = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+    line = Lifeline(process.pid)
+    assert not line.gone()
+    os.kill(process.pid, signal.SIGKILL)
+    assert line.gone(5.0)
+    process.wait()
+
+
+def test_cores_are_shared_out():
+    assert cores_of("fly", {2, 3, 5}) == {2}
+    assert cores_of("learn", {2, 3, 5}) == {3, 5}
+    assert cores_of("fly", {4}) == cores_of("learn", {4}) == {4}
+
+
+def test_the_accounts_are_those_of_the_durations():
+    found = summary(np.array([1e-4] * 98 + [3e-3, 0.2]))
+    assert found["p50"] == pytest.approx(0.1)
+    assert found["max"] == pytest.approx(200.0)
+    assert sum(found["histogram"]) == 100
+    assert found["histogram"][-1] == 1
+    assert summary(np.array([]))["p99"] is None
