@@ -56,7 +56,7 @@ def spec_in(folder, controller, **changes):
     return replace(
         LiveSpec(
             controller, ("residual", "policy"), start, None, Scenario(), "small", level(np.array([0.0, 0.0, 0.5])),
-            HOME, made.limits, LOW, HIGH, DT, 1, 50, SECONDS, 0, folder, mains=MAINS | DRILL,
+            HOME, made.limits, LOW, HIGH, DT, 1, 150, SECONDS, 0, folder, mains=MAINS | DRILL,
         ),
         **changes,
     )  # fmt: skip

@@ -37,6 +37,7 @@ class ControlLoop:
         self._commands: deque[np.ndarray] = deque(maxlen=plan.delay_ticks + 1)
         self._known = {"sample": 0, "order": 0}
         self._landing, self._gap, self._ticks = "", "", 0
+        self._ended: tuple[Sample, Sample] | None = None
 
     def new_sample(self) -> bool:
         """Return whether there is a measurement that has not been answered."""
@@ -82,6 +83,7 @@ class ControlLoop:
             self.land(LANDING)
         if t >= self.plan.seconds - 0.5 * self.plan.dt:
             self.land(LANDING)
+        self._watch()
         if self.mode == Mode.POLICY:
             self.intake.poll(t)
         self._ticks += 1
@@ -164,8 +166,13 @@ class ControlLoop:
             self.pilot.accepted(accepted)
         self._finish_row(None if lost else accepted)
         self._commands.append(accepted)
-        if lost:
+        self._ended = None if lost else (before, sample)
+
+    def _watch(self) -> None:
+        """Judge the tick that has ended by what its measurement says."""
+        if self._ended is None:
             return
+        (before, sample), self._ended = self._ended, None
         self._fallback.hover.feel(before.state, sample.state, self._commands[0])
         if self.mode == Mode.POLICY:
             a = (sample.state[12:] - before.state[12:]) / self.plan.dt
