@@ -14,7 +14,7 @@ from live_processes import DT, HOME, level, moved
 from retrim.onboard.accounts import summary
 from retrim.onboard.control_process import PATIENCE, PHASE, Schedule
 from retrim.onboard.guard import G, Mode
-from retrim.onboard.messages import COLUMNS, COMMAND, FlightRows, Sample, Setpoint
+from retrim.onboard.messages import COLUMNS, FlightRows, Sample, Setpoint
 from retrim.onboard.realtime import Lifeline, cores_of
 from retrim.onboard.recorder import Recorder, read_log
 from retrim.onboard.watchdog import Watchdog, WatchdogPlan
@@ -145,7 +145,7 @@ def rows(first, n, mode=Mode.POLICY):
 
 def test_the_recorder_fills_gaps_from_reports_and_goes_on_after_a_kill(tmp_path):
     bus, path = InProcessBus(TOPICS), tmp_path / "flight.csv"
-    recorder = Recorder(path, bus, DT)
+    recorder = Recorder(path, bus)
     bus.publish("flight", rows(0, 10))
     assert recorder.step() == 10
     assert recorder.step() == 0
@@ -153,38 +153,36 @@ def test_the_recorder_fills_gaps_from_reports_and_goes_on_after_a_kill(tmp_path)
     assert recorder.step() == 15
     with path.open("a") as file:
         file.write("25,0.5,0")  # torn
-    again = Recorder(path, bus, DT)
+    again = Recorder(path, bus)
     bus.publish("flight", rows(10, 30))
     assert again.step() == 15
     np.testing.assert_array_equal(read_log(path)[:, 0], np.arange(40))
 
 
-def test_it_follows_the_plant_when_nobody_reports_any_more(tmp_path):
-    bus = InProcessBus(TOPICS)
-    recorder = Recorder(tmp_path / "flight.csv", bus, DT)
-    bus.publish("flight", rows(0, 3))
+def test_what_the_watchdog_flies_is_written_without_a_gap(tmp_path):
+    watched = Watched()
+    recorder = Recorder(tmp_path / "flight.csv", watched.bus)
+    for k in range(30):
+        now = k * DT
+        watched.bus.publish("sample", sample(k, now).pack())
+        if k < 10:  # control reports with a tick of delay, and dies
+            watched.says(k, now)
+            watched.bus.publish("flight", rows(0, k)) if k else None
+        watched.watchdog.check(now, gone=k >= 10)
     recorder.step()
-    u = np.array([9.0, 0.1, 0.2, 0.3])
-    for k in range(3, 12):
-        bus.publish("sample", sample(k, k * DT).pack())
-        assert recorder.behind() == (k > 7)
-        if k > 7:
-            bus.publish("fallback", Setpoint(k, k * DT, u, HOME).pack())
-            assert recorder.follow() == 1
-            assert recorder.follow() == 0
     found = read_log(tmp_path / "flight.csv")
-    np.testing.assert_array_equal(found[:, 0], [0, 1, 2, 8, 9, 10, 11])
-    assert (found[3:, -1] == Mode.WATCHDOG).all()
-    np.testing.assert_allclose(found[-1, COMMAND], u)
+    np.testing.assert_array_equal(found[:, 0], np.arange(30))
+    np.testing.assert_allclose(found[:, 1][10:], DT * np.arange(10, 30))
+    assert (found[:10, -1] == Mode.POLICY).all()
+    assert (found[10:, -1] == Mode.WATCHDOG).all()
 
 
 def test_a_full_disk_ends_the_log_and_nothing_else(tmp_path):
     bus = InProcessBus(TOPICS | {"ready.recorder": 4096})
-    recorder = Recorder(tmp_path / "gone" / "flight.csv", bus, DT)
+    recorder = Recorder(tmp_path / "gone" / "flight.csv", bus)
     assert recorder.failed
     bus.publish("flight", rows(0, 3))
     assert recorder.step() == 0
-    assert recorder.follow() == 0
 
 
 def test_a_lifeline_tells_at_once():

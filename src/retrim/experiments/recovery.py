@@ -27,7 +27,7 @@ def timeline(name: str, home: Array, seconds: float) -> tuple[np.ndarray, Extern
     Returns:
         Times [s], the effects at each (leading axis), and the samples at which they differ from the one before.
     """
-    times = np.linspace(0.0, seconds, round(seconds / STEP), endpoint=False)
+    times = np.linspace(0.0, seconds, max(1, round(seconds / STEP)), endpoint=False)
     acting, x = disturbance(name), State.at(home)
     found: ExternalEffects = jax.vmap(lambda t: acting(t, x))(jnp.asarray(times, dtype=x.p.dtype))
     values = np.concatenate([np.asarray(leaf).reshape(len(times), -1) for leaf in jax.tree.leaves(found)], axis=1)

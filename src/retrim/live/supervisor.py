@@ -58,7 +58,7 @@ class Supervisor:
             os.sched_setaffinity(0, cores_of("learn"))
         self.bus = SharedMemoryBus.create(
             {"sample": 4096, "setpoint": 4096, "fallback": 4096, "order": 4096, "ended": 4096, "world": 4096}
-            | {"status": 65536, "flight": rows}
+            | {"status": 65536, "flight": rows, "fallback.flight": rows}
             | {f"ready.{role}": 8192 for role in roles}
             | {f"parameters.{name}": size + 100_000 for name, size in half.items()}
             | {slot(layer, i): learnt for layer in ("residual", "policy") for i in range(SLOTS)}
@@ -195,7 +195,7 @@ class Supervisor:
                 self.processes["control"].pid, parent,
             )  # fmt: skip
         if role == "recorder":
-            return RecorderPlan(bus, s.folder / "flight.csv", s.dt, self.processes["control"].pid, parent)
+            return RecorderPlan(bus, s.folder / "flight.csv", s.dt, parent)
         layer: Layer = "residual" if role == "residual" else "policy"
         return LearnerPlan(bus, layer, s.start, s.reference, s.seed, s.controller.base, parent)
 

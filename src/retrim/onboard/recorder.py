@@ -9,12 +9,10 @@ import numpy as np
 from ..errors import MessageError
 from ..transport.bus import Bus
 from ..transport.shared_memory import SharedMemoryBus
-from .guard import Mode
-from .messages import COLUMNS, FlightRows, Sample, Setpoint, pack_note, unpack_note
+from .messages import COLUMNS, FlightRows, pack_note, unpack_note
 from .realtime import Lifeline
 
-SOME = 5  # ticks
-SILENCE = 1.0  # [s] without a sample, after which a flight without its pilot is over
+SILENCE = 2.0  # [s] without a tick, after which a flight is over
 
 
 @dataclass(frozen=True)
@@ -26,8 +24,6 @@ class RecorderPlan:
     path: Path
     """Of the log, a CSV file with a line per tick."""
     dt: float
-    control: int
-    """The process that flies; the log ends with the flight."""
     parent: int
     """Who takes the bus away; if it is gone, the recorder does."""
 
@@ -35,10 +31,9 @@ class RecorderPlan:
 class Recorder:
     """Appends the ticks that are new. A gap is filled from the last seconds of flight, which every report holds."""
 
-    def __init__(self, path: Path, bus: Bus, dt: float) -> None:
-        self._path, self._bus, self._version, self._dt = path, bus, 0, dt
-        self._start: float | None = None
-        self._following = False
+    def __init__(self, path: Path, bus: Bus) -> None:
+        self._path, self._bus = path, bus
+        self._versions = {"flight": 0, "fallback.flight": 0}
         self.failed: str | None = None
         self._last = -1
         try:
@@ -48,45 +43,18 @@ class Recorder:
 
     def step(self) -> int:
         """Write what is new; return how many ticks that were. A full disk ends the log and not the flight."""
-        message = self._bus.latest("flight", self._version)
+        return self._take("flight") + self._take("fallback.flight")
+
+    def _take(self, topic: str) -> int:
+        message = self._bus.latest(topic, self._versions[topic])
         if message is None or self.failed:
             return 0
-        self._version = message.version
+        self._versions[topic] = message.version
         try:
             rows = FlightRows.unpack(message.data).rows
         except MessageError:
             return 0
-        new = self._append(rows[rows[:, 0] > self._last])
-        self._following = self._following and not new
-        return new
-
-    def follow(self) -> int:
-        """Write what the plant says and the watchdog commands, where nobody reports any more; return how many ticks."""
-        sample, command = self._bus.latest("sample"), self._bus.latest("fallback")
-        if sample is None or self.failed:
-            return 0
-        try:
-            said = Sample.unpack(sample.data)
-            answer = None if command is None else Setpoint.unpack(command.data)
-        except MessageError:
-            return 0
-        u = answer.u if answer is not None and answer.tick == said.tick else said.accepted
-        self._start = said.t - said.tick * self._dt if self._start is None else self._start
-        head, tail = [said.tick, said.t - self._start, said.age], [0.0, 0.0, 0.0, said.age, 0.0, Mode.WATCHDOG]
-        row = np.concatenate([head, said.state, said.truth, u, tail])
-        if said.tick <= self._last:
-            return 0
-        self._following = True
-        return self._append(row[None])
-
-    def behind(self) -> bool:
-        """Return whether the plant is some ticks ahead of the reports: the process that flies hangs."""
-        sample = self._bus.latest("sample")
-        try:
-            ahead = 0 if sample is None else Sample.unpack(sample.data).tick - self._last
-        except MessageError:
-            return False
-        return self._following or ahead > SOME
+        return self._append(rows[rows[:, 0] > self._last])
 
     def _append(self, new: np.ndarray) -> int:
         try:
@@ -127,17 +95,13 @@ def _mended(path: Path) -> int:
 def record(plan: RecorderPlan) -> None:
     """Write until the flight is over: the main function of the process."""
     bus = SharedMemoryBus(plan.folder)
-    recorder, control = Recorder(plan.path, bus, plan.dt), Lifeline(plan.control)
+    recorder = Recorder(plan.path, bus)
     bus.publish("ready.recorder", pack_note("ready", failed=recorder.failed))
     heard = time.monotonic()
     while not (_landed(bus) or bus.latest("ended")) and time.monotonic() < heard + SILENCE:
-        silent = control.gone(plan.dt / 4)
-        if recorder.step() or ((silent or recorder.behind()) and recorder.follow()):
+        if recorder.step() or bus.latest("sample") is None:
             heard = time.monotonic()
-        if silent:
-            time.sleep(plan.dt / 4)
-        elif bus.latest("sample") is None:
-            heard = time.monotonic()  # on the ground
+        time.sleep(plan.dt)
     recorder.step()
     if Lifeline(plan.parent).gone():
         bus.remove()

@@ -1,6 +1,7 @@
 """The process that goes on commanding when the one that flies has died or hangs: nothing but the fallback."""
 
 import time
+from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,11 +11,12 @@ from ..errors import MessageError
 from ..transport.bus import Bus
 from ..transport.shared_memory import SharedMemoryBus
 from .guard import Fallback, GeometricHover, Mode
-from .messages import Sample, Setpoint, pack_note
+from .messages import COMMAND, FlightRows, Sample, Setpoint, pack_note
 from .realtime import Lifeline, be_punctual
 
 PATIENCE = 1.6  # ticks without a command
 CHECK_EVERY = 0.002  # [s]
+ROWS = 50  # of a report: what it saw before it took over, too
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,8 @@ class Watchdog:
         self._seen = 0
         self._next = 0.0
         self._target = plan.home
+        self._rows: deque[np.ndarray] = deque(maxlen=ROWS)
+        self._start = 0.0
 
     def check(self, now: float, gone: bool) -> Setpoint | None:
         """Return the command that was published, if one was due.
@@ -74,6 +78,8 @@ class Watchdog:
         self.done = mode == Mode.LANDED
         setpoint = Setpoint(self._sample.tick, now, u, self._target, self.done)
         self.bus.publish("fallback", setpoint.pack())
+        self._rows[-1][COMMAND], self._rows[-1][-1] = u, Mode.WATCHDOG
+        self.bus.publish("fallback.flight", FlightRows(np.stack(self._rows)).pack())
         return setpoint
 
     def _hear(self, data: bytes) -> None:
@@ -96,6 +102,12 @@ class Watchdog:
             return False
         if self._sample is not None and sample.tick == self._sample.tick + 1:
             self._fallback.hover.feel(self._sample.state, sample.state, sample.accepted)
+            self._rows[-1][COMMAND] = sample.accepted
+        if self._sample is None:
+            self._start = sample.t
+        accounts = [0.0, 0.0, 0.0, sample.age, 0.0, Mode.POLICY]
+        head = [sample.tick, sample.t - self._start, sample.age]
+        self._rows.append(np.concatenate([head, sample.state, sample.truth, sample.accepted, accounts]))
         self._sample = sample
         return True
 
