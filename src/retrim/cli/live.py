@@ -152,7 +152,7 @@ def _shown_on(screen: Live, events: LiveEvents) -> Callable[[Status, list[Event]
             last[0] = status.t
             console.print(_line(status), markup=False, soft_wrap=True)
         for event in new:
-            if event.kind not in ("policy", "residual"):
+            if event.kind not in ("policy", "residual", "rejected"):
                 screen.console.print(f"{event.t:.1f} s {event.kind}: {event.note}", markup=False, soft_wrap=True)
 
     return show

@@ -29,7 +29,7 @@ class LiveEvents:
         for version in control.get("given_up", []):
             if version not in self._given_up:
                 self._given_up.add(version)
-                new.append(Event(t, "rejected", f"policy: version {version} is taken back, or comes from one that was"))
+                new.append(Event(t, "guard", f"policy: version {version} is taken back, or comes from one that was"))
         new += [Event(t, "rejected", said) for said in status.rejections]
         for what, count in control.get("refused", {}).items():
             if count > self._refused.get(what, 0):
