@@ -131,5 +131,9 @@ def learnt_in(request: LiveRequest, bus: Bus, status: Status) -> LearnerState | 
 
 
 def complaints(folder: Path) -> list[Path]:
-    """Return what the processes of a flight have written to their standard outputs, where it is not empty."""
-    return [path for path in sorted(folder.glob("*.log")) if path.stat().st_size]
+    """Return the files with what processes wrote to their standard outputs; those that are empty are removed."""
+    found = sorted(folder.glob("*.log"))
+    for path in found:
+        if not path.stat().st_size:
+            path.unlink()
+    return [path for path in found if path.exists()]
