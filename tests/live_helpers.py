@@ -44,10 +44,8 @@ def setup() -> Setup:
 
 
 def plan(controller, *, folder=Path(), parent=0, window=50, delay_ticks=1, seconds=1e9, **limits) -> ControlPlan:
-    box = Limits(np.array([-3.0, -3.0, -0.3]), np.array([3.0, 3.0, 4.0]), **limits)
-    return ControlPlan(
-        folder, controller, box, LOW, HIGH, DT, delay_ticks, window, 0.1, seconds, frozenset({0}), 20, parent
-    )  # fmt: skip
+    box = Limits(np.array([-3.0, -3.0, -0.3]), np.array([3.0, 3.0, 4.0]), LOW, HIGH, **limits)
+    return ControlPlan(folder, controller, box, DT, delay_ticks, window, seconds, frozenset({0}), 20, parent)
 
 
 def holding(gains=(4.0, 3.5), *, fitted=False):

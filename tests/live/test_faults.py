@@ -9,7 +9,7 @@ from subprocess import Popen
 import numpy as np
 import pytest
 
-from live_helpers import HIGH, LOW, holding, plan
+from live_helpers import holding, plan
 from live_processes import DT, HOME, DrillPlan, level
 from retrim.config import Scenario
 from retrim.live.events import LiveEvents
@@ -56,7 +56,7 @@ def spec_in(folder, controller, **changes):
     return replace(
         LiveSpec(
             controller, ("residual", "policy"), start, None, Scenario(), "small", level(np.array([0.0, 0.0, 0.5])),
-            HOME, made.limits, LOW, HIGH, DT, 1, 150, SECONDS, 0, folder, mains=MAINS | DRILL,
+            HOME, made.limits, DT, 1, 150, SECONDS, 0, folder, mains=MAINS | DRILL,
         ),
         **changes,
     )  # fmt: skip

@@ -101,8 +101,10 @@ def test_what_parameters_alone_decide_is_computed_once():
 
 
 def test_what_has_no_numpy_form_is_named_before_take_off():
-    with pytest.raises(ConfigError, match="operation 'sort' of this controller has no NumPy form"):
+    with pytest.raises(ConfigError, match="operation 'sort' in this controller has no NumPy form"):
         numpy_program(lambda p, x: jnp.sort(x), jnp.array(0.0), X)
+    with pytest.raises(ConfigError, match="rounding away from zero in this controller has no NumPy form"):
+        numpy_program(lambda p, x: lax.round(x), jnp.array(0.0), X)
 
 
 @pytest.mark.parametrize(

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from live_processes import moved, rotation
-from retrim.onboard.guard import UP, Fallback, GeometricHover, Limits, Mode, turn
+from retrim.onboard.guard import HOVER, UP, Fallback, G, GeometricHover, Limits, Mode, turn
+from retrim.physics.state import STANDARD_GRAVITY, Command
 
-DT, G = 0.02, 9.81
+DT = 0.02
 LOW, HIGH = np.array([0.0, -6.0, -6.0, -2.0]), np.array([30.0, 6.0, 6.0, 2.0])
-LIMITS = Limits(np.array([-3.0, -3.0, -0.3]), np.array([3.0, 3.0, 4.0]))
+LIMITS = Limits(np.array([-3.0, -3.0, -0.3]), np.array([3.0, 3.0, 4.0]), LOW, HIGH)
 
 
 def state(p=(0.0, 0.0, 1.0), turned=(0.0, 0.0, 0.0), v=(0.0, 0.0, 0.0)):
@@ -39,6 +40,11 @@ def test_each_limit_is_named(x, said):
     assert said in LIMITS.broken(x)
 
 
+def test_it_hovers_by_the_same_gravity_as_the_models():
+    assert G == STANDARD_GRAVITY
+    np.testing.assert_array_equal(HOVER, Command.hover().vector())
+
+
 def test_a_flight_within_limits_breaks_none():
     assert LIMITS.broken(state((2.9, -2.9, 0.0), (1.3, 0.0, 0.0), (0.0, 14.0, 0.0))) is None
 
@@ -56,7 +62,7 @@ def test_the_turn_is_the_smallest_that_points_the_thrust():
 
 @pytest.mark.parametrize("push", [(0.0, 0.0, 0.0), (2.0, -2.0, 2.0), (-2.0, 0.0, -2.0)])
 def test_it_holds_a_place_from_a_tumble_and_against_a_push(push):
-    hover, last = GeometricHover(LOW, HIGH, DT), []
+    hover, last = GeometricHover(LIMITS, DT), []
 
     def decide(x, acting):
         if last:
@@ -71,8 +77,8 @@ def test_it_holds_a_place_from_a_tumble_and_against_a_push(push):
 
 @pytest.mark.parametrize("push", [(0.0, 0.0, 0.0), (1.5, 0.0, 2.0)])
 def test_the_fallback_holds_then_sinks_then_stops(push):
-    hover = GeometricHover(LOW, HIGH, DT)
-    fallback, modes, last = Fallback(hover, floor=0.1), [], []
+    hover = GeometricHover(LIMITS, DT)
+    fallback, modes, last = Fallback(hover), [], []
 
     def decide(x, acting):
         if last:
@@ -92,7 +98,7 @@ def test_the_fallback_holds_then_sinks_then_stops(push):
 
 
 def test_blind_it_levels_and_sinks_and_stops_after_two_seconds():
-    fallback = Fallback(GeometricHover(LOW, HIGH, DT), floor=0.1)
+    fallback = Fallback(GeometricHover(LIMITS, DT))
     x = state((0.0, 0.0, 3.0), (0.4, 0.2, 0.0))
     found = [fallback.step(x, False, x[:3], land=False) for _ in range(102)]
     assert {mode for _, mode in found[:99]} == {Mode.BLIND}
@@ -103,6 +109,6 @@ def test_blind_it_levels_and_sinks_and_stops_after_two_seconds():
     assert (found[50][0][1:] == 0.0).all()
     assert 0.9 * G < found[50][0][0] < G
     # When the state is known again, the vehicle holds.
-    seen = Fallback(GeometricHover(LOW, HIGH, DT), floor=0.1)
+    seen = Fallback(GeometricHover(LIMITS, DT))
     seen.step(x, False, x[:3], land=False)
     assert seen.step(x, True, x[:3], land=False)[1] == Mode.HOLD

@@ -13,12 +13,14 @@ from live_helpers import HIGH, LOW, TOPICS
 from live_processes import DT, HOME, level, moved
 from retrim.onboard.accounts import summary
 from retrim.onboard.control_process import PATIENCE, PHASE, Schedule
-from retrim.onboard.guard import G, Mode
+from retrim.onboard.guard import G, Limits, Mode
 from retrim.onboard.messages import COLUMNS, FlightRows, Sample, Setpoint
 from retrim.onboard.realtime import Lifeline, cores_of
 from retrim.onboard.recorder import Recorder, read_log
 from retrim.onboard.watchdog import Watchdog, WatchdogPlan
 from retrim.transport.in_process import InProcessBus
+
+LIMITS = Limits(np.full(3, -5.0), np.full(3, 5.0), LOW, HIGH)
 
 
 def sample(tick, sent, x=None):
@@ -82,7 +84,7 @@ def test_a_step_that_ends_in_the_next_tick_leaves_nothing_out():
 class Watched:
     def __init__(self):
         self.bus = InProcessBus(TOPICS)
-        plan = WatchdogPlan(Path(), LOW, HIGH, DT, HOME, 0.1, 0.1, frozenset({0}), 40, os.getpid(), os.getpid())
+        plan = WatchdogPlan(Path(), LIMITS, DT, HOME, frozenset({0}), 40, os.getpid(), os.getpid())
         self.watchdog = Watchdog(plan, self.bus)
 
     def says(self, tick, now, target=HOME):

@@ -1,6 +1,5 @@
 """``retrim live``."""
 
-import json
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -16,7 +15,7 @@ from ..experiments.asked import flown_reference, loaded
 from ..experiments.figures import picture
 from ..experiments.interrupts import interrupts_only_set
 from ..experiments.limits import check_seeds
-from ..experiments.outputs import clear_outputs, write_learnt
+from ..experiments.outputs import clear_outputs, write_events, write_learnt
 from ..experiments.run import INTERRUPTED, Run
 from ..experiments.tables.document import TableSection
 from ..experiments.training import train
@@ -110,7 +109,7 @@ def live(
 
 def _fly(request: LiveRequest, run: Run) -> int:
     """Fly one flight, and show and write what it leaves."""
-    events, status = LiveEvents(), None
+    events = LiveEvents()
     with Supervisor(live_spec(request)) as supervisor:
         with RichReporter().progress("warming up") as advance:
             for waiting, _ in supervisor.warm_up():
@@ -131,8 +130,7 @@ def _fly(request: LiveRequest, run: Run) -> int:
         found, seeds=[request.seed], preset=request.setup.preset.name, seconds=float(flight.log.t[-1]),
         ended=status.ended, scheduling=supervisor.refused, histograms_ms=histograms(rows),
     )  # fmt: skip
-    said = [{"event": event.kind, "t": round(event.t, 6), "note": event.note} for event in events.all]
-    run.write_text("events.jsonl", "".join(json.dumps(line) + "\n" for line in said))
+    write_events([flight], run.folder)
     write_learnt([flight], request.setup.preset, run.folder)
     lines = tuple((row["metric"], UNITS.get(row["metric"], ""), _shown(row["value"])) for row in found)
     show_table(TableSection(("figure", "unit", "value"), lines, f"live, {flight.log.t[-1]:.1f} s"))

@@ -85,8 +85,8 @@ class Flight:
 
     @property
     def swaps(self) -> tuple[float, ...]:
-        """Times at which a new policy took over [s]."""
-        return tuple(e.t for e in self.log.events if e.kind == "policy")
+        """Times at which a new policy took over [s]; a live one may do so while landing, which is no part of this."""
+        return tuple(e.t for e in self.log.events if e.kind == "policy" and e.t <= self.log.t[-1])
 
     @property
     def events(self) -> tuple[Event, ...]:

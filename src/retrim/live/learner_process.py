@@ -27,6 +27,7 @@ from ..transport.bus import Bus
 from ..transport.shared_memory import SharedMemoryBus
 from .controllers import flown
 from .published import flown_update, keep, newest_update
+from .states import state_of
 
 CHECK_EVERY = 0.005  # [s]
 VERDICT = 1.0  # [s] that a policy waits to be taken or refused; after it, it counts as lost
@@ -112,9 +113,8 @@ class LearnerLoop:
             return
         dtype = np.asarray(self.setup.flown.home()).dtype
         for row in rows[rows[:, 0] > self._last_tick]:
-            x, u = row[MEASURED].astype(dtype), row[COMMAND].astype(dtype)
-            state = State(*(jnp.asarray(part) for part in (x[:3], x[3:12].reshape(3, 3), x[12:])))
-            self._buffer.push(float(row[1]), state, Command(jnp.asarray(u[0]), jnp.asarray(u[1:])), float(row[2]))
+            state, u = state_of(row[MEASURED], dtype), jnp.asarray(row[COMMAND], dtype)
+            self._buffer.push(float(row[1]), state, Command.of(u), float(row[2]))
             self._last_tick, self._new_ticks = int(row[0]), self._new_ticks + 1
 
     def _publish(self, update: Update) -> None:

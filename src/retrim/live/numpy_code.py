@@ -14,10 +14,9 @@ import numpy as np
 from jax import random
 from jax.extend.core import ClosedJaxpr, Jaxpr, Var
 
-from ..errors import ConfigError
 from ..onboard import lax, threefry
 from ..onboard.program import ProgramSource
-from .primitives import EXPRESSIONS
+from .primitives import EXPRESSIONS, no_form
 
 CONSTANT, PARAMETER, INPUT = range(3)
 INLINE = ("jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "remat", "checkpoint")
@@ -91,16 +90,13 @@ class _Writer:
             elif name in EXPRESSIONS:
                 results = self._write(eqn, operands)
             else:
-                raise ConfigError(f"operation {name!r} of this controller has no NumPy form, so it cannot fly live")
+                raise no_form(f"operation {name!r}")
             found |= dict(zip(eqn.outvars, results, strict=True))
         return [read(atom) for atom in jaxpr.outvars]
 
     def _write(self, eqn: Any, operands: list[Ref]) -> list[Ref]:
         names, kind = [name for name, _ in operands], max((kind for _, kind in operands), default=CONSTANT)
-        try:
-            text = EXPRESSIONS[eqn.primitive.name](eqn, *names)
-        except NotImplementedError as error:
-            raise ConfigError(f"{error}: it has no NumPy form, so this controller cannot fly live") from error
+        text = EXPRESSIONS[eqn.primitive.name](eqn, *names)
         many = eqn.primitive.multiple_results
         if text in names:  # nothing happens to it
             return [operands[names.index(text)]]
@@ -109,7 +105,7 @@ class _Writer:
             return [self.constant(v) for v in (value if many else [value])]
         if text not in self._known:
             self._known[text] = (f"v{len(self.lines)}", kind)
-            self.lines.append((*self._known[text][:1], text, kind, tuple(names)))
+            self.lines.append((f"v{len(self.lines)}", text, kind, tuple(names)))
         whole = self._known[text]
         return [self._item(whole, i) for i in range(len(eqn.outvars))] if many else [whole]
 

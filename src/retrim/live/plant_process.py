@@ -12,17 +12,18 @@ import numpy as np
 from ..config.scenario import Scenario
 from ..errors import MessageError, PlantError
 from ..experiments.compile_cache import enable_compile_cache
+from ..experiments.flying import FLOOR
 from ..onboard.messages import Sample, Setpoint, pack_note
 from ..onboard.orders import wait_for_take_off
 from ..onboard.realtime import Lifeline, be_punctual, sleep_until
-from ..physics.state import Command, State
-from ..plants.plant import Measurement, Plant
+from ..physics.state import Command
+from ..plants.plant import Measurement, Plant, as_numpy
 from ..transport.bus import Bus
 from ..transport.shared_memory import SharedMemoryBus
+from .states import state_of, vector_of
 
 SHARE = 0.6  # of a tick, for which a command is waited for; the rest is for the simulation
 ALONE = 5.0  # [s] without a command, after which a plant without a supervisor ends
-GROUND = -0.5  # [m]; below it a vehicle has crashed
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,7 @@ def simulate(plan: PlantPlan) -> None:
     jax.config.update("jax_cpu_enable_async_dispatch", False)  # a tick is computed here and now, by no pool of threads
     enable_compile_cache()
     bus, parent = SharedMemoryBus(plan.folder), Lifeline(plan.parent)
-    x0 = State(*map(jnp.asarray, _parts(plan.x0)))
+    x0 = state_of(plan.x0, jnp.zeros(0).dtype)
     try:
         with plan.scenario.make(plan.vehicle, dt=plan.dt, seed=plan.seed) as plant:
             for _ in range(2):  # every program compiled, and run
@@ -69,15 +70,21 @@ def simulate(plan: PlantPlan) -> None:
 def _flown(plan: PlantPlan, plant: Plant, bus: Bus, parent: Lifeline, measurement: Measurement, epoch: float) -> str:
     """Fly, and return why the flight ended."""
     tick, late, held, unanswered = 0, 0, 0, 0
-    u = accepted = np.asarray(Command.hover().vector(), dtype=float)
+    u = accepted = as_numpy(Command.hover()).astype(float)
     while True:
         sleep_until(epoch + tick * plan.dt)
         now = time.monotonic()
         sample = Sample(
-            tick, measurement.t, now, measurement.age, _vector(measurement.x), _vector(measurement.true_state), accepted
+            tick,
+            measurement.t,
+            now,
+            measurement.age,
+            vector_of(measurement.x),
+            vector_of(measurement.true_state),
+            accepted,
         )
         bus.publish("sample", sample.pack())
-        if not np.isfinite(sample.truth).all() or sample.truth[2] < GROUND:
+        if not np.isfinite(sample.truth).all() or sample.truth[2] < FLOOR:
             return "crashed"
         setpoint = _answer(bus, tick, epoch + (tick + SHARE) * plan.dt)
         unanswered = 0 if setpoint is not None else unanswered + 1
@@ -91,13 +98,13 @@ def _flown(plan: PlantPlan, plant: Plant, bus: Bus, parent: Lifeline, measuremen
             u = setpoint.u
         dtype = measurement.x.p.dtype
         measurement, taken = plant.step(Command(jnp.asarray(u[0], dtype), jnp.asarray(u[1:], dtype)))
-        accepted, tick = np.asarray(taken.vector(), dtype=float), tick + 1
+        accepted, tick = as_numpy(taken).astype(float), tick + 1
         behind = time.monotonic() - (epoch + tick * plan.dt)
         if behind > 0:
             late += 1
             epoch += max(0.0, behind - plan.dt)  # the world waits rather than jump
         if tick % 25 == 0:
-            bus.publish("world", pack_note("world", late=late, held=held, epoch=epoch))
+            bus.publish("world", pack_note("world", late=late, held=held))
 
 
 def _answer(bus: Bus, tick: int, until: float) -> Setpoint | None:
@@ -116,12 +123,3 @@ def _answer(bus: Bus, tick: int, until: float) -> Setpoint | None:
         if time.monotonic() >= until:
             return None
         time.sleep(3e-4)
-
-
-def _vector(x: State) -> np.ndarray:
-    return np.concatenate([np.asarray(leaf, dtype=float).ravel() for leaf in (x.p, x.R, x.v)])
-
-
-def _parts(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    x = x.astype(np.asarray(jnp.zeros(0)).dtype)
-    return x[:3], x[3:12].reshape(3, 3), x[12:]

@@ -8,7 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax.lax import GatherScatterMode, RoundingMethod
 
+from ..errors import ConfigError
+
 Expression = Callable[..., str]
+
+
+def no_form(operation: str) -> ConfigError:
+    """Return the error of a controller with an operation that cannot be written."""
+    return ConfigError(f"{operation} in this controller has no NumPy form, so it cannot fly live")
 
 
 def _infix(symbol: str) -> Expression:
@@ -107,7 +114,7 @@ def _power(eqn: Any, x: str) -> str:
 def _gather(eqn: Any, x: str, at: str) -> str:
     d, fill = eqn.params["dimension_numbers"], GatherScatterMode.FILL_OR_DROP
     if d.operand_batching_dims:
-        raise NotImplementedError("gather with batches")
+        raise no_form("gather with batches")
     axes = (d.offset_dims, d.collapsed_slice_dims, d.start_index_map, eqn.params["slice_sizes"])
     mode = GatherScatterMode.from_any(eqn.params["mode"])
     return f"lax.gather({x}, {at}, {', '.join(str(tuple(each)) for each in axes)}, fill={mode == fill})"
@@ -116,14 +123,14 @@ def _gather(eqn: Any, x: str, at: str) -> str:
 def _scatter(eqn: Any, x: str, at: str, updates: str) -> str:
     d, mode = eqn.params["dimension_numbers"], GatherScatterMode.from_any(eqn.params["mode"])
     if d.operand_batching_dims or mode == GatherScatterMode.CLIP:
-        raise NotImplementedError("scatter with batches or clipped indices")
+        raise no_form("scatter with batches or clipped indices")
     axes = f"{tuple(d.update_window_dims)}, {tuple(d.inserted_window_dims)}, {tuple(d.scatter_dims_to_operand_dims)}"
     return f"lax.scatter({x}, {at}, {updates}, {axes})"
 
 
 def _round(eqn: Any, x: str) -> str:
     if eqn.params["rounding_method"] != RoundingMethod.TO_NEAREST_EVEN:
-        raise NotImplementedError("rounding away from zero")
+        raise no_form("rounding away from zero")
     return f"np.round({x})"
 
 

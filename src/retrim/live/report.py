@@ -48,7 +48,6 @@ def flight_of(
     if len(shown) < 2:
         raise PlantError(f"{request.folder / 'flight.csv'} holds {len(shown)} ticks: there was no flight")
     u = np.concatenate([HOVER[None], shown[:-1, COMMAND]])
-    until = float(shown[-1, 1])
     log = Log(
         shown[:, 1],
         _states(shown[:, TRUE]),
@@ -56,7 +55,7 @@ def flight_of(
         u,
         dt,
         False,
-        tuple(event for event in events if event.t <= until),
+        tuple(events),
         shown[:, 2],
     )
     return scored(request.setup, request.flight, until_terminated(request.setup.flown, log), learnt), rows

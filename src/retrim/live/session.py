@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,9 +18,11 @@ from ..experiments.flights import FlightSpec
 from ..io.trained import save_learnt
 from ..onboard.guard import Limits
 from ..onboard.messages import MOST_TICKS
+from ..plants.plant import as_numpy
 from ..runtime.pilot import ControllerPilot
 from .controllers import adaptive_source, plain_source
 from .spec import LiveSpec
+from .states import vector_of
 
 LAYERS: tuple[Layer, ...] = ("residual", "policy")
 LEARNING = ("full", "lora")
@@ -77,7 +78,6 @@ def live_spec(request: LiveRequest) -> LiveSpec:
             raise ConfigError(f"method {request.method!r} is no controller, so it cannot fly live; full and lora learn")
         controller = plain_source(setup, pilot.controller)
         save_learnt(start, setup.learner.init(request.policy, k_residual), preset)
-    vehicle = request.scenario.make_vehicle(preset.vehicle)
     return LiveSpec(
         controller=controller,
         layers=LAYERS if request.method in LEARNING else (),
@@ -85,11 +85,9 @@ def live_spec(request: LiveRequest) -> LiveSpec:
         reference=request.scenario.reference,
         scenario=request.scenario,
         vehicle=preset.vehicle,
-        x0=_vector(setup.flight_starts(1, request.seed)[0]),
+        x0=vector_of(setup.flight_starts(1, request.seed)[0]),
         home=np.asarray(setup.flown.home(), dtype=float),
-        limits=_limits(setup, request.seconds, request.fence),
-        low=np.asarray(vehicle.command_min.vector(), dtype=float),
-        high=np.asarray(vehicle.command_max.vector(), dtype=float),
+        limits=_limits(request),
         dt=preset.dt,
         delay_ticks=preset.plant_delay_ticks,
         window=window,
@@ -99,14 +97,12 @@ def live_spec(request: LiveRequest) -> LiveSpec:
     )
 
 
-def _limits(setup: Setup, seconds: float, fence: float) -> Limits:
-    """A box around everything that the reference passes."""
-    times = jnp.arange(0.0, max(seconds, setup.preset.dt), 0.05)
+def _limits(request: LiveRequest) -> Limits:
+    """What the vehicle takes, and a box around everything that the reference passes."""
+    setup, fence = request.setup, request.fence
+    vehicle = request.scenario.make_vehicle(setup.preset.vehicle)
+    times = jnp.arange(0.0, max(request.seconds, setup.preset.dt), 0.05)
     places = np.asarray(jax.jit(jax.vmap(setup.flown.target))(times), dtype=float)
     low, high = places.min(0) - fence, places.max(0) + fence
     low[2] = max(low[2], min(-BELOW_GROUND, float(places[:, 2].min()) - BELOW_GROUND))
-    return Limits(low, high)
-
-
-def _vector(x: Any) -> np.ndarray:
-    return np.concatenate([np.asarray(leaf, dtype=float).ravel() for leaf in (x.p, x.R, x.v)])
+    return Limits(low, high, as_numpy(vehicle.command_min).astype(float), as_numpy(vehicle.command_max).astype(float))

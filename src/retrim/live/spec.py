@@ -39,8 +39,6 @@ class LiveSpec:
     x0: np.ndarray
     home: np.ndarray
     limits: Limits
-    low: np.ndarray
-    high: np.ndarray
     dt: float
     delay_ticks: int
     window: int
@@ -49,7 +47,5 @@ class LiveSpec:
     seed: int
     folder: Path
     """Where the log goes, and what the processes write to their standard outputs."""
-    floor: float = 0.1
-    """Height at which the vehicle has landed [m]."""
     mains: Mapping[str, str] = field(default_factory=lambda: MAINS)
     """What runs as each process; another link to a vehicle is another main function of the plant."""

@@ -53,9 +53,6 @@ class Supervisor:
         rows = 8 * len(COLUMNS) * self.spec.window + 10_000
         roles = ("control", "plant", "watchdog", "recorder", "residual", "policy")
         learnt = self.spec.start.stat().st_size + 200_000
-        self._cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else None
-        if self._cores:
-            os.sched_setaffinity(0, cores_of("learn"))
         self.bus = SharedMemoryBus.create(
             {"sample": 4096, "setpoint": 4096, "fallback": 4096, "order": 4096, "ended": 4096, "world": 4096}
             | {"status": 65536, "flight": rows, "fallback.flight": rows}
@@ -64,6 +61,9 @@ class Supervisor:
             | {slot(layer, i): learnt for layer in ("residual", "policy") for i in range(SLOTS)}
             | {"said.residual": 8192, "said.policy": 8192}
         )
+        self._cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else None
+        if self._cores:
+            os.sched_setaffinity(0, cores_of("learn"))
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -129,8 +129,8 @@ class Supervisor:
         assert self.epoch is not None
         ended = self._note("ended").get("reason")
         for role, process in self.processes.items():
-            again = role in RESTARTED and process.poll() is not None and ended is None and not self._over(role)
-            if again and self.restarts.get(role, 0) < ATTEMPTS:
+            died = process.poll() not in (None, 0)  # who ends by itself says that the flight is over
+            if role in RESTARTED and died and ended is None and self.restarts.get(role, 0) < ATTEMPTS:
                 self.restarts[role] = self.restarts.get(role, 0) + 1
                 with contextlib.suppress(OSError):  # the flight goes on without it
                     self._start(role)
@@ -149,10 +149,6 @@ class Supervisor:
             if self.processes["control"].poll() is None and self.processes["plant"].poll() is not None:
                 self.processes["control"].terminate()  # there is nothing left to fly
             time.sleep(0.02)
-
-    def _over(self, role: str) -> bool:
-        """Whether a process ended because the flight did."""
-        return role in ("watchdog", "recorder") and self._note("status").get("mode") == "landed"
 
     def _alive(self, role: str) -> bool:
         return role in self.processes and self.processes[role].poll() is None
@@ -184,16 +180,14 @@ class Supervisor:
         fly = frozenset(cores_of("fly", self._cores))
         if role == "control":
             return ControlPlan(
-                bus, s.controller, s.limits, s.low, s.high, s.dt, s.delay_ticks, s.window, s.floor, s.seconds,
-                fly, PRIORITIES[role], parent,
-            )  # fmt: skip
+                bus, s.controller, s.limits, s.dt, s.delay_ticks, s.window, s.seconds, fly, PRIORITIES[role], parent
+            )
         if role == "plant":
             return PlantPlan(bus, s.scenario, s.vehicle, s.x0, s.dt, s.seed, fly, PRIORITIES[role], parent)
         if role == "watchdog":
             return WatchdogPlan(
-                bus, s.low, s.high, s.dt, s.home, s.limits.state_age, s.floor, fly, PRIORITIES[role],
-                self.processes["control"].pid, parent,
-            )  # fmt: skip
+                bus, s.limits, s.dt, s.home, fly, PRIORITIES[role], self.processes["control"].pid, parent
+            )
         if role == "recorder":
             return RecorderPlan(bus, s.folder / "flight.csv", s.dt, parent)
         layer: Layer = "residual" if role == "residual" else "policy"

@@ -31,7 +31,7 @@ class ControlLoop:
         """The newest measurement."""
         self.error = 0.0
         self.missed, self.late_samples = 0, 0
-        self._fallback = Fallback(GeometricHover(plan.low, plan.high, plan.dt), plan.floor)
+        self._fallback = Fallback(GeometricHover(plan.limits, plan.dt))
         self._row: np.ndarray | None = None
         self._start, self._issued, self._target = 0.0, np.array([]), np.zeros(3)
         self._commands: deque[np.ndarray] = deque(maxlen=plan.delay_ticks + 1)
@@ -66,7 +66,7 @@ class ControlLoop:
         u = self._policy(sample, t, age, new) if self.mode == Mode.POLICY else None
         if u is None:
             u, self.mode = self._fallback.step(sample.state, fresh, self._target, land=bool(self._landing))
-            self._issued = u if self.mode == Mode.LANDED else np.clip(u, self.plan.low, self.plan.high)
+            self._issued = u if self.mode == Mode.LANDED else self.plan.limits.within(u)
         setpoint = Setpoint(sample.tick, time.monotonic(), self._issued, self._target, self.mode == Mode.LANDED)
         self.bus.publish("setpoint", setpoint.pack())
         if new:
@@ -124,7 +124,7 @@ class ControlLoop:
             u = self.pilot.act(t, sample.age, sample.state)
             self._target = self.pilot.target(t)
             if np.isfinite(u).all():
-                self._issued = np.clip(u, self.plan.low, self.plan.high)
+                self._issued = self.plan.limits.within(u)
                 if (self._issued != u).any():
                     self.pilot.accepted(self._issued)
                 self.error = float(np.linalg.norm(sample.state[:3] - self._target))

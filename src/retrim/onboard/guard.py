@@ -35,6 +35,12 @@ class Limits:
     """Corner of the geofence, world [m]."""
     high: np.ndarray
     """The other one."""
+    u_min: np.ndarray
+    """Smallest command [c, omega] that the vehicle takes."""
+    u_max: np.ndarray
+    """Largest one."""
+    floor: float = 0.1
+    """Height at which the vehicle has landed [m]."""
     tilt: float = 1.4
     """Angle between thrust and vertical [rad]."""
     speed: float = 15.0
@@ -43,6 +49,11 @@ class Limits:
     """Age of the newest measurement [s]."""
     policy_age: float = float("inf")
     """Flight time since the newest measurement that the policy was learnt from [s]."""
+
+    def within(self, u: np.ndarray) -> np.ndarray:
+        """Return a command [c, omega] as the vehicle takes it."""
+        taken: np.ndarray = np.clip(u, self.u_min, self.u_max)
+        return taken
 
     def broken(self, x: np.ndarray) -> str | None:
         """Return which limit a state breaks, in words; None if it keeps them all.
@@ -65,10 +76,7 @@ class Limits:
 class GeometricHover:
     """Holds a place by thrust and body rates, with integral action (Lee et al. 2010, attitude as a rotation vector)."""
 
-    low: np.ndarray
-    """Smallest command."""
-    high: np.ndarray
-    """Largest command."""
+    limits: Limits
     dt: float
     integral: np.ndarray = field(default_factory=lambda: np.zeros(3))
     felt: np.ndarray = field(default_factory=lambda: np.zeros(3))
@@ -101,8 +109,7 @@ class GeometricHover:
         a[:2] *= min(1.0, 6.0 / (np.hypot(a[0], a[1]) + 1e-9))
         force = np.clip(a, -6.0, 6.0) + G * UP
         along = force / np.sqrt(force @ force)
-        u: np.ndarray = np.clip(np.concatenate([[force @ R[:, 2]], 8.0 * turn(R, along)]), self.low, self.high)
-        return u
+        return self.limits.within(np.concatenate([[force @ R[:, 2]], 8.0 * turn(R, along)]))
 
 
 def turn(R: np.ndarray, along: np.ndarray) -> np.ndarray:
@@ -121,8 +128,6 @@ class Fallback:
     """What flies when the policy must not: hold, then sink, then stop. A plain sequence, by the clock."""
 
     hover: GeometricHover
-    floor: float
-    """Height at which the vehicle has landed [m]."""
     hold_s: float = 2.0
     sink: float = 0.5
     """[m/s]"""
@@ -154,11 +159,11 @@ class Fallback:
         self.since += self.hover.dt
         self.blind_s = 0.0 if fresh else self.blind_s + self.hover.dt
         if self.blind_s > BLIND_S or self._down(x, fresh):
-            return HOVER * 0.0, Mode.LANDED
+            return np.zeros(4), Mode.LANDED
         if not fresh:
             # Turned level within a quarter of a second of what was known; after that, straight on and gently down.
             rates = 4.0 * turn(x[3:12].reshape(3, 3), UP) if self.blind_s <= 0.25 else np.zeros(3)
-            return np.clip(np.concatenate([[0.95 * G], rates]), self.hover.low, self.hover.high), Mode.BLIND
+            return self.hover.limits.within(np.concatenate([[0.95 * G], rates])), Mode.BLIND
         if land or self.since > self.hold_s:
             self.sinking_s += self.hover.dt
             self.place[2] = min(self.place[2], x[2] + 0.3) - self.hover.dt * self.sink
@@ -171,4 +176,4 @@ class Fallback:
             return False
         moving = float(np.abs(x[12:15]).max()) > 0.1
         self.still_s = 0.0 if moving else self.still_s + self.hover.dt
-        return bool(x[2] <= self.floor) or self.still_s > 2.0
+        return bool(x[2] <= self.hover.limits.floor) or self.still_s > 2.0

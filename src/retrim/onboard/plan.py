@@ -3,8 +3,6 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from .guard import Limits
 from .pilot import ControllerSource
 
@@ -17,17 +15,11 @@ class ControlPlan:
     """Of the bus."""
     controller: ControllerSource
     limits: Limits
-    low: np.ndarray
-    """Smallest command that the vehicle takes."""
-    high: np.ndarray
-    """Largest one."""
     dt: float
     delay_ticks: int
     """Declared command delay of the plant."""
     window: int
     """Ticks that are published for those who learn and for the log."""
-    floor: float
-    """Height at which the vehicle has landed [m]."""
     seconds: float
     """After which it lands by itself [s]."""
     cores: frozenset[int]

@@ -12,7 +12,7 @@ from ..transport.shared_memory import SharedMemoryBus
 from .messages import COLUMNS, FlightRows, pack_note, unpack_note
 from .realtime import Lifeline
 
-SILENCE = 2.0  # [s] without a tick, after which a flight is over
+SILENCE = 2.0  # [s] without a tick, after which a flight without a supervisor is over
 
 
 @dataclass(frozen=True)
@@ -97,13 +97,13 @@ def record(plan: RecorderPlan) -> None:
     bus = SharedMemoryBus(plan.folder)
     recorder = Recorder(plan.path, bus)
     bus.publish("ready.recorder", pack_note("ready", failed=recorder.failed))
-    heard = time.monotonic()
-    while not (_landed(bus) or bus.latest("ended")) and time.monotonic() < heard + SILENCE:
+    parent, heard = Lifeline(plan.parent), time.monotonic()
+    while not (_landed(bus) or bus.latest("ended") or (parent.gone() and time.monotonic() > heard + SILENCE)):
         if recorder.step() or bus.latest("sample") is None:
             heard = time.monotonic()
         time.sleep(plan.dt)
     recorder.step()
-    if Lifeline(plan.parent).gone():
+    if parent.gone():
         bus.remove()
 
 

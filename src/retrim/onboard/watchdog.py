@@ -10,7 +10,7 @@ import numpy as np
 from ..errors import MessageError
 from ..transport.bus import Bus
 from ..transport.shared_memory import SharedMemoryBus
-from .guard import Fallback, GeometricHover, Mode
+from .guard import Fallback, GeometricHover, Limits, Mode
 from .messages import COMMAND, FlightRows, Sample, Setpoint, pack_note
 from .realtime import Lifeline, be_punctual
 
@@ -24,13 +24,10 @@ class WatchdogPlan:
     """Everything that the process is started with."""
 
     folder: Path
-    low: np.ndarray
-    high: np.ndarray
+    limits: Limits
     dt: float
     home: np.ndarray
     """Where to hold if control never said, world [m]."""
-    state_age: float
-    floor: float
     cores: frozenset[int]
     priority: int
     control: int
@@ -44,7 +41,7 @@ class Watchdog:
 
     def __init__(self, plan: WatchdogPlan, bus: Bus) -> None:
         self.plan, self.bus = plan, bus
-        self._fallback = Fallback(GeometricHover(plan.low, plan.high, plan.dt), plan.floor)
+        self._fallback = Fallback(GeometricHover(plan.limits, plan.dt))
         self.heard: float | None = None
         self.done = False
         self._version = 0
@@ -73,7 +70,7 @@ class Watchdog:
         if not silent or self.done or self._sample is None or not (new or now >= self._next):
             return None
         self._next = now + 1.5 * self.plan.dt  # at the latest, should no sample come
-        fresh = self._sample.age + now - self._sample.sent <= self.plan.state_age
+        fresh = self._sample.age + now - self._sample.sent <= self.plan.limits.state_age
         u, mode = self._fallback.step(self._sample.state, fresh, self._target, land=False)
         self.done = mode == Mode.LANDED
         setpoint = Setpoint(self._sample.tick, now, u, self._target, self.done)

@@ -1,0 +1,19 @@
+"""States between processes: p, R by rows and v as one vector of NumPy."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from ..physics.state import State
+
+
+def vector_of(x: State) -> np.ndarray:
+    """Return a state as a vector; no program of JAX is needed for it."""
+    return np.concatenate([np.asarray(leaf, dtype=float).ravel() for leaf in (x.p, x.R, x.v)])
+
+
+def state_of(x: np.ndarray, dtype: Any) -> State:
+    """Return the state of a vector."""
+    p, R, v = (jnp.asarray(part, dtype) for part in (x[:3], x[3:12].reshape(3, 3), x[12:]))
+    return State(p, R, v)
