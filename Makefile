@@ -7,7 +7,7 @@ STAMP := $(VENV)/.installed
 
 DEV := $(VENV)/.installed-dev
 
-.PHONY: setup dev demo test check docs wheel mutants drill bench tables pins clean
+.PHONY: setup dev demo test check docs wheel mutants drill test-page bench tables pins clean
 
 setup: $(STAMP)
 
@@ -46,6 +46,12 @@ mutants: dev
 drill: dev
 	RETRIM_DRILLS=4 $(BIN)/pytest tests/live/test_faults.py
 
+# The page of a live flight in a browser without a screen; Debian's Chromium is installed if there is none.
+test-page: dev
+	command -v chromium >/dev/null || apt-get install --yes --no-install-recommends chromium
+	$(UV) pip install --quiet --python $(VENV) --constraints constraints.txt --group browser
+	$(BIN)/pytest -n 0 tests/live/test_page.py
+
 bench: setup
 	$(BIN)/retrim bench
 
@@ -65,18 +71,18 @@ tables: dev
 $(STAMP): pyproject.toml constraints.txt | $(UV)
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "retrim needs Python 3.11 or newer; set PYTHON=...")'
 	$(UV) venv --quiet --clear --python $(PYTHON) $(VENV)
-	$(UV) pip install --quiet --python $(VENV) --constraints constraints.txt --editable .
+	$(UV) pip install --quiet --python $(VENV) --constraints constraints.txt --editable '.[page]'
 	@touch $@
 
 # The developers' tools, the site's tools, and the independent plants that the tests fly.
 $(DEV): $(STAMP)
-	$(UV) pip install --quiet --python $(VENV) --constraints constraints.txt --group dev --group docs --editable '.[plants]'
+	$(UV) pip install --quiet --python $(VENV) --constraints constraints.txt --group dev --group docs --editable '.[plants,page,zenoh]'
 	@touch $@
 
 # After a change of dependencies in pyproject.toml: names, versions and markers only. Versions that still fit stay;
 # `make pins UPGRADE=--upgrade` takes the newest.
 pins: | $(UV)
-	$(UV) pip compile --quiet $(UPGRADE) --universal --all-extras --group dev --group docs --python-version 3.11 \
+	$(UV) pip compile --quiet $(UPGRADE) --universal --all-extras --group dev --group docs --group browser --python-version 3.11 \
 		--no-header --no-annotate pyproject.toml --output-file constraints.txt
 
 clean:

@@ -3,6 +3,7 @@
 import gc
 import os
 import signal
+from pathlib import Path
 
 # Nearly all of the suite's time is compiling, and half of that is optimisation that a short test never earns back. A
 # program in one piece takes fewer memory maps. The commands that tests start inherit this. What users run, optimised,
@@ -36,6 +37,18 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.03)
 signal.signal(signal.SIGINT, signal.default_int_handler)
 settings.register_profile("repeatable", derandomize=True)  # the same examples on every machine
 settings.load_profile("repeatable")
+
+
+LONG = ("test_examples.py", "cli/", "docs/", "live/", "experiments/")
+"""Files whose tests fly whole flights: they begin first, so that both workers are done at about the same time."""
+
+
+def pytest_collection_modifyitems(items):
+    def place(item):
+        path = item.path.relative_to(Path(__file__).parent).as_posix()
+        return next((i for i, start in enumerate(LONG) if path.startswith(start)), len(LONG))
+
+    items.sort(key=place)
 
 
 @pytest.fixture

@@ -20,7 +20,8 @@ from retrim.physics.dynamics import f_a
 LOW, HIGH = np.array([0.0, -6.0, -6.0, -2.0]), np.array([30.0, 6.0, 6.0, 2.0])
 TOPICS = {"sample": 4096, "setpoint": 4096, "fallback": 4096, "order": 4096, "ended": 4096, "status": 65536,
           "flight": 300_000, "fallback.flight": 300_000, "parameters.policy": 300_000,
-          "parameters.residual": 100_000}  # fmt: skip
+          "parameters.residual": 100_000, "learning": 4096, "learner.residual": 8192,
+          "learner.policy": 8192}  # fmt: skip
 
 
 class Holds(AbstractController[Float[Array, ""]]):

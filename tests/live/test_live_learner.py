@@ -58,8 +58,9 @@ class Beside:
         rows[:, COMMAND] = np.array([10.3, 0.0, 0.0, 0.0]) + 0.01 * np.sin(rows[:, :1])
         self.bus.publish("flight", FlightRows(rows).pack())
 
-    def says(self, newest, given_up=()):
-        self.bus.publish("status", pack_note("status", newest={"policy": newest}, given_up=list(given_up)))
+    def says(self, newest, given_up=(), mode="policy"):
+        note = pack_note("status", newest={"policy": newest}, given_up=list(given_up), mode=mode)
+        self.bus.publish("status", note)
 
     def parameters(self, half, after=0):
         message = self.bus.latest(f"parameters.{half}")
@@ -110,6 +111,19 @@ def test_a_window_becomes_parameters_that_the_controller_takes(start):
     beside.now += 99.99
     assert loop.step()
     assert beside.parameters("residual", after=1).version == 2
+
+
+def test_nothing_is_learnt_that_nobody_would_fly(start):
+    beside = Beside(start, "residual")
+    loop = beside.loops["residual"]
+    beside.fly()
+    beside.bus.publish("learning", pack_note("learning", paused=True))
+    assert not loop.step()
+    beside.bus.publish("learning", pack_note("learning", paused=False))
+    beside.says(0, mode="descend")
+    assert not loop.step()
+    beside.says(0)
+    assert loop.step()
 
 
 def test_a_policy_goes_on_from_what_is_flown(start):

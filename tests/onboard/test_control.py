@@ -176,6 +176,26 @@ def test_a_policy_that_flies_clearly_worse_is_taken_back():
     assert flight.status["versions"] == {"policy": 3}
 
 
+def test_what_took_off_flies_while_learning_is_not_wanted_and_the_last_policy_after_it():
+    flight, plain = Flight(holding(), x=level(x=0.4)), Flight(holding(), x=level(x=0.4))
+    flight.bus.publish("parameters.policy", flight.parameters((6.0, 5.0), 1))
+    flight.step(100)
+    flight.bus.publish("learning", pack_note("learning", paused=True, flown=False))
+    flight.step()
+    assert flight.status["versions"] == {"policy": 0}
+    assert not flight.status["learning"]
+    flight.bus.publish("parameters.policy", flight.parameters((7.0, 5.0), 2))
+    flight.step(20)
+    flight.x = level(x=0.4)
+    plain.step(121)
+    plain.x = level(x=0.4)
+    np.testing.assert_allclose(flight.step(), plain.step(), atol=0.05)
+    flight.bus.publish("learning", pack_note("learning", paused=False, flown=True))
+    flight.step(2)
+    assert flight.status["versions"] == {"policy": 2}
+    assert flight.status["refused"] == {}
+
+
 def test_it_is_taken_back_while_fits_and_policies_keep_coming():
     flight = Flight(holding(fitted=True), push=(0.3, 0.0, 0.0))
     flight.step(200)

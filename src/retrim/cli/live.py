@@ -1,9 +1,15 @@
 """``retrim live``."""
 
+import os
+import sys
 import threading
+import webbrowser
 from collections.abc import Callable
+from contextlib import closing
+from importlib.util import find_spec
 from pathlib import Path
 
+import tyro
 from rich.live import Live
 from rich.table import Table
 
@@ -19,12 +25,15 @@ from ..experiments.outputs import clear_outputs, write_events, write_learnt
 from ..experiments.run import INTERRUPTED, Run
 from ..experiments.tables.document import TableSection
 from ..experiments.training import train
+from ..live.display import live_line, live_rows
 from ..live.events import LiveEvents
+from ..live.page import LOOPBACK
 from ..live.report import complaints, flight_of, histograms, learnt_in, results
 from ..live.session import LEARNING, LiveRequest, live_spec
 from ..live.status import Status
 from ..live.supervisor import Supervisor
 from ..live.watching import watched
+from ..live.wishes import Wishes
 from ..runtime.events import Event
 from .console import RichReporter, console, show_paths, show_table, started
 
@@ -49,6 +58,10 @@ def live(
     seconds: float | None = None,
     fence: float = 3.0,
     seed: int = 0,
+    page: tyro.conf.FlagCreatePairsOff[bool] = False,
+    no_page: tyro.conf.FlagCreatePairsOff[bool] = False,
+    page_host: str = LOOPBACK[0],
+    page_port: int = 8080,
     out: Path | None = None,
 ) -> Callable[[threading.Event], int]:
     """Fly against the clock, and learn at the same time: a process for control, for each learner, and for the plant.
@@ -71,6 +84,10 @@ def live(
         seconds: Length of the flight; until Ctrl-C by default.
         fence: How far from its reference the vehicle may be along any axis before the fallback flies [m].
         seed: Seed of the start, of the learners and of what is random in the scenario.
+        page: Show the flight in a browser, with knobs, also with `--seconds`; without it, that is the default.
+        no_page: Show it in the terminal only.
+        page_host: Address that the page listens on. Anybody who reaches another than 127.0.0.1 may turn the knobs.
+        page_port: Port of the page, or the next one that is free.
         out: Folder of what the flight leaves; a new one under runs/ by default.
     """
 
@@ -80,6 +97,7 @@ def live(
             raise ConfigError(f"--fence {fence:g} m must be between 0.5 and 1000")
         if seconds is not None and not 1.0 <= seconds <= LONGEST:
             raise ConfigError(f"--seconds {seconds:g} must be between 1 and {LONGEST:g}")
+        address = _page_address(page, no_page or (seconds is not None and not page), page_host, page_port)
         state, weights, chosen = None, None, load_for(preset.partition("/")[0], preset)
         if policy is not None or resume is not None:
             weights, chosen, state = loaded(policy, resume)
@@ -100,7 +118,8 @@ def live(
         clear_outputs(run.folder)
         for old in (*run.folder.glob("*.log"), run.folder / "flight.csv"):
             old.unlink(missing_ok=True)
-        request = LiveRequest(setup, weights, scenario, method, seconds or LONGEST, seed, fence, run.folder, state)
+        length = seconds or LONGEST
+        request = LiveRequest(setup, weights, scenario, method, length, seed, fence, run.folder, state, address)
         with interrupts_only_set(run.stop):  # a Ctrl-C lands the vehicle; whoever is in the air is not dropped
             return _fly(request, run)
 
@@ -120,9 +139,11 @@ def _fly(request: LiveRequest, run: Run) -> int:
         for role, refused in supervisor.refused.items():
             for what in refused:
                 console.print(f"{role}: no {what}", markup=False, soft_wrap=True)
-        with Live(console=console, auto_refresh=False) as screen:
-            status = watched(supervisor, request.seconds, events, _shown_on(screen, events), run.stop)
-        learnt = learnt_in(request, supervisor.bus, status) if request.method in LEARNING else None
+        if request.page is not None and supervisor.page_port is not None:
+            _open_page(request.page[0], supervisor.page_port)
+        with Live(console=console, auto_refresh=False) as screen, closing(Wishes(request, supervisor)) as wishes:
+            status = watched(supervisor, request.seconds, events, _shown_on(screen, events), run.stop, wishes)
+        learnt = learnt_in(supervisor.bus, status, supervisor.start) if request.method in LEARNING else None
     console.print(f"flight over: {status.ended}", markup=False, soft_wrap=True)
     flight, rows = flight_of(request, events.all, status, learnt)
     found = results(request, flight, rows, status, events)
@@ -139,6 +160,39 @@ def _fly(request: LiveRequest, run: Run) -> int:
     return run.exit_code
 
 
+def _page_address(demanded: bool, none: bool, host: str, port: int) -> tuple[str, int] | None:
+    """Return where the page should be; None for no page.
+
+    Raises:
+        ConfigError: A page was demanded and cannot be had.
+    """
+    if not 1 <= port <= 65535:
+        raise ConfigError(f"--page-port {port} must be between 1 and 65535")
+    if demanded and none:
+        raise ConfigError("--page and --no-page: choose one")
+    if none:
+        return None
+    if find_spec("viser") is None:
+        if demanded:
+            raise ConfigError("--page needs viser: pip install 'retrim[page]'")
+        console.print("no page in the browser: pip install 'retrim[page]' brings it", markup=False)
+        return None
+    if host not in LOOPBACK:
+        console.print(
+            f"[yellow]warning[/yellow]: the page listens on {host}: anybody who reaches it may turn its knobs and land "
+            "the vehicle"
+        )
+    return host, port
+
+
+def _open_page(host: str, port: int) -> None:
+    """Say where the page is, and open it where there is a screen."""
+    url = f"http://{host}:{port}"
+    console.print(f"page: {url}", markup=False, soft_wrap=True)
+    if console.is_terminal and (sys.platform == "darwin" or {"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ)):
+        webbrowser.open(url)
+
+
 def _shown_on(screen: Live, events: LiveEvents) -> Callable[[Status, list[Event]], None]:
     """Show a flight as a table in a terminal, and as a line now and then elsewhere; events as they come."""
     last = [float("-inf")]
@@ -148,7 +202,7 @@ def _shown_on(screen: Live, events: LiveEvents) -> Callable[[Status, list[Event]
             screen.update(_screen(status, events), refresh=True)
         elif status.t - last[0] >= LINE_EVERY:
             last[0] = status.t
-            console.print(_line(status), markup=False, soft_wrap=True)
+            console.print(live_line(status), markup=False, soft_wrap=True)
         for event in new:
             if event.kind not in ("policy", "residual", "rejected"):
                 screen.console.print(f"{event.t:.1f} s {event.kind}: {event.note}", markup=False, soft_wrap=True)
@@ -156,31 +210,10 @@ def _shown_on(screen: Live, events: LiveEvents) -> Callable[[Status, list[Event]
     return show
 
 
-def _line(status: Status) -> str:
-    control = status.control
-    versions = ", ".join(f"{half} {n}" for half, n in control.get("versions", {}).items())
-    return (
-        f"{max(0.0, status.t):.0f} s, {control.get('mode', 'not started')}, error {control.get('error', 0.0):.3f} m, "
-        f"versions: {versions}, missed ticks: {control.get('missed', 0)}"
-    )
-
-
 def _screen(status: Status, events: LiveEvents) -> Table:
-    control = status.control
-    table = Table(title=f"live, {max(0.0, status.t):.1f} s; Ctrl-C lands", min_width=60)
-    table.add_column("what")
-    table.add_column("now")
-    table.add_row("flown by", control.get("mode", "not started"))
-    table.add_row("error", f"{control.get('error', 0.0):.4f} m")
-    for half, version in control.get("versions", {}).items():
-        table.add_row(f"{half} swaps", str(version))
-    table.add_row("missed ticks", str(control.get("missed", 0)))
-    if refused := control.get("refused"):
-        table.add_row("refused messages", ", ".join(f"{what}: {n}" for what, n in refused.items()))
-    table.add_row("late samples, held commands", f"{status.world.get('late', 0)}, {status.world.get('held', 0)}")
-    table.add_row("processes", ", ".join(role if alive else f"{role} (dead)" for role, alive in status.alive.items()))
-    if events.all:
-        table.add_row("last event", f"{events.all[-1].t:.1f} s {events.all[-1].kind}: {events.all[-1].note}")
+    table = Table("what", "now", title=f"live, {max(0.0, status.t):.1f} s; Ctrl-C lands", min_width=60)
+    for row in live_rows(status, events):
+        table.add_row(*row)
     return table
 
 

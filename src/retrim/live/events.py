@@ -1,5 +1,7 @@
 """What happens in a live flight, as events: each once, from reports that repeat themselves."""
 
+from collections.abc import Iterable
+
 from ..runtime.events import Event
 from .status import Status
 
@@ -17,11 +19,12 @@ class LiveEvents:
         self._restarts: dict[str, int] = {}
         self._given_up: set[int] = set()
         self._refused: dict[str, int] = {}
+        self._knobs_refused = ""
 
-    def take(self, status: Status) -> list[Event]:
-        """Return what is new."""
+    def take(self, status: Status, others: Iterable[Event] = ()) -> list[Event]:
+        """Return what is new, ``others`` included."""
         t, control = status.t, status.control
-        new: list[Event] = []
+        new = list(others)
         for at, half, version, age in control.get("swaps", []):
             if version > max((v for _, h, v, _ in self.swaps if h == half), default=0):
                 self.swaps.append((at, half, version, age))
@@ -39,6 +42,9 @@ class LiveEvents:
             if count > self._restarts.get(role, 0):
                 self._restarts[role] = count
                 new.append(Event(t, "restarted", f"the {role} process had died"))
+        if (refused := status.world.get("knobs_refused", "")) and refused != self._knobs_refused:
+            new.append(Event(t, "refused", f"knobs: {refused}"))
+        self._knobs_refused = refused
         if status.log_failed and not self._log_failed:
             self._log_failed = True
             new.append(Event(t, "guard", f"log: the flight is no longer written down, {status.log_failed}"))

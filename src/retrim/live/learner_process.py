@@ -1,5 +1,7 @@
 """The process of one layer of learning: windows of flight come in, parameters go out."""
 
+import contextlib
+import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -31,6 +33,7 @@ from .states import state_of
 
 CHECK_EVERY = 0.005  # [s]
 VERDICT = 1.0  # [s] that a policy waits to be taken or refused; after it, it counts as lost
+NICE = 10
 REMEMBERED = 8  # policies that were flown
 
 
@@ -61,6 +64,7 @@ class LearnerLoop:
         self._worker = self._new_worker()
         self._last_tick, self._new_ticks, self._began = -1, 0, float("-inf")
         self._known: dict[str, int] = {}
+        self._learnt = 0
         self._pending: tuple[int, PolicyUpdate, float] | None = None
         self._flown: list[tuple[int, Update]] = []
 
@@ -93,10 +97,15 @@ class LearnerLoop:
         if self.plan.layer == "policy":
             self._take_residual()
             self._judge()
-        if self._pending is not None or not self._new_ticks or self._clock() - self._began < self.every:
+        waits = self._pending is not None or not self._new_ticks or self._clock() - self._began < self.every
+        if waits or not self._wanted():
             return False
         self._began, self._new_ticks = self._clock(), 0
         update = self._worker.learn(self._buffer.window())
+        self._learnt += 1
+        took = self._clock() - self._began
+        note = pack_note(f"learner.{self.plan.layer}", learnt=self._learnt, took=took, until=update.computed_from)
+        self.bus.publish(f"learner.{self.plan.layer}", note)
         if self.plan.layer == "policy" and self._judge():
             return True  # the policy that it was trained from was taken back meanwhile
         self._publish(update)
@@ -163,9 +172,16 @@ class LearnerLoop:
         return back
 
     def _status(self) -> dict[str, Any]:
-        message = self.bus.latest("status")
+        return self._note("status")
+
+    def _wanted(self) -> bool:
+        """Nobody takes what is learnt after the policy has flown; what was flown last would be lost."""
+        return self._status().get("mode", "policy") == "policy" and not self._note("learning").get("paused", False)
+
+    def _note(self, topic: str) -> dict[str, Any]:
+        message = self.bus.latest(topic)
         try:
-            return {} if message is None else unpack_note(message.data, "status")
+            return {} if message is None else unpack_note(message.data, topic)
         except MessageError:
             return {}
 
@@ -190,6 +206,8 @@ def _start(state: LearnerState) -> PolicyUpdate:
 
 def learn(plan: LearnerPlan) -> None:
     """Learn until the flight is over: the main function of the process."""
+    with contextlib.suppress(OSError, AttributeError):
+        os.nice(NICE)  # a browser or a terminal on the same machine answers before the next update is done
     enable_compile_cache()
     bus, parent = SharedMemoryBus(plan.folder), Lifeline(plan.parent)
     loop = LearnerLoop(plan, bus)

@@ -1,5 +1,6 @@
 """The process of a simulated plant: it keeps wall-clock time, as a vehicle does."""
 
+import contextlib
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,9 +18,10 @@ from ..onboard.messages import Sample, Setpoint, pack_note
 from ..onboard.orders import wait_for_take_off
 from ..onboard.realtime import Lifeline, be_punctual, sleep_until
 from ..physics.state import Command
-from ..plants.plant import Measurement, Plant, as_numpy
+from ..plants.plant import Measurement, as_numpy
 from ..transport.bus import Bus
 from ..transport.shared_memory import SharedMemoryBus
+from .knobs import KnobbedPlant, Knobs
 from .states import state_of, vector_of
 
 SHARE = 0.6  # of a tick, for which a command is waited for; the rest is for the simulation
@@ -51,25 +53,30 @@ def simulate(plan: PlantPlan) -> None:
     x0 = state_of(plan.x0, jnp.zeros(0).dtype)
     try:
         with plan.scenario.make(plan.vehicle, dt=plan.dt, seed=plan.seed) as plant:
-            for _ in range(2):  # every program compiled, and run
+            knobbed = KnobbedPlant(plant, plan.scenario, plan.seed)
+            for load in (0.0, 0.01):  # every program compiled, and run
                 plant.reset(x0)
+                knobbed.turn(Knobs(load=load))
                 for _ in range(5):
-                    plant.step(Command.hover(x0.p.dtype))
+                    knobbed.step(Command.hover(x0.p.dtype))
+            knobbed.turn(Knobs())
             measurement = plant.reset(x0)
             refused = be_punctual(plan.priority, set(plan.cores))
             bus.publish("ready.plant", pack_note("ready", refused=refused))
             epoch = wait_for_take_off(bus, parent)
             if epoch is None:
                 return
-            reason = _flown(plan, plant, bus, parent, measurement, epoch)
+            reason = _flown(plan, knobbed, bus, parent, measurement, epoch)
     except PlantError as error:
         reason = f"plant lost: {error}"
     bus.publish("ended", pack_note("ended", reason=reason))
 
 
-def _flown(plan: PlantPlan, plant: Plant, bus: Bus, parent: Lifeline, measurement: Measurement, epoch: float) -> str:
+def _flown(
+    plan: PlantPlan, plant: KnobbedPlant, bus: Bus, parent: Lifeline, measurement: Measurement, epoch: float
+) -> str:
     """Fly, and return why the flight ended."""
-    tick, late, held, unanswered = 0, 0, 0, 0
+    tick, late, held, unanswered, turned = 0, 0, 0, 0, 0
     u = accepted = as_numpy(Command.hover()).astype(float)
     while True:
         sleep_until(epoch + tick * plan.dt)
@@ -96,6 +103,10 @@ def _flown(plan: PlantPlan, plant: Plant, bus: Bus, parent: Lifeline, measuremen
             return "landed"
         else:
             u = setpoint.u
+        if (asked := bus.latest("knobs", turned)) is not None:
+            turned = asked.version
+            with contextlib.suppress(MessageError):
+                plant.turn(Knobs.unpack(asked.data))
         dtype = measurement.x.p.dtype
         measurement, taken = plant.step(Command(jnp.asarray(u[0], dtype), jnp.asarray(u[1:], dtype)))
         accepted, tick = as_numpy(taken).astype(float), tick + 1
@@ -104,7 +115,7 @@ def _flown(plan: PlantPlan, plant: Plant, bus: Bus, parent: Lifeline, measuremen
             late += 1
             epoch += max(0.0, behind - plan.dt)  # the world waits rather than jump
         if tick % 25 == 0:
-            bus.publish("world", pack_note("world", late=late, held=held))
+            bus.publish("world", pack_note("world", late=late, held=held, knobs_refused=plant.refused))
 
 
 def _answer(bus: Bus, tick: int, until: float) -> Setpoint | None:

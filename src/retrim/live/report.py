@@ -118,9 +118,15 @@ def _finite(value: Any) -> Any:
     return None if value is None or not np.isfinite(value) else value
 
 
-def learnt_in(request: LiveRequest, bus: Bus, status: Status) -> LearnerState | None:
-    """Return what was learnt and flown last; None if nothing was."""
-    state = load_learnt(request.folder / "start.safetensors")[0]
+def learnt_in(bus: Bus, status: Status, start: Path) -> LearnerState | None:
+    """Return what was learnt and flown last; None if nothing was.
+
+    Args:
+        bus: Of the flight.
+        status: How it stands.
+        start: File with what the learners went on from.
+    """
+    state = load_learnt(start)[0]
     fit, policy = (flown_update(bus, state, layer, status.control) for layer in LAYERS)
     if fit is not None and isinstance(fit[1], ResidualUpdate):
         state = LearnerState(state.policy, fit[1].state)

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -21,11 +22,13 @@ from ..onboard.messages import MOST_TICKS
 from ..plants.plant import as_numpy
 from ..runtime.pilot import ControllerPilot
 from .controllers import adaptive_source, plain_source
-from .spec import LiveSpec
+from .page import free_port
+from .spec import LiveSpec, PageSpec
 from .states import vector_of
 
 LAYERS: tuple[Layer, ...] = ("residual", "policy")
 LEARNING = ("full", "lora")
+PATH_S = 20.0  # [s] of the reference that the page draws
 BELOW_GROUND = 0.3  # [m], by which a fence lies below z = 0: starts may lie there, and a transient dips
 
 
@@ -47,6 +50,8 @@ class LiveRequest:
     folder: Path
     state: LearnerState | None = None
     """What an earlier flight learnt, to go on from."""
+    page: tuple[str, int] | None = None
+    """Address and port of the page; None for no page."""
 
     @property
     def flight(self) -> FlightSpec:
@@ -64,12 +69,9 @@ def live_spec(request: LiveRequest) -> LiveSpec:
     window = max(preset.adapt.window, round(3.0 / preset.dt))
     if window > MOST_TICKS:
         raise ConfigError(f"adapt.window = {window} ticks: a live flight reports at most {MOST_TICKS}")
-    k_residual = random.split(request.flight.key())[0]
     start = request.folder / "start.safetensors"
     if request.method in LEARNING:
-        policy = request.policy
-        chosen = setup.low_rank(policy, request.flight.key()) if request.method == "lora" else policy
-        state = request.state or setup.learner.init(chosen, k_residual)
+        state = request.state or learner_state(request, request.policy, request.method)
         controller = adaptive_source(setup, state)
         save_learnt(start, state, preset)
     else:
@@ -77,7 +79,7 @@ def live_spec(request: LiveRequest) -> LiveSpec:
         if not isinstance(pilot, ControllerPilot):
             raise ConfigError(f"method {request.method!r} is no controller, so it cannot fly live; full and lora learn")
         controller = plain_source(setup, pilot.controller)
-        save_learnt(start, setup.learner.init(request.policy, k_residual), preset)
+        save_learnt(start, learner_state(request, request.policy, "full"), preset)
     return LiveSpec(
         controller=controller,
         layers=LAYERS if request.method in LEARNING else (),
@@ -94,15 +96,48 @@ def live_spec(request: LiveRequest) -> LiveSpec:
         seconds=request.seconds,
         seed=request.flight.plant_seed,
         folder=request.folder,
+        page=_page(request) if request.page is not None else None,
     )
+
+
+def learner_state(request: LiveRequest, policy: Policy, method: str, residual: Any = None) -> LearnerState:
+    """Return what learners start from.
+
+    Args:
+        request: Of the flight.
+        policy: What flies.
+        method: ``full`` or ``lora``.
+        residual: What has been fitted; None for nothing.
+    """
+    key = request.flight.key()
+    chosen = request.setup.low_rank(policy, key) if method == "lora" else policy
+    state = request.setup.learner.init(chosen, random.split(key)[0])
+    return state if residual is None else LearnerState(state.policy, residual)
+
+
+def _page(request: LiveRequest) -> PageSpec:
+    assert request.page is not None
+    host, port = request.page
+    vehicle = request.scenario.make_vehicle(request.setup.preset.vehicle)
+    others = tuple(method for method in LEARNING if method != request.method)
+    methods = (request.method, *others) if request.method in LEARNING else ()
+    arm = float(np.hypot(*np.asarray(vehicle.arm)))
+    name = request.setup.preset.name
+    return PageSpec(host, free_port(host, port), name, _places(request, PATH_S), methods, arm, float(vehicle.mass))
 
 
 def _limits(request: LiveRequest) -> Limits:
     """What the vehicle takes, and a box around everything that the reference passes."""
     setup, fence = request.setup, request.fence
     vehicle = request.scenario.make_vehicle(setup.preset.vehicle)
-    times = jnp.arange(0.0, max(request.seconds, setup.preset.dt), 0.05)
-    places = np.asarray(jax.jit(jax.vmap(setup.flown.target))(times), dtype=float)
+    places = _places(request, request.seconds)
     low, high = places.min(0) - fence, places.max(0) + fence
     low[2] = max(low[2], min(-BELOW_GROUND, float(places[:, 2].min()) - BELOW_GROUND))
     return Limits(low, high, as_numpy(vehicle.command_min).astype(float), as_numpy(vehicle.command_max).astype(float))
+
+
+def _places(request: LiveRequest, seconds: float) -> np.ndarray:
+    """Places that the reference passes, world [m]."""
+    setup = request.setup
+    times = jnp.arange(0.0, max(seconds, setup.preset.dt), 0.05)
+    return np.asarray(jax.jit(jax.vmap(setup.flown.target))(times), dtype=float)

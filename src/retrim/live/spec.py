@@ -19,8 +19,27 @@ MAINS = {
     "plant": "retrim.live.plant_process:simulate",
     "residual": "retrim.live.learner_process:learn",
     "policy": "retrim.live.learner_process:learn",
+    "page": "retrim.live.page:show",
 }
 """Main function of each process, by role."""
+
+
+@dataclass(frozen=True)
+class PageSpec:
+    """The page of a flight."""
+
+    host: str
+    port: int
+    name: str
+    """Of what flies."""
+    path: np.ndarray
+    """Places that the reference passes, world [m], (n, 3)."""
+    methods: tuple[str, ...]
+    """Ways of learning to choose from, the present one first; none if nothing learns."""
+    arm: float
+    """From the centre of the vehicle to a rotor [m]."""
+    mass: float
+    """Of the vehicle [kg]."""
 
 
 @dataclass(frozen=True)
@@ -47,5 +66,6 @@ class LiveSpec:
     seed: int
     folder: Path
     """Where the log goes, and what the processes write to their standard outputs."""
+    page: PageSpec | None = None
     mains: Mapping[str, str] = field(default_factory=lambda: MAINS)
     """What runs as each process; another link to a vehicle is another main function of the plant."""

@@ -6,30 +6,27 @@ import os
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 from subprocess import Popen, TimeoutExpired
 from typing import Any
 
-from ..adapt.updates import Layer
 from ..errors import MessageError, PlantError
 from ..onboard.launch import launch
-from ..onboard.messages import COLUMNS, pack_note, unpack_note
-from ..onboard.plan import ControlPlan
+from ..onboard.messages import pack_note, unpack_note
 from ..onboard.realtime import cores_of
-from ..onboard.recorder import RecorderPlan
-from ..onboard.watchdog import WatchdogPlan
 from ..transport.message import describe
 from ..transport.shared_memory import SharedMemoryBus
-from .learner_process import LearnerPlan
-from .plant_process import PlantPlan
-from .published import SLOTS, slot
+from .plans import plan_of
 from .spec import LiveSpec
 from .status import Status
+from .topics import topics
 
 LANDING = 60.0  # [s], after which processes are ended wherever the vehicle is
 ATTEMPTS = 5  # to bring a process back
+LEARN = ("residual", "policy", "recorder", "page")
+"""Roles that stay off the core of those that must be on time."""
 READY_S = 300.0  # [s], compiling included
-RESTARTED = ("residual", "policy", "watchdog", "recorder")
-PRIORITIES = {"control": 30, "watchdog": 40, "plant": 20}
+RESTARTED = ("residual", "policy", "watchdog", "recorder", "page")
 
 
 @dataclass
@@ -47,20 +44,7 @@ class Supervisor:
 
     def __enter__(self) -> "Supervisor":
         """Make the bus."""
-        half = {
-            name: sum(a.nbytes for a in arrays.values()) for name, arrays in self.spec.controller.parameters.items()
-        }
-        rows = 8 * len(COLUMNS) * self.spec.window + 10_000
-        roles = ("control", "plant", "watchdog", "recorder", "residual", "policy")
-        learnt = self.spec.start.stat().st_size + 200_000
-        self.bus = SharedMemoryBus.create(
-            {"sample": 4096, "setpoint": 4096, "fallback": 4096, "order": 4096, "ended": 4096, "world": 4096}
-            | {"status": 65536, "flight": rows, "fallback.flight": rows}
-            | {f"ready.{role}": 8192 for role in roles}
-            | {f"parameters.{name}": size + 100_000 for name, size in half.items()}
-            | {slot(layer, i): learnt for layer in ("residual", "policy") for i in range(SLOTS)}
-            | {"said.residual": 8192, "said.policy": 8192}
-        )
+        self.bus, self.start = SharedMemoryBus.create(topics(self.spec)), self.spec.start
         self._cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else None
         if self._cores:
             os.sched_setaffinity(0, cores_of("learn"))
@@ -97,6 +81,8 @@ class Supervisor:
             self._start(role)
         self._start("watchdog")
         self._start("recorder")
+        if self.spec.page is not None:
+            self._start("page")
         while waiting := [role for role in self.processes if self.bus.latest(f"ready.{role}") is None]:
             self._check_alive()
             if time.monotonic() - began > READY_S:
@@ -123,6 +109,24 @@ class Supervisor:
         if not self._landing:
             self._landing = True
             self.bus.publish("order", pack_note("order", epoch=self.epoch, order="land"))
+
+    def learn(self, *, paused: bool, flown: bool) -> None:
+        """Let the learners work or wait, and fly what they learnt or what took off."""
+        self.bus.publish("learning", pack_note("learning", paused=paused, flown=flown))
+
+    def learn_from(self, start: Path) -> None:
+        """Start the policy's learner again with what a file holds."""
+        self.start = start
+        process = self.processes["policy"]
+        process.kill()
+        process.wait()
+        with contextlib.suppress(OSError):
+            self._start("policy")
+
+    @property
+    def page_port(self) -> int | None:
+        """Where the page is; None if there is none."""
+        return self._note("ready.page", "ready").get("port")
 
     def watch(self) -> Status:
         """Bring back processes that have died and may; return how the flight stands."""
@@ -172,26 +176,13 @@ class Supervisor:
         return found
 
     def _start(self, role: str) -> None:
-        cores = cores_of("learn" if role in (*self.spec.layers, "recorder") else "fly", self._cores)
+        cores = cores_of("learn" if role in LEARN else "fly", self._cores)
         self.processes[role] = launch(self.spec.mains[role], self._plan(role), self.spec.folder / f"{role}.log", cores)
 
     def _plan(self, role: str) -> Any:
-        s, bus, parent = self.spec, self.bus.folder, os.getpid()
+        control = self.processes["control"].pid if "control" in self.processes else 0
         fly = frozenset(cores_of("fly", self._cores))
-        if role == "control":
-            return ControlPlan(
-                bus, s.controller, s.limits, s.dt, s.delay_ticks, s.window, s.seconds, fly, PRIORITIES[role], parent
-            )
-        if role == "plant":
-            return PlantPlan(bus, s.scenario, s.vehicle, s.x0, s.dt, s.seed, fly, PRIORITIES[role], parent)
-        if role == "watchdog":
-            return WatchdogPlan(
-                bus, s.limits, s.dt, s.home, fly, PRIORITIES[role], self.processes["control"].pid, parent
-            )
-        if role == "recorder":
-            return RecorderPlan(bus, s.folder / "flight.csv", s.dt, parent)
-        layer: Layer = "residual" if role == "residual" else "policy"
-        return LearnerPlan(bus, layer, s.start, s.reference, s.seed, s.controller.base, parent)
+        return plan_of(role, self.spec, self.start, self.bus.folder, fly, control)
 
     def _note(self, topic: str, kind: str | None = None) -> dict[str, Any]:
         message = self.bus.latest(topic)

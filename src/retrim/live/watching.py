@@ -8,6 +8,7 @@ from ..runtime.events import Event
 from .events import LiveEvents
 from .status import Status
 from .supervisor import LANDING, Supervisor
+from .wishes import Wishes
 
 EVERY = 0.05  # [s]
 
@@ -18,6 +19,7 @@ def watched(
     events: LiveEvents,
     show: Callable[[Status, list[Event]], None],
     stop: threading.Event,
+    wishes: Wishes | None = None,
 ) -> Status:
     """Take off, watch until the flight is over, and wait until its log is written.
 
@@ -27,6 +29,7 @@ def watched(
         events: They are collected here.
         show: Called many times a second with how the flight stands and what is new.
         stop: Lands the vehicle, too.
+        wishes: What a person asks for in flight.
 
     Returns:
         The last status.
@@ -35,7 +38,7 @@ def watched(
     landed_by = float("inf")
     while True:
         status = supervisor.watch()
-        new = events.take(status)
+        new = events.take(status, wishes.obey(status) if wishes is not None else ())
         try:
             show(status, new)
         except (OSError, SystemExit):  # nobody reads any more: whoever is in the air lands

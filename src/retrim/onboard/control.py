@@ -8,7 +8,7 @@ import numpy as np
 
 from ..errors import MessageError
 from ..transport.bus import Bus
-from .guard import Fallback, GeometricHover, Mode
+from .guard import UP, Fallback, G, GeometricHover, Mode
 from .intake import Intake
 from .messages import ACCOUNTS, COMMAND, FlightRows, Sample, Setpoint, pack_note, unpack_note
 from .pilot import LivePilot
@@ -16,6 +16,7 @@ from .plan import ControlPlan
 
 REPORT_EVERY = 5  # ticks
 LANDING = "landing"
+FELT = 0.1  # share of a tick in the mean of what is felt
 
 
 class ControlLoop:
@@ -31,11 +32,14 @@ class ControlLoop:
         """The newest measurement."""
         self.error = 0.0
         self.missed, self.late_samples = 0, 0
+        self.felt, self.estimate = np.zeros(3), np.zeros(3)
+        """Acceleration that the simple model misses, over the last tenths of a second, and what the residual model says
+        of it, world [m/s^2]."""
         self._fallback = Fallback(GeometricHover(plan.limits, plan.dt))
         self._row: np.ndarray | None = None
         self._start, self._issued, self._target = 0.0, np.array([]), np.zeros(3)
         self._commands: deque[np.ndarray] = deque(maxlen=plan.delay_ticks + 1)
-        self._known = {"sample": 0, "order": 0}
+        self._known = {"sample": 0, "order": 0, "learning": 0}
         self._landing, self._gap, self._ticks = "", "", 0
         self._ended: tuple[Sample, Sample] | None = None
 
@@ -81,6 +85,8 @@ class ControlLoop:
         t = 0.0 if self.sample is None else self.sample.t - self._start
         if (order := self._new("order")) is not None and order.get("order") == "land":
             self.land(LANDING)
+        if (learning := self._new("learning")) is not None:
+            self.intake.open = bool(learning.get("flown", True))
         if t >= self.plan.seconds - 0.5 * self.plan.dt:
             self.land(LANDING)
         self._watch()
@@ -102,7 +108,8 @@ class ControlLoop:
         self.bus.publish("status", pack_note(
             "status", mode=self.mode.name.lower(), reason=self.reason, error=self.error, versions=self.pilot.versions,
             newest=intake.newest, given_up=intake.given_up, refused=intake.refused, swaps=list(intake.swaps),
-            missed=self.missed, late_samples=self.late_samples,
+            missed=self.missed, late_samples=self.late_samples, felt=self.felt.tolist(),
+            estimate=self.estimate.tolist(), target=self._target.tolist(), learning=self.intake.open,
         ))  # fmt: skip
 
     def land(self, reason: str) -> None:
@@ -176,7 +183,11 @@ class ControlLoop:
         self._fallback.hover.feel(before.state, sample.state, self._commands[0])
         if self.mode == Mode.POLICY:
             a = (sample.state[12:] - before.state[12:]) / self.plan.dt
-            missed = float(np.linalg.norm(a - self.pilot.predicted(before.state, self._commands[0])))
+            predicted = self.pilot.predicted(before.state, self._commands[0])
+            simple = self._commands[0][0] * before.state[[5, 8, 11]] - G * UP
+            self.felt += FELT * (a - simple - self.felt)
+            self.estimate += FELT * (predicted - simple - self.estimate)
+            missed = float(np.linalg.norm(a - predicted))
             target = self.pilot.target(sample.t - self._start)
             self.intake.watch(float(np.linalg.norm(sample.state[:3] - target)), missed)
 

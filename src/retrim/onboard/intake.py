@@ -31,10 +31,27 @@ class Intake:
         self.swaps: deque[list[Any]] = deque(maxlen=REMEMBERED)
         self._bus, self._base = bus, base
         self._known = dict.fromkeys(pilot.versions, 0)
-        self._flown = FlownError(dt)
+        self._dt, self._flown, self._open = dt, FlownError(dt), True
+
+    @property
+    def open(self) -> bool:
+        """Whether what was learnt is flown; if not, what flies is what took off."""
+        return self._open
+
+    @open.setter
+    def open(self, learnt: bool) -> None:
+        if learnt == self._open:
+            return
+        self._open, self._flown = learnt, FlownError(self._dt)
+        if learnt:  # what came last flies again
+            self._known, self.newest = dict.fromkeys(self._known, 0), dict.fromkeys(self.newest, 0)
+        else:
+            self.pilot.restart()
 
     def poll(self, t: float) -> None:
         """Take what has come by time ``t`` of the flight [s], if it may be flown."""
+        if not self._open:
+            return
         for half in self._known:
             message = self._bus.latest(f"parameters.{half}", self._known[half])
             if message is None:
@@ -70,7 +87,7 @@ class Intake:
 
     def _take(self, found: Parameters, t: float) -> None:
         self.newest[found.half] = found.version
-        if found.half == "policy" and found.parent in self.given_up:
+        if found.half == "policy" and {found.parent, found.version} & set(self.given_up):
             self.given_up.append(found.version)
             self.refuse("trained from a policy that was taken back")
             return

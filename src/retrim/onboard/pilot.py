@@ -101,6 +101,13 @@ class LivePilot:
             self._policies[parameters.version] = self._parameters[half]
         self._change()
 
+    def restart(self) -> None:
+        """Fly with the parameters of take-off from the next tick on."""
+        self._parameters = {half: list(arrays.values()) for half, arrays in self._source.parameters.items()}
+        self.versions = dict.fromkeys(self._source.parameters, 0)
+        self._policies = {0: self._parameters["policy"]}
+        self._change()
+
     def expected(self, half: str) -> Mapping[str, Any]:
         """Return what parameters of a half look like."""
         return self._source.parameters[half]

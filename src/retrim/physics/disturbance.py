@@ -46,6 +46,16 @@ class Together(eqx.Module):
         return sum((part(t, x) for part in self.parts), start=ExternalEffects.calm(x.p.dtype))
 
 
+class Held(eqx.Module):
+    """Effects of any kind that stay as they are; who holds them may replace them by others in flight."""
+
+    effects: ExternalEffects
+
+    def __call__(self, t: Float[Array, ""], x: State) -> ExternalEffects:
+        """Return the effects."""
+        return ExternalEffects.calm(x.p.dtype) + self.effects
+
+
 class Constant(eqx.Module):
     """The same acceleration at all times; the paper's none, small and large (Sec. IV-B)."""
 

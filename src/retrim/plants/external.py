@@ -76,6 +76,10 @@ class ExternalPlant(Plant, abc.ABC):
         self._ticks += 1
         return Measurement(self._ticks * self.dt, self._x, truth=self._x), u
 
+    def disturb(self, disturbance: Disturbance) -> None:
+        """Fly on under another disturbance; one of the same kind with other numbers compiles nothing."""
+        self._disturbance = disturbance
+
     def stop(self) -> None:
         """Forget the flight."""
         self._x = None

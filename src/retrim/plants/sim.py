@@ -182,6 +182,10 @@ class SimPlant(Plant):
         self._ticks += 1
         return self._measurement(), accepted
 
+    def disturb(self, disturbance: Disturbance) -> None:
+        """Fly on under another disturbance; one of the same kind with other numbers compiles nothing."""
+        self.simulation = dataclasses.replace(self.simulation, disturbance=disturbance)
+
     def _measurement(self) -> Measurement:
         assert self._state is not None
         model, sensors, state = self.simulation.model, self.simulation.sensors, self._state

@@ -1,0 +1,32 @@
+"""A live flight in words."""
+
+from .events import LiveEvents
+from .status import Status
+
+
+def live_line(status: Status) -> str:
+    """Return how a flight stands, as one line."""
+    control = status.control
+    versions = ", ".join(f"{half} {n}" for half, n in control.get("versions", {}).items())
+    return (
+        f"{max(0.0, status.t):.0f} s, {control.get('mode', 'not started')}, error {control.get('error', 0.0):.3f} m, "
+        f"versions: {versions}, missed ticks: {control.get('missed', 0)}"
+    )
+
+
+def live_rows(status: Status, events: LiveEvents) -> list[tuple[str, str]]:
+    """Return how a flight stands: what, and how it is now."""
+    control = status.control
+    rows: list[tuple[str, str]] = []
+    rows.append(("flown by", control.get("mode", "not started")))
+    rows.append(("error", f"{control.get('error', 0.0):.4f} m"))
+    for half, version in control.get("versions", {}).items():
+        rows.append((f"{half} swaps", str(version)))
+    rows.append(("missed ticks", str(control.get("missed", 0))))
+    if refused := control.get("refused"):
+        rows.append(("refused messages", ", ".join(f"{what}: {n}" for what, n in refused.items())))
+    rows.append(("late samples, held commands", f"{status.world.get('late', 0)}, {status.world.get('held', 0)}"))
+    rows.append(("processes", ", ".join(role if alive else f"{role} (dead)" for role, alive in status.alive.items())))
+    if events.all:
+        rows.append(("last event", f"{events.all[-1].t:.1f} s {events.all[-1].kind}: {events.all[-1].note}"))
+    return rows

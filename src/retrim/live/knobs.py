@@ -1,0 +1,122 @@
+"""What a person may do to a simulated vehicle in flight: push it, blow at it, load it, weaken a rotor."""
+
+import math
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+
+from ..config.disturbances import disturbance
+from ..config.scenario import Scenario
+from ..errors import MessageError, PlantError
+from ..onboard.messages import pack_note, unpack_note
+from ..physics.disturbance import Held, Together
+from ..physics.effects import ExternalEffects
+from ..physics.state import Command
+from ..physics.vehicle import payload_inertia
+from ..plants.plant import Measurement, Plant
+
+PUSH, WIND, LOAD, WEAKEST = 4.0, 10.0, 5.0, 0.5  # [m/s^2], [m/s] per axis; [kg]; share of its thrust
+KICK_S = 0.2  # [s], how long a kick acts
+KICK = 15.0  # [m/s^2] per axis, at most
+
+
+@dataclass(frozen=True)
+class Knobs:
+    """How the knobs stand. All of it comes on top of the disturbance of the scenario."""
+
+    push: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """External acceleration, world [m/s^2]."""
+    wind: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """World [m/s]."""
+    load: float = 0.0
+    """Mass hung under the vehicle [kg]."""
+    rotor: float = 1.0
+    """Share of its thrust that the front-right rotor keeps."""
+    kick: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Acceleration of the last kick, world [m/s^2]."""
+    kicks: int = 0
+    """Kicks so far; one more is one more kick."""
+
+    def __post_init__(self) -> None:
+        """Raise :class:`MessageError` for a knob that is turned too far, or nowhere."""
+        for name, values, bound in (("push", self.push, PUSH), ("wind", self.wind, WIND), ("kick", self.kick, KICK)):
+            if len(values) != 3 or not all(math.isfinite(v) and abs(v) <= bound for v in values):
+                raise MessageError(f"knobs: {name} = {values} must be three numbers within +-{bound:g}")
+        if not 0.0 <= self.load <= LOAD or not WEAKEST <= self.rotor <= 1.0 or self.kicks < 0:
+            raise MessageError(
+                f"knobs: load = {self.load} kg must be 0 to {LOAD:g}, rotor = {self.rotor} {WEAKEST:g} to 1"
+            )
+
+    def pack(self) -> bytes:
+        """Return the bytes; the inverse of :meth:`unpack`."""
+        return pack_note("knobs", **vars(self))
+
+    @classmethod
+    def unpack(cls, data: bytes) -> "Knobs":
+        """Read knobs.
+
+        Raises:
+            MessageError: The bytes are none, or a knob is turned too far.
+        """
+        fields = unpack_note(data, "knobs")
+        try:
+            (px, py, pz), (wx, wy, wz), (kx, ky, kz) = (map(float, fields[name]) for name in ("push", "wind", "kick"))
+            load, rotor, kicks = float(fields["load"]), float(fields["rotor"]), int(fields["kicks"])
+            return cls((px, py, pz), (wx, wy, wz), load, rotor, (kx, ky, kz), kicks)
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
+            raise MessageError(f"knobs: {error}") from error
+
+    def effects(self, *, kicking: bool = False) -> ExternalEffects:
+        """Return what acts on the vehicle, with or without the kick."""
+        push = np.asarray(self.push) + (np.asarray(self.kick) if kicking else 0.0)
+        gain = np.array([self.rotor, 1.0, 1.0, 1.0])
+        inertia = payload_inertia(self.load) if self.load > 0 else np.zeros(3)
+        return ExternalEffects(*(jnp.asarray(a) for a in (push, np.asarray(self.wind), gain, self.load, inertia)))
+
+
+class KnobbedPlant:
+    """A plant whose knobs are turned while it flies. What it does not know is refused, and the flight goes on."""
+
+    def __init__(self, plant: Plant, scenario: Scenario, seed: int) -> None:
+        """Build one; a plant of one's own without a method ``disturb`` has no knobs."""
+        self.refused = "" if hasattr(plant, "disturb") else "this plant has no knobs"
+        """Why the knobs were not turned last time."""
+        self._plant, self._possible = plant, not self.refused
+        self._knobs, self._left = Knobs(), 0
+        self._scenario = disturbance(scenario.disturbance, seed)
+        self._turn()
+
+    def turn(self, knobs: Knobs) -> None:
+        """Turn the knobs; a kick begins if there was one more than before."""
+        if knobs.kicks > self._knobs.kicks:
+            self._left = round(KICK_S / self._plant.dt)
+        self._knobs = knobs
+        if self._possible:
+            self.refused = ""
+        self._turn()
+
+    def step(self, u: Command) -> tuple[Measurement, Command]:
+        """Fly for a tick.
+
+        Raises:
+            PlantError: The plant is lost.
+        """
+        try:
+            done = self._plant.step(u)
+        except PlantError as error:
+            if not self._possible or self._knobs == Knobs(kicks=self._knobs.kicks):
+                raise
+            self.refused, self._knobs, self._left = str(error), Knobs(kicks=self._knobs.kicks), 0
+            self._turn()
+            done = self._plant.step(u)
+        if self._left:
+            self._left -= 1
+            if not self._left:
+                self._turn()
+        return done
+
+    def _turn(self) -> None:
+        if self._possible:
+            held = Held(self._knobs.effects(kicking=self._left > 0))
+            self._plant.disturb(Together((self._scenario, held)))  # type: ignore[attr-defined]

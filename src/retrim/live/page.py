@@ -1,0 +1,139 @@
+"""The process of the page: a flight in a browser, with knobs. The flight waits for it at no time."""
+
+import contextlib
+import io
+import socket
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import ConfigError, MessageError
+from ..onboard.messages import Sample, pack_note, unpack_note
+from ..onboard.realtime import Lifeline
+from ..transport.bus import Bus
+from ..transport.shared_memory import SharedMemoryBus
+from .knobs import Knobs
+from .panel import Panel
+from .scene import Scene
+from .spec import PageSpec
+
+RATE = 20.0  # [Hz]
+TEXT_EVERY = 5  # refreshes
+LOOPBACK = ("127.0.0.1", "localhost", "::1")
+
+
+@dataclass(frozen=True)
+class PagePlan:
+    """Everything that the process is started with."""
+
+    folder: Path
+    """Of the bus."""
+    page: PageSpec
+    parent: int
+
+
+def free_port(host: str, wanted: int) -> int:
+    """Return a port of ``host`` that nobody listens on: the first of ten from ``wanted`` on.
+
+    Raises:
+        ConfigError: There is none, or no such address on this machine.
+    """
+    error: OSError | None = None
+    for port in range(wanted, min(wanted + 10, 65536)):
+        try:
+            with socket.create_server((host, port)):
+                return port
+        except OSError as found:
+            error = found
+    raise ConfigError(f"page: no free port from {wanted} on at {host!r} ({error})")
+
+
+def show(plan: PagePlan) -> None:
+    """Show the flight until somebody ends the process: its main function."""
+    import viser
+
+    bus, parent, spec = SharedMemoryBus(plan.folder), Lifeline(plan.parent), plan.page
+    with contextlib.redirect_stdout(io.StringIO()):  # it prints where it is; so do we
+        server = viser.ViserServer(host=spec.host, port=spec.port, label=f"retrim: {spec.name}", verbose=False)
+    page = _Page(spec, bus, server)
+    bus.publish("ready.page", pack_note("ready", port=server.get_port()))
+    refreshed = 0
+    while not parent.gone(1.0 / RATE):
+        page.refresh(text=refreshed % TEXT_EVERY == 0)
+        refreshed += 1
+    server.stop()
+
+
+class _Page:
+    """Reads the bus for scene and panel, and writes what a person does."""
+
+    def __init__(self, spec: PageSpec, bus: Bus, server: Any) -> None:
+        self._bus, self._wishes = bus, dict[str, Any]()
+        self._scene = Scene(server, spec.path, spec.arm, RATE)
+        self._panel = Panel(server, self._turn, self._wish, spec.methods, spec.mass, RATE)
+        self._scene.on_pull(self._panel.pull)
+        self._tick = -1
+
+    def refresh(self, *, text: bool) -> None:
+        """Show what is new."""
+        status, sample = self._note("status"), self._sample()
+        if sample is not None and sample.tick != self._tick:
+            self._tick = sample.tick
+            felt, estimate = (np.asarray(status.get(name, (0.0, 0.0, 0.0))) for name in ("felt", "estimate"))
+            target = np.asarray(status.get("target", sample.state[:3]))
+            self._scene.move(sample.truth[:3], sample.truth[3:12].reshape(3, 3), target, felt, estimate)
+            policies = int(status.get("newest", {}).get("policy", 0))
+            self._panel.note(sample.t, float(np.linalg.norm(sample.truth[:3] - target)), policies)
+        if text and status:
+            self._panel.show(_text(status, self._note("ended"), self._learners(), self._note("world")))
+
+    def _sample(self) -> Sample | None:
+        message = self._bus.latest("sample")
+        with contextlib.suppress(MessageError):
+            return None if message is None else Sample.unpack(message.data)
+        return None
+
+    def _learners(self) -> dict[str, dict[str, Any]]:
+        found = {layer: self._note(f"learner.{layer}") for layer in ("residual", "policy")}
+        return {layer: note for layer, note in found.items() if note}
+
+    def _note(self, topic: str) -> dict[str, Any]:
+        message = self._bus.latest(topic)
+        with contextlib.suppress(MessageError):
+            return {} if message is None else unpack_note(message.data, topic)
+        return {}
+
+    def _turn(self, knobs: Knobs) -> None:
+        self._bus.publish("knobs", knobs.pack())
+
+    def _wish(self, **wish: Any) -> None:
+        self._wishes |= wish
+        self._bus.publish("wish", pack_note("wish", **self._wishes))
+
+
+def _text(
+    status: dict[str, Any], ended: dict[str, Any], learners: dict[str, dict[str, Any]], world: dict[str, Any]
+) -> str:
+    lines = [f"**{status['mode']}**" + (f": {status['reason']}" if status.get("reason") else "")]
+    if ended:
+        lines = [f"**flight over**: {ended.get('reason', '')}"]
+    versions = status.get("versions", {})
+    if "policy" in versions:
+        lines.append(f"policy {versions['policy']}, taken back: {len(status.get('given_up', []))}")
+    lines.append(f"error {100.0 * status['error']:.1f} cm, missed ticks {status['missed']}")
+    felt, estimate = (_arrow(status.get(name, [])) for name in ("felt", "estimate"))
+    lines.append(f"<span style='color:#d64541'>disturbance</span> {felt} m/s²")
+    lines.append(f"<span style='color:#3070d6'>estimate</span> {estimate} m/s²")
+    for layer, note in learners.items():
+        lines.append(f"{layer} learner: {note['learnt']} times, {1e3 * note['took']:.0f} ms each")
+    if not status.get("learning", True):
+        lines.append("what was learnt does not fly")
+    if world.get("knobs_refused"):
+        lines.append(f"knobs refused: {world['knobs_refused']}")
+    return "<br>".join(lines)
+
+
+def _arrow(a: list[float]) -> str:
+    return " ".join(f"{value:+.2f}" for value in a)

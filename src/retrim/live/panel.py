@@ -1,0 +1,145 @@
+"""The panel of the page: how the flight stands, and what a person may change of it."""
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from .knobs import LOAD, PUSH, WEAKEST, WIND, Knobs
+
+HISTORY_S = 60.0  # [s]
+KICKS = {"+x": (8.0, 0.0, 0.0), "-x": (-8.0, 0.0, 0.0), "+y": (0.0, 8.0, 0.0), "-y": (0.0, -8.0, 0.0)}  # [m/s^2]
+WAITING = "Waiting for take-off."
+
+
+class Panel:
+    """Sliders, buttons and a history; what a person does with them is told at once."""
+
+    def __init__(
+        self,
+        server: Any,
+        turn: Callable[[Knobs], None],
+        wish: Callable[..., None],
+        methods: tuple[str, ...],
+        mass: float,
+        rate: float,
+    ) -> None:
+        """Build the panel.
+
+        Args:
+            server: The viser server.
+            turn: Called with how the knobs stand.
+            wish: Called with ``method`` and ``paused``, or with ``land``.
+            methods: Ways of learning to choose from, the present one first; none if nothing learns.
+            mass: Of the vehicle [kg].
+            rate: How often the panel is refreshed [Hz].
+        """
+        self._told, self._gui = turn, server.gui
+        self._knobs, self._pull = Knobs(), np.zeros(3)
+        self._history: deque[tuple[float, float, float]] = deque(maxlen=round(HISTORY_S * rate))
+        self._text = self._gui.add_markdown(WAITING)
+        self._plot = _history_plot(self._gui)
+        with self._gui.add_folder("World"):
+            self._gui.add_markdown("Grab the vehicle with the mouse and pull. Or:")
+            self._push = _vector(self._gui, "push [m/s²]", PUSH, 0.1)
+            self._wind = _vector(self._gui, "wind [m/s]", WIND, 0.5)
+            most = float(f"{min(LOAD, 0.8 * mass):.2g}")
+            self._load = self._gui.add_slider("load [kg]", 0.0, most, step=most / 50, initial_value=0.0)
+            self._rotor = self._gui.add_slider(
+                "rotor",
+                WEAKEST,
+                1.0,
+                step=0.01,
+                initial_value=1.0,
+                hint="share of its thrust that the front-right rotor keeps",
+            )
+            kick = self._gui.add_button_group("kick", tuple(KICKS))
+            calm = self._gui.add_button("Calm", hint="all knobs back to nothing")
+        for knob in (self._push, self._wind, self._load, self._rotor):
+            knob.on_update(lambda _: self._turned())
+        kick.on_click(lambda event: self._turned(KICKS[event.target.value]))
+        calm.on_click(lambda _: self._calm())
+        with self._gui.add_folder("Learning"):
+            if methods:
+                method = self._gui.add_dropdown("method", (*methods, "none"), initial_value=methods[0])
+                paused = self._gui.add_checkbox("pause", initial_value=False)
+                for choice in (method, paused):
+                    choice.on_update(lambda _: wish(method=method.value, paused=paused.value))
+            else:
+                self._gui.add_markdown("This flight does not learn.")
+        self._gui.add_button("Land", color="red").on_click(lambda _: wish(land=True))
+
+    def pull(self, a: np.ndarray) -> None:
+        """Take note of what the mouse does: an acceleration, world [m/s^2]."""
+        self._pull = a
+        self._turned()
+
+    def note(self, t: float, error: float, policies: int) -> None:
+        """Add to the history: time since take-off [s], distance from the target [m], number of policies so far."""
+        self._history.append((t, 100.0 * error, policies))
+
+    def show(self, text: str) -> None:
+        """Refresh what is shown: the history, and how the flight stands in Markdown."""
+        self._text.content = text
+        if len(self._history) > 1:
+            t, error, policies = np.array(self._history).T
+            top = max(1.0, 1.1 * error.max())
+            marks = np.where(np.append(False, np.diff(policies) > 0), error, -10.0 * top)  # not there: far below
+            self._plot.scales = _scales((t[0], t[-1]), top)
+            self._plot.data = (t, error, marks)
+
+    def _turned(self, kick: tuple[float, float, float] | None = None) -> None:
+        push = np.clip(np.asarray(self._push.value) + self._pull, -PUSH, PUSH)
+        self._knobs = Knobs(
+            (float(push[0]), float(push[1]), float(push[2])),
+            self._wind.value,
+            self._load.value,
+            self._rotor.value,
+            kick or self._knobs.kick,
+            self._knobs.kicks + (kick is not None),
+        )
+        self._told(self._knobs)
+
+    def _calm(self) -> None:
+        for knob, value in (
+            (self._push, (0.0, 0.0, 0.0)),
+            (self._wind, (0.0, 0.0, 0.0)),
+            (self._load, 0.0),
+            (self._rotor, 1.0),
+        ):
+            knob.value = value
+        self._knobs = replace(Knobs(), kick=self._knobs.kick, kicks=self._knobs.kicks)
+        self._told(self._knobs)
+
+
+def _vector(gui: Any, name: str, bound: float, step: float) -> Any:
+    return gui.add_vector3(name, (0.0, 0.0, 0.0), min=(-bound,) * 3, max=(bound,) * 3, step=step)
+
+
+def _history_plot(gui: Any) -> Any:
+    from viser import uplot
+
+    nothing = np.array([0.0, 1.0])
+    points = uplot.Series_Points(show=True, size=5, fill="#d64541")
+    return gui.add_uplot(
+        (nothing, nothing, nothing),
+        (
+            uplot.Series(label="t [s]"),
+            uplot.Series(label="error [cm]", stroke="#3070d6", width=1.5),
+            uplot.Series(label="new policy", stroke="#d64541", width=0, points=points),
+        ),
+        scales=_scales((0.0, 1.0), 1.0),
+        aspect=2.3,
+    )
+
+
+def _scales(span: tuple[float, float], top: float) -> dict[str, Any]:
+    """Ranges of the axes."""
+    from viser import uplot
+
+    return {
+        "x": uplot.Scale(time=False, auto=False, range=(float(span[0]), float(span[1]))),
+        "y": uplot.Scale(auto=False, range=(0.0, float(top))),
+    }

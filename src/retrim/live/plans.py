@@ -1,0 +1,45 @@
+"""What each process of a live flight is started with."""
+
+import os
+from pathlib import Path
+from typing import Any
+
+from ..adapt.updates import Layer
+from ..onboard.plan import ControlPlan
+from ..onboard.recorder import RecorderPlan
+from ..onboard.watchdog import WatchdogPlan
+from .learner_process import LearnerPlan
+from .page import PagePlan
+from .plant_process import PlantPlan
+from .spec import LiveSpec
+
+PRIORITIES = {"control": 30, "watchdog": 40, "plant": 20}
+
+
+def plan_of(role: str, spec: LiveSpec, start: Path, bus: Path, cores: frozenset[int], control: int) -> Any:
+    """Return the plan of a role.
+
+    Args:
+        role: Name.
+        spec: Of the flight.
+        start: File with what learners go on from.
+        bus: Folder of the bus.
+        cores: Those of the processes that must be on time.
+        control: The process that flies, once it runs.
+    """
+    s, parent = spec, os.getpid()
+    if role == "control":
+        return ControlPlan(
+            bus, s.controller, s.limits, s.dt, s.delay_ticks, s.window, s.seconds, cores, PRIORITIES[role], parent
+        )
+    if role == "plant":
+        return PlantPlan(bus, s.scenario, s.vehicle, s.x0, s.dt, s.seed, cores, PRIORITIES[role], parent)
+    if role == "watchdog":
+        return WatchdogPlan(bus, s.limits, s.dt, s.home, cores, PRIORITIES[role], control, parent)
+    if role == "recorder":
+        return RecorderPlan(bus, s.folder / "flight.csv", s.dt, parent)
+    if role == "page":
+        assert s.page is not None
+        return PagePlan(bus, s.page, parent)
+    layer: Layer = "residual" if role == "residual" else "policy"
+    return LearnerPlan(bus, layer, start, s.reference, s.seed, s.controller.base, parent)

@@ -1,0 +1,111 @@
+"""The vehicle and what acts on it, in three dimensions."""
+
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+RED, BLUE, GREY, GREEN, DARK = (214, 69, 65), (48, 112, 214), (150, 150, 150), (60, 160, 90), (45, 45, 50)
+METRES = 0.25  # of an arrow, for each m/s^2
+ROPE = 5.0  # [1/s^2], acceleration for each metre that the hand is away
+TRAIL_S = 6.0  # [s]
+FORWARD = np.array([[1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, 1.0]])
+"""Where rotors are, x forward and y left: front-right, back-left, back-right, front-left."""
+
+
+class Scene:
+    """Vehicle, trail, reference and arrows; each is sent once and then moved."""
+
+    def __init__(self, server: Any, path: np.ndarray, arm: float, rate: float) -> None:
+        """Build the scene.
+
+        Args:
+            server: The viser server.
+            path: Places that the reference passes, world [m], (n, 3).
+            arm: From the centre of the vehicle to a rotor [m].
+            rate: How often the scene is moved [Hz].
+        """
+        self._scene, self._trail = server.scene, deque[np.ndarray](maxlen=round(TRAIL_S * rate))
+        middle, size = path.mean(0), float(np.ptp(path, axis=0).max())
+        server.initial_camera.position = tuple(middle + (1.3 + size) * np.array([-0.8, -0.7, 0.35]))
+        server.initial_camera.look_at = tuple(middle)
+        ground = 2.0 * np.ceil(3.0 + size)
+        self._scene.add_grid("/ground", width=ground, height=ground, position=(middle[0], middle[1], 0.0))
+        if size > 0.01:
+            pairs = np.stack([path[:-1], path[1:]], axis=1)
+            self._scene.add_line_segments("/reference", pairs, GREY, thickness=0.006)
+        self._target = self._scene.add_icosphere("/target", 0.03, GREEN, opacity=0.6, cast_shadow=False)
+        self._vehicle = self._scene.add_frame("/vehicle", show_axes=False)
+        _quadrotor(self._scene, max(arm, 0.08))
+        self._grip = self._scene.add_icosphere(
+            "/vehicle/grip", 1.7 * max(arm, 0.08), GREEN, opacity=0.06, cast_shadow=False
+        )
+        self._rope = self._scene.add_line_segments("/rope", np.zeros((1, 2, 3)), GREEN, thickness=0.01, visible=False)
+        self._line = self._scene.add_line_segments("/trail", np.zeros((1, 2, 3)), DARK, thickness=0.008)
+        self._arrows = {
+            name: self._scene.add_arrows(
+                f"/{name}", np.zeros((1, 2, 3)), color, shaft_radius=0.008, head_radius=0.02, head_length=0.05
+            )
+            for name, color in (("disturbance", RED), ("estimate", BLUE))
+        }
+
+    def on_pull(self, pull: Callable[[np.ndarray], None]) -> None:
+        """Call ``pull`` with an acceleration, world [m/s^2], as somebody pulls the vehicle; zero at the end."""
+
+        async def dragged(event: Any) -> None:  # the server calls only coroutines in order
+            grip, hand = np.array(event.start_position), np.array(event.end_position)
+            over = event.phase == "end"
+            self._rope.visible, self._rope.points = not over, np.stack([grip, hand])[None]
+            pull(np.zeros(3) if over else ROPE * (hand - grip))
+
+        self._grip.on_drag("left")(dragged)
+
+    def move(
+        self, p: np.ndarray, R: np.ndarray, target: np.ndarray, disturbance: np.ndarray, estimate: np.ndarray
+    ) -> None:
+        """Show a new state.
+
+        Args:
+            p: Position, world [m].
+            R: Attitude, body to world.
+            target: Where the vehicle should be, world [m].
+            disturbance: Acceleration that the simple model misses, world [m/s^2].
+            estimate: What the residual model says of it, world [m/s^2].
+        """
+        self._vehicle.position, self._vehicle.wxyz = tuple(p), quaternion(R)
+        self._target.position = tuple(target)
+        self._trail.append(p)
+        if len(self._trail) > 1:
+            points = np.stack(self._trail)
+            self._line.points = np.stack([points[:-1], points[1:]], axis=1)
+        for (name, arrow), a in zip(self._arrows.items(), (disturbance, estimate), strict=True):
+            above = 0.04 if name == "estimate" else 0.0  # beside each other where they agree
+            start = p + np.array([0.0, 0.0, above])
+            arrow.visible = bool(np.linalg.norm(a) > 0.05)
+            arrow.points = np.stack([start, start + METRES * a])[None]
+
+
+def quaternion(R: np.ndarray) -> tuple[float, float, float, float]:
+    """Return an attitude as a unit quaternion, real part first (Shepperd's method)."""
+    t = np.array([np.trace(R), *np.diag(R)])
+    i = int(np.argmax(t))
+    x, y, z = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+    xy, xz, yz = R[0, 1] + R[1, 0], R[0, 2] + R[2, 0], R[1, 2] + R[2, 1]
+    one = 1.0 + 2.0 * t[i] - t[0]
+    rows = ((1.0 + t[0], x, y, z), (x, one, xy, xz), (y, xy, one, yz), (z, xz, yz, one))
+    q = np.array(rows[i])
+    w, a, b, c = q / np.linalg.norm(q)
+    return float(w), float(a), float(b), float(c)
+
+
+def _quadrotor(scene: Any, arm: float) -> None:
+    across = arm / 2.0**0.5
+    scene.add_box("/vehicle/body", DARK, dimensions=(0.7 * arm, 0.45 * arm, 0.25 * arm))
+    scene.add_box("/vehicle/nose", RED, dimensions=(0.12 * arm, 0.3 * arm, 0.2 * arm), position=(0.4 * arm, 0.0, 0.0))
+    for i, (x, y) in enumerate(across * FORWARD):
+        name, color = f"/vehicle/rotor{i}", RED if x > 0 else GREY
+        scene.add_cylinder(name, radius=0.55 * arm, height=0.04 * arm, color=color, opacity=0.5,
+                           position=(x, y, 0.2 * arm))  # fmt: skip
+        ends = np.array([[[0.0, 0.0, 0.0], [x, y, 0.0]], [[x, y, 0.0], [x, y, 0.2 * arm]]])
+        scene.add_line_segments(f"/vehicle/arm{i}", ends, DARK, thickness=0.12 * arm)

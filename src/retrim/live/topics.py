@@ -1,0 +1,24 @@
+"""The topics of a live flight, and the longest message of each."""
+
+from ..onboard.messages import COLUMNS
+from .published import SLOTS, slot
+from .spec import LiveSpec
+
+SMALL = ("sample", "setpoint", "fallback", "order", "ended", "world", "knobs", "wish", "learning")
+LAYERS = ("residual", "policy")
+ROLES = ("control", "plant", "watchdog", "recorder", "page", *LAYERS)
+
+
+def topics(spec: LiveSpec) -> dict[str, int]:
+    """Return the longest message of each topic [bytes]."""
+    half = {name: sum(a.nbytes for a in arrays.values()) for name, arrays in spec.controller.parameters.items()}
+    rows = 8 * len(COLUMNS) * spec.window + 10_000
+    learnt = 2 * spec.start.stat().st_size + 200_000  # a policy of low rank holds its base, too
+    return (
+        dict.fromkeys(SMALL, 4096)
+        | {"status": 65536, "flight": rows, "fallback.flight": rows}
+        | {f"ready.{role}": 8192 for role in ROLES}
+        | {f"parameters.{name}": size + 100_000 for name, size in half.items()}
+        | {slot(layer, i): learnt for layer in LAYERS for i in range(SLOTS)}
+        | {f"{what}.{layer}": 8192 for what in ("said", "learner") for layer in LAYERS}
+    )

@@ -1,0 +1,103 @@
+"""What a person asks for in flight: land, pause, learn in another way, fly what took off."""
+
+import contextlib
+import time
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from ..errors import MessageError, RetrimError
+from ..io.trained import load_learnt, save_learnt
+from ..onboard.messages import unpack_note
+from ..runtime.events import Event
+from .knobs import Knobs
+from .report import learnt_in
+from .session import LEARNING, LiveRequest, learner_state
+from .status import Status
+from .supervisor import Supervisor
+
+SETTLED_S = 0.5  # [s] without a further turn, after which knobs that were turned are an event
+
+
+class Wishes:
+    """Reads what was asked, and does it; one for each flight. What it takes long to do is done beside the flight."""
+
+    def __init__(self, request: LiveRequest, supervisor: Supervisor) -> None:
+        """Build one for the flight of a supervisor."""
+        self._request, self._supervisor = request, supervisor
+        self._wish: dict[str, Any] = {"method": request.method, "paused": False}
+        self._method, self._starts = request.method, 0
+        self._versions = {"wish": 0, "knobs": 0}
+        self._turned: tuple[float, Knobs] | None = None
+        self._work = ThreadPoolExecutor(1)
+        self._coming: tuple[str, Future[Path]] | None = None
+
+    def obey(self, status: Status) -> list[Event]:
+        """Do what has been asked for since the last call; return it as events."""
+        new = self._knobs(status.t)
+        if (wish := self._new("wish")) is not None:
+            try:
+                asked = unpack_note(wish, "wish")
+            except MessageError:
+                return new
+            new += self._ask(asked, status)
+        return new + self._arrived(status.t)
+
+    def close(self) -> None:
+        """Drop what is still being worked on."""
+        self._work.shutdown(wait=False, cancel_futures=True)
+
+    def _ask(self, asked: dict[str, Any], status: Status) -> list[Event]:
+        if asked.get("land"):
+            self._supervisor.land()
+            return [Event(status.t, "asked", "land")]
+        method, paused = asked.get("method", self._wish["method"]), bool(asked.get("paused", self._wish["paused"]))
+        now = {"method": method, "paused": paused}
+        if now == self._wish or not self._supervisor.spec.layers or method not in (*LEARNING, "none"):
+            return []
+        self._wish = now
+        self._supervisor.learn(paused=paused or method == "none", flown=method != "none")
+        if method in LEARNING and method != self._method:
+            self._method = method
+            self._coming = method, self._work.submit(self._start_of, method, status)
+        return [Event(status.t, "asked", f"method {method}" + (", paused" if paused else ""))]
+
+    def _start_of(self, method: str, status: Status) -> Path:
+        """Write down what flies, in the form in which ``method`` learns."""
+        found = learnt_in(self._supervisor.bus, status, self._supervisor.start)
+        state = found or load_learnt(self._supervisor.start)[0]
+        self._starts += 1
+        path = self._request.folder / f"start-{self._starts}.safetensors"
+        merged = state.policy.policy.merged()
+        save_learnt(path, learner_state(self._request, merged, method, state.residual), self._request.setup.preset)
+        return path
+
+    def _arrived(self, t: float) -> list[Event]:
+        if self._coming is None or not self._coming[1].done():
+            return []
+        (method, future), self._coming = self._coming, None
+        try:
+            self._supervisor.learn_from(future.result())
+        except (RetrimError, OSError) as error:
+            return [Event(t, "asked", f"method {method} cannot be had: {error}")]
+        return [Event(t, "asked", f"the policy's learner starts again: {method}")]
+
+    def _knobs(self, t: float) -> list[Event]:
+        if (turned := self._new("knobs")) is not None:
+            with contextlib.suppress(MessageError):
+                self._turned = time.monotonic(), Knobs.unpack(turned)
+        if self._turned is None or time.monotonic() - self._turned[0] < SETTLED_S:
+            return []
+        knobs, self._turned = self._turned[1], None
+        return [Event(t, "knobs", ", ".join(f"{name} {_shown(value)}" for name, value in vars(knobs).items()))]
+
+    def _new(self, topic: str) -> bytes | None:
+        message = self._supervisor.bus.latest(topic, self._versions[topic])
+        if message is None:
+            return None
+        self._versions[topic] = message.version
+        return message.data
+
+
+def _shown(value: Any) -> str:
+    return " ".join(f"{each:g}" for each in value) if isinstance(value, tuple) else f"{value:g}"

@@ -1,0 +1,114 @@
+"""Knobs: what a person does to a simulated vehicle is what acts on it, and what cannot act is refused."""
+
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from retrim.config.scenario import Scenario
+from retrim.errors import MessageError, PlantError
+from retrim.live.knobs import KICK_S, KnobbedPlant, Knobs
+from retrim.onboard.messages import pack_note
+from retrim.physics import Command, State
+from retrim.plants.plant import Measurement, Plant, as_numpy
+
+
+def knobbed(plant="simple", **scenario):
+    made = Scenario(plant=plant, **scenario).make("small")
+    made.reset(None)
+    return KnobbedPlant(made, Scenario(plant=plant, **scenario), 0)
+
+
+def speeds(plant, ticks):
+    """Velocity after each tick of hover commands."""
+    return np.array([np.asarray(plant.step(Command.hover(jnp.zeros(0).dtype))[0].v) for _ in range(ticks)])
+
+
+def test_knobs_survive_the_bus():
+    knobs = Knobs((1.0, -2.0, 0.5), (3.0, 0.0, -1.0), 0.05, 0.8, (8.0, 0.0, 0.0), 3)
+    assert Knobs.unpack(knobs.pack()) == knobs
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"push": [9.0, 0.0, 0.0]}, {"push": [float("nan"), 0.0, 0.0]}, {"push": [0.0, 0.0]}, {"push": "up"},
+        {"wind": None}, {"load": -0.1}, {"load": 1e9}, {"rotor": 0.1}, {"rotor": "weak"}, {"kicks": -1},
+        {"kicks": float("inf")}, {"kick": [99.0, 0.0, 0.0]},
+    ],
+)  # fmt: skip
+def test_a_knob_that_is_turned_too_far_is_refused(fields):
+    good = json.loads(json.dumps(vars(Knobs())))
+    assert Knobs.unpack(pack_note("knobs", **good)) == Knobs()
+    with pytest.raises(MessageError, match="knobs"):
+        Knobs.unpack(pack_note("knobs", **(good | fields)))
+
+
+def test_a_push_is_an_acceleration_and_ends_with_the_knob():
+    plant, still = knobbed(), knobbed()
+    plant.turn(Knobs(push=(1.0, 0.0, 0.0)))
+    pushed = speeds(plant, 10) - speeds(still, 10)
+    np.testing.assert_allclose(pushed[-1], [0.2, 0.0, 0.0], atol=0.01)
+    plant.turn(Knobs())
+    after = speeds(plant, 10)[:, 0]
+    np.testing.assert_allclose(after, after[0], atol=0.02)
+
+
+def test_knobs_come_on_top_of_the_disturbance():
+    both, alone = knobbed(disturbance="push=1"), knobbed(disturbance="push=1")
+    both.turn(Knobs(push=(-1.0, 0.0, 0.0)))
+    difference = speeds(both, 10)[-1] - speeds(alone, 10)[-1]
+    np.testing.assert_allclose(difference, [-0.2, 0.0, 0.0], atol=0.01)
+
+
+def test_a_kick_ends_by_itself_and_comes_once():
+    plant, still = knobbed(), knobbed()
+    kicked = Knobs(kick=(8.0, 0.0, 0.0), kicks=1)
+    plant.turn(kicked)
+    gained = (speeds(plant, 30) - speeds(still, 30))[:, 0]
+    assert abs(int(np.argmax(gained)) - (round(KICK_S / 0.02) - 1)) <= 1  # from then on, drag slows it down
+    np.testing.assert_allclose(gained.max(), 8.0 * KICK_S, rtol=0.1)
+    before = speeds(plant, 1)[0, 0]
+    plant.turn(kicked)  # the same message again, as after another knob was turned
+    assert abs(speeds(plant, 5)[-1, 0] - before) < 0.2
+
+
+@pytest.mark.parametrize("knobs", [Knobs(load=0.05), Knobs(rotor=0.7), Knobs(wind=(4.0, 0.0, 0.0))])
+def test_every_knob_moves_the_vehicle(knobs):
+    plant, still = knobbed(), knobbed()
+    plant.turn(knobs)
+    assert np.abs(speeds(plant, 15) - speeds(still, 15)).max() > 0.02
+
+
+def test_a_plant_that_does_not_know_an_effect_flies_on():
+    plant, still = knobbed("rotorpy"), knobbed("rotorpy")
+    plant.turn(Knobs(load=0.1, push=(1.0, 0.0, 0.0)))
+    np.testing.assert_array_equal(speeds(plant, 5), speeds(still, 5))
+    assert "cannot carry a load" in plant.refused
+    plant.turn(Knobs(push=(1.0, 0.0, 0.0)))
+    assert plant.refused == ""
+    assert speeds(plant, 5)[-1, 0] - speeds(still, 5)[-1, 0] > 0.05
+
+
+def test_a_plant_without_knobs_says_so_and_its_errors_are_its_own():
+    class Bare(Plant):
+        dt = 0.02
+
+        def reset(self, x0):
+            return Measurement(0.0, State.at(jnp.zeros(3)))
+
+        def step(self, u):
+            if as_numpy(u)[0] > 20:
+                raise PlantError("too much")
+            return self.reset(None), u
+
+        def stop(self):
+            pass
+
+    plant = KnobbedPlant(Bare(), Scenario(), 0)
+    plant.turn(Knobs(push=(1.0, 0.0, 0.0)))
+    assert plant.refused == "this plant has no knobs"
+    assert plant.step(Command.hover(jnp.zeros(0).dtype))[0].t == 0.0
+    with pytest.raises(PlantError, match="too much"):
+        plant.step(Command.of(jnp.array([30.0, 0.0, 0.0, 0.0])))

@@ -1,0 +1,109 @@
+"""What a person asks for in flight is done, once, and told."""
+
+import time
+
+import jax
+import numpy as np
+import pytest
+from jax import random
+
+from helpers import tiny_preset
+from live_helpers import TOPICS
+from retrim.adapt.updates import PolicyUpdate
+from retrim.config.scenario import Scenario
+from retrim.config.setup import Setup
+from retrim.control.lora import LoraPolicy
+from retrim.io.trained import load_learnt
+from retrim.learn.bptt import PolicyState
+from retrim.live import wishes
+from retrim.live.knobs import Knobs
+from retrim.live.published import keep
+from retrim.live.session import LiveRequest, live_spec
+from retrim.live.status import Status
+from retrim.live.supervisor import Supervisor
+from retrim.live.wishes import Wishes
+from retrim.onboard.messages import pack_note
+from retrim.transport.in_process import InProcessBus
+
+pytestmark = pytest.mark.usefixtures("optax_promotion")
+
+
+class Told(Supervisor):
+    """Has no processes; it notes what it is told."""
+
+    def __init__(self, spec):
+        super().__init__(spec)
+        room = {f"update.{layer}.{i}": 5_000_000 for layer in ("residual", "policy") for i in (0, 1)}
+        self.bus, self.start = InProcessBus(TOPICS | room | {"wish": 4096, "knobs": 4096}), spec.start
+        self.told = []
+
+    def land(self):
+        self.told.append("land")
+
+    def learn(self, *, paused, flown):
+        self.told.append((paused, flown))
+
+    def learn_from(self, start):
+        self.told.append(start)
+        self.start = start
+
+
+@pytest.fixture
+def asked(tmp_path):
+    with jax.numpy_dtype_promotion("standard"):
+        setup = Setup.of(tiny_preset())
+        policy = setup.new_policy(random.key(0))
+        request = LiveRequest(setup, policy, Scenario(), "full", 10.0, 0, 3.0, tmp_path)
+        return Wishes(request, Told(live_spec(request)))
+
+
+def status(**control):
+    return Status(1.0, control, {}, {}, {}, None, [], False, None)
+
+
+def wish(asked, **fields):
+    asked._supervisor.bus.publish("wish", pack_note("wish", **fields))
+    return [f"{event.kind}: {event.note}" for event in asked.obey(status())]
+
+
+def test_landing_is_an_order(asked):
+    assert wish(asked, land=True) == ["asked: land"]
+    assert asked._supervisor.told == ["land"]
+    assert asked.obey(status()) == []
+
+
+def test_pausing_keeps_what_flies_and_none_does_not(asked):
+    assert wish(asked, method="full", paused=False) == []
+    assert wish(asked, method="full", paused=True) == ["asked: method full, paused"]
+    assert wish(asked, method="none", paused=False) == ["asked: method none"]
+    assert wish(asked, method="full", paused=False) == ["asked: method full"]
+    assert asked._supervisor.told == [(True, True), (True, False), (False, True)]
+    assert wish(asked, method="magic") == []
+
+
+def test_another_way_of_learning_goes_on_from_what_is_flown(asked):
+    supervisor = asked._supervisor
+    state = load_learnt(supervisor.start)[0]
+    nudged = state.policy.policy.with_params(jax.tree.map(lambda leaf: leaf + 0.01, state.policy.policy.params))
+    keep(supervisor.bus, "policy", 3, PolicyUpdate(1.0, 1.0, 2.0, PolicyState(nudged, state.policy.optimiser)))
+    flying = status(newest={"policy": 3}, given_up=[])
+    supervisor.bus.publish("wish", pack_note("wish", method="lora", paused=False))
+    assert [event.note for event in asked.obey(flying)] == ["method lora"]
+    until = time.monotonic() + 60.0
+    while len(supervisor.told) < 2 and time.monotonic() < until:
+        asked.obey(flying)
+        time.sleep(0.01)
+    assert supervisor.told == [(False, True), supervisor.start]
+    found = load_learnt(supervisor.start)[0].policy.policy
+    assert isinstance(found, LoraPolicy)
+    for leaf, expected in zip(jax.tree.leaves(found.merged().params), jax.tree.leaves(nudged.params), strict=True):
+        np.testing.assert_allclose(leaf, expected, atol=1e-12)
+
+
+def test_knobs_are_an_event_once_they_rest(asked, monkeypatch):
+    monkeypatch.setattr(wishes, "SETTLED_S", 0.0)
+    asked._supervisor.bus.publish("knobs", b"noise")
+    assert asked.obey(status()) == []
+    asked._supervisor.bus.publish("knobs", Knobs(load=0.05, push=(1.0, 0.0, 0.0)).pack())
+    assert [event.kind for event in asked.obey(status())] == ["knobs"]
+    assert asked.obey(status()) == []
