@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from retrim.errors import ConfigError
@@ -331,6 +331,7 @@ numbers = st.floats(-900.0, 900.0).map(lambda v: round(v, 6))
 @settings(max_examples=50, deadline=None)
 def test_what_is_written_is_read(rows, columns, sign, tmp_path_factory):
     """Any plausible points, in any order of columns, with any separator; yaw but for whole turns."""
+    assume(max(math.dist(a[:3], b[:3]) for a, b in itertools.pairwise(rows)) >= 25.0)  # else: are the times in ms?
     points = [dict(zip(("x", "y", "z", "yaw"), row, strict=True), t=25.0 * k) for k, row in enumerate(rows)]
     text = "\n".join([sign.join(columns), *(sign.join(repr(float(p[name])) for name in columns) for p in points)])
     table = read_table(written(tmp_path_factory.mktemp("points"), text))

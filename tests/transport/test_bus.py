@@ -2,51 +2,207 @@
 
 import multiprocessing
 import os
+import shutil
 import signal
+import socket
+import subprocess
 import time
+from typing import NamedTuple
 
 import pytest
 
-from retrim.errors import MessageError
+from retrim.errors import ConfigError, MessageError
+from retrim.transport.bus import Bus
 from retrim.transport.in_process import InProcessBus
+from retrim.transport.network import NetworkBus
+from retrim.transport.remote import Address
 from retrim.transport.shared_memory import SharedMemoryBus
 
-TOPICS = {"a": 100, "big": 200_000}
+TOPICS = {"a": 100, "b.c": 100, "there": 100, "back": 100, "nothing": 100, "again": 100, "big": 200_000}
+LOCAL, NETWORK = ("in process", "shared memory"), ("zenoh", "ros")
 
 
-@pytest.fixture(params=["in process", "shared memory"])
-def bus(request):
-    if request.param == "in process":
-        yield InProcessBus(TOPICS)
-    else:
+class Ends(NamedTuple):
+    """Two who share a bus."""
+
+    writer: Bus
+    reader: Bus
+
+
+def port():
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return server.getsockname()[1]
+
+
+@pytest.fixture(scope="module")
+def master():
+    """A real rosmaster; tests of ROS 1 are left out without one."""
+    if shutil.which("rosmaster") is None:
+        pytest.skip("needs rosmaster and rospy: make test-ros installs them")
+    where = port()
+    environment = os.environ | {"ROS_LOG_DIR": "/tmp", "PYTHONPATH": ""}
+    process = subprocess.Popen(
+        ["rosmaster", "--core", "-p", str(where)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=environment
+    )
+    until = time.monotonic() + 30.0
+    while time.monotonic() < until:
+        try:
+            socket.create_connection(("127.0.0.1", where), 1.0).close()
+            break
+        except OSError:
+            time.sleep(0.1)
+    yield Address("ros", "127.0.0.1", where)
+    process.terminate()
+    process.wait()
+
+
+@pytest.fixture(scope="module", params=[*LOCAL, *NETWORK])
+def ends(request):
+    """Two ends of one bus; each test has its own topics, or goes on where another one was."""
+    backend = request.param
+    if backend == "in process":
+        bus = InProcessBus(TOPICS)
+        yield Ends(bus, bus)
+        return
+    if backend == "shared memory":
         bus = SharedMemoryBus.create(TOPICS)
-        yield bus
-        bus.remove()
+        found = Ends(bus, SharedMemoryBus(bus.folder))
+    else:
+        where = network(backend, request)
+        found = Ends(where.join(TOPICS, listen=True), where.join(TOPICS, listen=False))
+    yield found
+    found.reader.close()
+    found.writer.remove() if backend == "shared memory" else found.writer.close()
 
 
-def test_the_last_message_counts(bus):
-    assert bus.latest("a") is None
+def network(backend, request):
+    """Where a new bus of a network is."""
+    if backend == "ros":
+        return request.getfixturevalue("master")
+    pytest.importorskip("zenoh")
+    return Address("zenoh", "127.0.0.1", port())
+
+
+def arrived(bus, topic, after=0, data=None, patience=10.0):
+    """Return the message of a topic once it is there."""
+    until = time.monotonic() + patience
+    while time.monotonic() < until:
+        found = bus.latest(topic, after)
+        if found is not None and data in (None, found.data):
+            return found
+        time.sleep(1e-3)
+    raise AssertionError(f"nothing came on {topic!r} within {patience} s")
+
+
+def test_the_last_message_counts(ends):
+    writer, reader = ends
+    version = 0
     for i in range(1, 6):
-        bus.publish("a", b"message %d" % i)
-        assert bus.latest("a") == (i, b"message %d" % i)
-    assert bus.latest("a", after=4) == (5, b"message 5")
-    assert bus.latest("a", after=5) is None
-    assert bus.latest("big") is None
+        writer.publish("a", b"message %d" % i)
+        found = arrived(reader, "a", version, b"message %d" % i)
+        assert found.version > version
+        version = found.version
+        assert reader.latest("a", after=version) is None
+    assert reader.latest("a", after=version - 1) == (version, b"message 5")
+    assert reader.latest("nothing") is None
 
 
-def test_messages_of_any_length(bus):
+def test_messages_of_any_length(ends):
+    writer, reader = ends
     for n in (0, 1, 99, 100):
-        bus.publish("a", bytes(range(n)))
-        assert bus.latest("a").data == bytes(range(n))
-    with pytest.raises(MessageError, match="'a': a message of 101 bytes, room for 100"):
-        bus.publish("a", bytes(101))
-    assert bus.latest("a").data == bytes(range(100))
+        writer.publish("b.c", bytes(range(n)))
+        assert arrived(reader, "b.c", data=bytes(range(n)))
+    with pytest.raises(MessageError, match=r"'b\.c': a message of 101 bytes, room for 100"):
+        writer.publish("b.c", bytes(101))
+    assert reader.latest("b.c").data == bytes(range(100))
+    writer.publish("big", bytes(200_000))
+    assert len(arrived(reader, "big").data) == 200_000
 
 
-def test_a_topic_that_there_is_not(bus):
-    for call in (lambda: bus.publish("b", b""), lambda: bus.latest("b")):
-        with pytest.raises(MessageError, match="no topic 'b' on this bus; there are a, big"):
+def test_a_topic_that_there_is_not(ends):
+    for call in (lambda: ends.writer.publish("b", b""), lambda: ends.reader.latest("b")):
+        with pytest.raises(MessageError, match=r"no topic 'b' on this bus; there are a, again, b\.c, back"):
             call()
+
+
+def test_both_ends_may_write_each_its_own_topic(ends):
+    ends.writer.publish("there", b"there")
+    ends.reader.publish("back", b"back")
+    arrived(ends.reader, "there", data=b"there")
+    arrived(ends.writer, "back", data=b"back")
+
+
+def _write_once(address):
+    bus = address.join(TOPICS, listen=False)
+    until = time.monotonic() + 10.0
+    while bus.latest("again") is None and time.monotonic() < until:
+        time.sleep(0.01)
+    bus.publish("again", b"of another process")
+    time.sleep(2.0)
+    os._exit(0)
+
+
+@pytest.mark.parametrize("backend", NETWORK)
+def test_between_processes_one_who_joins_late_has_the_last_message_and_goes_on_counting(backend, request):
+    where = network(backend, request)
+    bus = where.join(TOPICS, listen=True)
+    bus.publish("again", b"before")
+    version = bus.latest("again").version
+    other = multiprocessing.get_context("spawn").Process(target=_write_once, args=(where,), daemon=True)
+    other.start()
+    try:
+        assert arrived(bus, "again", version, b"of another process", patience=30.0).version > version
+    finally:
+        other.join(10.0)
+        other.kill()
+        bus.close()
+
+
+def test_of_a_network_only_what_is_newer_and_fits_is_taken():
+    class Looped(NetworkBus):
+        def _send(self, topic, frame):
+            self.sent = frame
+
+        def close(self):
+            pass
+
+    bus, other = Looped(TOPICS), Looped(TOPICS)
+    other.publish("a", b"one")
+    first = other.sent
+    other.publish("a", b"two")
+    bus._received("a", other.sent)
+    bus._received("a", first)  # overtaken
+    bus._received("a", b"short")
+    bus._received("a", bytes(1000))
+    assert bus.latest("a") == (2, b"two")
+    assert bus.refused == 2
+    again = Looped(TOPICS)
+    again.publish("a", b"started again")
+    bus._received("a", again.sent)
+    assert bus.latest("a") == (3, b"started again")
+    bus.publish("a", b"mine")
+    bus._received("a", bus.sent)  # an echo
+    assert bus.latest("a") == (4, b"mine")
+
+
+@pytest.mark.parametrize("text", ["", "zenoh", "zenoh:", "zenoh::7447", "zenoh:host:0", "zenoh:host:99999",
+                                  "tcp:host:1", "ros:host:port"])  # fmt: skip
+def test_an_address_that_is_none_is_named(text):
+    with pytest.raises(ConfigError, match="is no address of a bus; one is zenoh:HOST:PORT or ros:HOST:PORT"):
+        Address.of(text)
+
+
+def test_a_master_that_there_is_not_is_named():
+    with pytest.raises(ConfigError, match=r"ROS: no rosmaster at 'http://127.0.0.1:1'"):
+        Address.of("ros:127.0.0.1:1").join(TOPICS, listen=True)
+
+
+def test_an_address_that_is_taken_is_named():
+    pytest.importorskip("zenoh")
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        where = Address("zenoh", "127.0.0.1", server.getsockname()[1])
+        with pytest.raises(ConfigError, match=f"zenoh: cannot join at 'tcp/127.0.0.1:{where.port}'"):
+            where.join(TOPICS, listen=True)
 
 
 def test_one_who_joins_late_has_the_last_message():

@@ -4,9 +4,8 @@ import os
 import sys
 import threading
 import webbrowser
-from collections.abc import Callable
-from contextlib import closing
-from importlib.util import find_spec
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import tyro
@@ -21,20 +20,18 @@ from ..experiments.asked import flown_reference, loaded
 from ..experiments.figures import picture
 from ..experiments.interrupts import interrupts_only_set
 from ..experiments.limits import check_seeds
-from ..experiments.outputs import clear_outputs, write_events, write_learnt
+from ..experiments.outputs import clear_outputs
 from ..experiments.run import INTERRUPTED, Run
 from ..experiments.tables.document import TableSection
 from ..experiments.training import train
 from ..live.display import live_line, live_rows
 from ..live.events import LiveEvents
-from ..live.page import LOOPBACK
-from ..live.report import complaints, flight_of, histograms, learnt_in, results
-from ..live.session import LEARNING, LiveRequest, live_spec
+from ..live.flying import fly_live
+from ..live.page import page_address
+from ..live.session import LiveRequest, learners_at
 from ..live.status import Status
-from ..live.supervisor import Supervisor
-from ..live.watching import watched
-from ..live.wishes import Wishes
 from ..runtime.events import Event
+from ..transport.remote import LOOPBACK
 from .console import RichReporter, console, show_paths, show_table, started
 
 LONGEST = 3600.0  # [s]
@@ -58,6 +55,7 @@ def live(
     seconds: float | None = None,
     fence: float = 3.0,
     seed: int = 0,
+    learners: str | None = None,
     page: tyro.conf.FlagCreatePairsOff[bool] = False,
     no_page: tyro.conf.FlagCreatePairsOff[bool] = False,
     page_host: str = LOOPBACK[0],
@@ -84,6 +82,8 @@ def live(
         seconds: Length of the flight; until Ctrl-C by default.
         fence: How far from its reference the vehicle may be along any axis before the fallback flies [m].
         seed: Seed of the start, of the learners and of what is random in the scenario.
+        learners: Where learners on another machine, started by `retrim learn`, reach this one: zenoh:HOST:PORT (this
+            machine listens there), or ros:HOST:PORT of a rosmaster. By default they run here.
         page: Show the flight in a browser, with knobs, also with `--seconds`; without it, that is the default.
         no_page: Show it in the terminal only.
         page_host: Address that the page listens on. Anybody who reaches another than 127.0.0.1 may turn the knobs.
@@ -93,11 +93,15 @@ def live(
 
     def ordered(stop: threading.Event) -> int:
         check_seeds([seed])
+        if page and no_page:
+            raise ConfigError("--page and --no-page: choose one")
         if not 0.5 <= fence <= 1000.0:
             raise ConfigError(f"--fence {fence:g} m must be between 0.5 and 1000")
         if seconds is not None and not 1.0 <= seconds <= LONGEST:
             raise ConfigError(f"--seconds {seconds:g} must be between 1 and {LONGEST:g}")
-        address = _page_address(page, no_page or (seconds is not None and not page), page_host, page_port)
+        wanted = page or (seconds is None and not no_page)
+        address = page_address(page_host, page_port, demanded=page, say=RichReporter().say) if wanted else None
+        ground = learners_at(learners, RichReporter().say) if learners is not None else None
         state, weights, chosen = None, None, load_for(preset.partition("/")[0], preset)
         if policy is not None or resume is not None:
             weights, chosen, state = loaded(policy, resume)
@@ -119,7 +123,7 @@ def live(
         for old in (*run.folder.glob("*.log"), run.folder / "flight.csv"):
             old.unlink(missing_ok=True)
         length = seconds or LONGEST
-        request = LiveRequest(setup, weights, scenario, method, length, seed, fence, run.folder, state, address)
+        request = LiveRequest(setup, weights, scenario, method, length, seed, fence, run.folder, state, address, ground)
         with interrupts_only_set(run.stop):  # a Ctrl-C lands the vehicle; whoever is in the air is not dropped
             return _fly(request, run)
 
@@ -127,87 +131,42 @@ def live(
 
 
 def _fly(request: LiveRequest, run: Run) -> int:
-    """Fly one flight, and show and write what it leaves."""
-    events = LiveEvents()
-    with Supervisor(live_spec(request)) as supervisor:
-        with RichReporter().progress("warming up") as advance:
-            for waiting, _ in supervisor.warm_up():
-                advance(0.5, f"compiling; not ready: {waiting}")
-                if run.interrupted:
-                    console.print("interrupted before take-off; nothing has flown")
-                    return INTERRUPTED
-        for role, refused in supervisor.refused.items():
-            for what in refused:
-                console.print(f"{role}: no {what}", markup=False, soft_wrap=True)
-        if request.page is not None and supervisor.page_port is not None:
-            _open_page(request.page[0], supervisor.page_port)
-        with Live(console=console, auto_refresh=False) as screen, closing(Wishes(request, supervisor)) as wishes:
-            status = watched(supervisor, request.seconds, events, _shown_on(screen, events), run.stop, wishes)
-        learnt = learnt_in(supervisor.bus, status, supervisor.start) if request.method in LEARNING else None
-    console.print(f"flight over: {status.ended}", markup=False, soft_wrap=True)
-    flight, rows = flight_of(request, events.all, status, learnt)
-    found = results(request, flight, rows, status, events)
-    run.write_results(
-        found, seeds=[request.seed], preset=request.setup.preset.name, seconds=float(flight.log.t[-1]),
-        ended=status.ended, scheduling=supervisor.refused, histograms_ms=histograms(rows),
-    )  # fmt: skip
-    write_events([flight], run.folder)
-    write_learnt([flight], request.setup.preset, run.folder)
-    lines = tuple((row["metric"], UNITS.get(row["metric"], ""), _shown(row["value"])) for row in found)
-    show_table(TableSection(("figure", "unit", "value"), lines, f"live, {flight.log.t[-1]:.1f} s"))
-    drawn = picture([flight], request.setup, request.scenario, run.folder, stem="live")
-    show_paths([*drawn[:1], run.folder / "results.json", run.folder / "flight.csv", *complaints(run.folder)])
+    """Fly one flight, and show what it leaves."""
+    done = fly_live(request, run, RichReporter(), _display, _open_page)
+    if done is None:
+        return INTERRUPTED
+    lines = tuple((row["metric"], UNITS.get(row["metric"], ""), _shown(row["value"])) for row in done.rows)
+    show_table(TableSection(("figure", "unit", "value"), lines, f"live, {done.flight.log.t[-1]:.1f} s"))
+    drawn = picture([done.flight], request.setup, request.scenario, run.folder, stem="live")
+    show_paths([*drawn[:1], *done.paths])
     return run.exit_code
 
 
-def _page_address(demanded: bool, none: bool, host: str, port: int) -> tuple[str, int] | None:
-    """Return where the page should be; None for no page.
-
-    Raises:
-        ConfigError: A page was demanded and cannot be had.
-    """
-    if not 1 <= port <= 65535:
-        raise ConfigError(f"--page-port {port} must be between 1 and 65535")
-    if demanded and none:
-        raise ConfigError("--page and --no-page: choose one")
-    if none:
-        return None
-    if find_spec("viser") is None:
-        if demanded:
-            raise ConfigError("--page needs viser: pip install 'retrim[page]'")
-        console.print("no page in the browser: pip install 'retrim[page]' brings it", markup=False)
-        return None
-    if host not in LOOPBACK:
-        console.print(
-            f"[yellow]warning[/yellow]: the page listens on {host}: anybody who reaches it may turn its knobs and land "
-            "the vehicle"
-        )
-    return host, port
-
-
-def _open_page(host: str, port: int) -> None:
+def _open_page(url: str) -> None:
     """Say where the page is, and open it where there is a screen."""
-    url = f"http://{host}:{port}"
     console.print(f"page: {url}", markup=False, soft_wrap=True)
     if console.is_terminal and (sys.platform == "darwin" or {"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ)):
         webbrowser.open(url)
 
 
-def _shown_on(screen: Live, events: LiveEvents) -> Callable[[Status, list[Event]], None]:
+@contextmanager
+def _display(events: LiveEvents) -> Iterator[Callable[[Status, list[Event]], None]]:
     """Show a flight as a table in a terminal, and as a line now and then elsewhere; events as they come."""
-    last = [float("-inf")]
+    last = float("-inf")
 
     def show(status: Status, new: list[Event]) -> None:
+        nonlocal last
         if console.is_terminal:
             screen.update(_screen(status, events), refresh=True)
-        elif status.t - last[0] >= LINE_EVERY:
-            last[0] = status.t
+        elif status.t - last >= LINE_EVERY:
+            last = status.t
             console.print(live_line(status), markup=False, soft_wrap=True)
         for event in new:
             if event.kind not in ("policy", "residual", "rejected"):
                 screen.console.print(f"{event.t:.1f} s {event.kind}: {event.note}", markup=False, soft_wrap=True)
 
-    return show
+    with Live(console=console, auto_refresh=False) as screen:
+        yield show
 
 
 def _screen(status: Status, events: LiveEvents) -> Table:

@@ -19,6 +19,7 @@ COMMANDS = {
     "sweep": "Presets x scenarios x seeds from a TOML file, to one table and one picture.",
     "reproduce": "Make a table of the paper again: hover, tracking, fast, vision, reversing, ...",
     "live": "Fly against the clock and learn at the same time, in processes of their own.",
+    "learn": "Learn for a live flight on another machine.",
     "gauntlet": "A policy under everything that changes, at hover or on references: recovery, steady and worst error.",
     "bench": "How long each piece of work takes on this machine.",
     "doctor": "Versions, device and cache, and known faults of dependencies.",

@@ -3,7 +3,9 @@
 import contextlib
 import io
 import socket
+from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ from ..errors import ConfigError, MessageError
 from ..onboard.messages import Sample, pack_note, unpack_note
 from ..onboard.realtime import Lifeline
 from ..transport.bus import Bus
+from ..transport.remote import LOOPBACK
 from ..transport.shared_memory import SharedMemoryBus
 from .knobs import Knobs
 from .panel import Panel
@@ -21,7 +24,6 @@ from .spec import PageSpec
 
 RATE = 20.0  # [Hz]
 TEXT_EVERY = 5  # refreshes
-LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,31 @@ def free_port(host: str, wanted: int) -> int:
         except OSError as found:
             error = found
     raise ConfigError(f"page: no free port from {wanted} on at {host!r} ({error})")
+
+
+def page_address(host: str, port: int, *, demanded: bool, say: Callable[[str], None]) -> tuple[str, int] | None:
+    """Return where a page can be; None if viser is not installed and nobody demanded a page.
+
+    Args:
+        host: Address to listen on.
+        port: First port to try.
+        demanded: A page was asked for, it is not just the default.
+        say: Told what a person should know.
+
+    Raises:
+        ConfigError: There is no such port, or a page was demanded and cannot be had.
+    """
+    if not 1 <= port <= 65535:
+        raise ConfigError(f"--page-port {port} must be between 1 and 65535")
+    if find_spec("viser") is None:
+        if demanded:
+            raise ConfigError("--page needs viser: pip install 'retrim[page]'")
+        say("no page in the browser: pip install 'retrim[page]' brings it")
+        return None
+    free_port(host, port)
+    if host not in LOOPBACK:
+        say(f"warning: the page listens on {host}; anybody who reaches it may turn the knobs and land the vehicle")
+    return host, port
 
 
 def show(plan: PagePlan) -> None:

@@ -8,6 +8,7 @@ from ..adapt.updates import Layer
 from ..onboard.plan import ControlPlan
 from ..onboard.recorder import RecorderPlan
 from ..onboard.watchdog import WatchdogPlan
+from .bridge_process import BridgePlan
 from .learner_process import LearnerPlan
 from .page import PagePlan
 from .plant_process import PlantPlan
@@ -41,5 +42,8 @@ def plan_of(role: str, spec: LiveSpec, start: Path, bus: Path, cores: frozenset[
     if role == "page":
         assert s.page is not None
         return PagePlan(bus, s.page, parent)
+    if role == "bridge":
+        assert s.learners is not None
+        return BridgePlan(bus, s.learners, parent)
     layer: Layer = "residual" if role == "residual" else "policy"
     return LearnerPlan(bus, layer, start, s.reference, s.seed, s.controller.base, parent)

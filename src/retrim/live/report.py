@@ -21,8 +21,9 @@ from ..runtime.events import Event
 from ..runtime.flight import Log, States
 from ..transport.bus import Bus
 from .events import LiveEvents
+from .mission import LAYERS
 from .published import flown_update
-from .session import LAYERS, LiveRequest
+from .session import LiveRequest
 from .status import Status
 
 

@@ -1,6 +1,8 @@
 """From a policy and a scenario to a live flight."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +12,6 @@ import numpy as np
 from jax import random
 
 from ..adapt.learner import LearnerState
-from ..adapt.updates import Layer
 from ..config.scenario import Scenario
 from ..config.setup import Setup
 from ..control.policy import Policy
@@ -21,12 +22,13 @@ from ..onboard.guard import Limits
 from ..onboard.messages import MOST_TICKS
 from ..plants.plant import as_numpy
 from ..runtime.pilot import ControllerPilot
+from ..transport.remote import Address
 from .controllers import adaptive_source, plain_source
+from .mission import LAYERS
 from .page import free_port
 from .spec import LiveSpec, PageSpec
 from .states import vector_of
 
-LAYERS: tuple[Layer, ...] = ("residual", "policy")
 LEARNING = ("full", "lora")
 PATH_S = 20.0  # [s] of the reference that the page draws
 BELOW_GROUND = 0.3  # [m], by which a fence lies below z = 0: starts may lie there, and a transient dips
@@ -52,6 +54,8 @@ class LiveRequest:
     """What an earlier flight learnt, to go on from."""
     page: tuple[str, int] | None = None
     """Address and port of the page; None for no page."""
+    learners: Address | None = None
+    """Where learners on another machine are reached; None: they run here."""
 
     @property
     def flight(self) -> FlightSpec:
@@ -97,7 +101,26 @@ def live_spec(request: LiveRequest) -> LiveSpec:
         seed=request.flight.plant_seed,
         folder=request.folder,
         page=_page(request) if request.page is not None else None,
+        learners=request.learners if request.method in LEARNING else None,
     )
+
+
+def learners_at(text: str, say: Callable[[str], None]) -> Address:
+    """Return where learners on another machine are reached.
+
+    Args:
+        text: As ``zenoh:192.168.1.5:7447``.
+        say: Told what a person should know.
+
+    Raises:
+        ConfigError: It is no address, or what it takes is not installed.
+    """
+    address = Address.of(text)
+    if address.kind == "zenoh" and find_spec("zenoh") is None:
+        raise ConfigError("a bus by zenoh needs zenoh: pip install 'retrim[zenoh]'")
+    if address.kind == "zenoh" and not address.loopback:
+        say(f"warning: this machine listens on {address.host}; anybody who reaches it may send policies to the vehicle")
+    return address
 
 
 def learner_state(request: LiveRequest, policy: Policy, method: str, residual: Any = None) -> LearnerState:

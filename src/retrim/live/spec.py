@@ -11,6 +11,7 @@ from ..adapt.updates import Layer
 from ..config.scenario import Scenario
 from ..onboard.guard import Limits
 from ..onboard.pilot import ControllerSource
+from ..transport.remote import Address
 
 MAINS = {
     "control": "retrim.onboard.control_process:fly",
@@ -20,6 +21,7 @@ MAINS = {
     "residual": "retrim.live.learner_process:learn",
     "policy": "retrim.live.learner_process:learn",
     "page": "retrim.live.page:show",
+    "bridge": "retrim.live.bridge_process:carry",
 }
 """Main function of each process, by role."""
 
@@ -67,5 +69,7 @@ class LiveSpec:
     folder: Path
     """Where the log goes, and what the processes write to their standard outputs."""
     page: PageSpec | None = None
+    learners: Address | None = None
+    """Where learners on another machine are reached; None: they are processes of this one."""
     mains: Mapping[str, str] = field(default_factory=lambda: MAINS)
     """What runs as each process; another link to a vehicle is another main function of the plant."""

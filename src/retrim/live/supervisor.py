@@ -17,16 +17,17 @@ from ..onboard.realtime import cores_of
 from ..transport.message import describe
 from ..transport.shared_memory import SharedMemoryBus
 from .plans import plan_of
+from .remote_learners import RemoteLearners
 from .spec import LiveSpec
 from .status import Status
 from .topics import topics
 
 LANDING = 60.0  # [s], after which processes are ended wherever the vehicle is
 ATTEMPTS = 5  # to bring a process back
-LEARN = ("residual", "policy", "recorder", "page")
+LEARN = ("residual", "policy", "recorder", "page", "bridge")
 """Roles that stay off the core of those that must be on time."""
 READY_S = 300.0  # [s], compiling included
-RESTARTED = ("residual", "policy", "watchdog", "recorder", "page")
+RESTARTED = ("residual", "policy", "watchdog", "recorder", "page", "bridge")
 
 
 @dataclass
@@ -41,10 +42,12 @@ class Supervisor:
     epoch: float | None = None
     _landing: bool = False
     _said: dict[str, int] = field(default_factory=dict)
+    _remote: RemoteLearners | None = None
 
     def __enter__(self) -> "Supervisor":
         """Make the bus."""
         self.bus, self.start = SharedMemoryBus.create(topics(self.spec)), self.spec.start
+        self._remote = None if self.spec.learners is None else RemoteLearners(self.spec, self.bus)
         self._cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else None
         if self._cores:
             os.sched_setaffinity(0, cores_of("learn"))
@@ -77,13 +80,16 @@ class Supervisor:
             PlantError: A process ended, or was not ready in time; the message has the last line of what it said.
         """
         began = time.monotonic()
-        for role in ("control", "plant", *self.spec.layers):
+        if self._remote is not None:
+            self._remote.announce(self.start)
+        for role in ("control", "plant", *(self.spec.layers if self._remote is None else ("bridge",))):
             self._start(role)
         self._start("watchdog")
         self._start("recorder")
         if self.spec.page is not None:
             self._start("page")
-        while waiting := [role for role in self.processes if self.bus.latest(f"ready.{role}") is None]:
+        needed = [*self.processes, *(self.spec.layers if self._remote is not None else ())]
+        while waiting := [role for role in needed if self.bus.latest(f"ready.{role}") is None]:
             self._check_alive()
             if time.monotonic() - began > READY_S:
                 raise PlantError(f"not ready after {READY_S:g} s: {', '.join(waiting)}; nothing has flown")
@@ -117,6 +123,9 @@ class Supervisor:
     def learn_from(self, start: Path) -> None:
         """Start the policy's learner again with what a file holds."""
         self.start = start
+        if self._remote is not None:
+            self._remote.announce(start)
+            return
         process = self.processes["policy"]
         process.kill()
         process.wait()
@@ -141,6 +150,8 @@ class Supervisor:
         if ended is None and self.processes["plant"].poll() is not None:
             ended = f"the plant process is gone: {self._last_words('plant')}"
         alive = {role: process.poll() is None for role, process in self.processes.items()}
+        if self._remote is not None:
+            alive |= self._remote.alive()
         control, world = self._note("status"), self._note("world")
         failed = self._note("ready.recorder", "ready").get("failed")
         t, watchdog = time.monotonic() - self.epoch, self.bus.latest("fallback") is not None

@@ -1,12 +1,12 @@
 """The topics of a live flight, and the longest message of each."""
 
 from ..onboard.messages import COLUMNS
+from .mission import LAYERS
 from .published import SLOTS, slot
 from .spec import LiveSpec
 
-SMALL = ("sample", "setpoint", "fallback", "order", "ended", "world", "knobs", "wish", "learning")
-LAYERS = ("residual", "policy")
-ROLES = ("control", "plant", "watchdog", "recorder", "page", *LAYERS)
+SMALL = ("sample", "setpoint", "fallback", "order", "ended", "world", "knobs", "wish", "learning", "ground")
+ROLES = ("control", "plant", "watchdog", "recorder", "page", "bridge", *LAYERS)
 
 
 def topics(spec: LiveSpec) -> dict[str, int]:
@@ -19,6 +19,7 @@ def topics(spec: LiveSpec) -> dict[str, int]:
         | {"status": 65536, "flight": rows, "fallback.flight": rows}
         | {f"ready.{role}": 8192 for role in ROLES}
         | {f"parameters.{name}": size + 100_000 for name, size in half.items()}
+        | {"mission": learnt}
         | {slot(layer, i): learnt for layer in LAYERS for i in range(SLOTS)}
         | {f"{what}.{layer}": 8192 for what in ("said", "learner") for layer in LAYERS}
     )

@@ -1,0 +1,87 @@
+"""One live flight from the warm-up to its files."""
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager, closing
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ..experiments.flights import Flight
+from ..experiments.outputs import write_events, write_learnt
+from ..experiments.reporter import Reporter
+from ..experiments.run import Run
+from ..runtime.events import Event
+from .events import LiveEvents
+from .report import complaints, flight_of, histograms, learnt_in, results
+from .session import LEARNING, LiveRequest, live_spec
+from .status import Status
+from .supervisor import Supervisor
+from .watching import watched
+from .wishes import Wishes
+
+Display = Callable[[LiveEvents], AbstractContextManager[Callable[[Status, list[Event]], None]]]
+"""From all events so far to a context in which a function is told how the flight stands and what is new."""
+
+
+class LiveFlight(NamedTuple):
+    """What a live flight was."""
+
+    flight: Flight
+    rows: list[dict[str, Any]]
+    """Those of ``results.json``."""
+    paths: list[Path]
+    """Files that it left, those that a person looks at first."""
+
+
+def fly_live(
+    request: LiveRequest, run: Run, reporter: Reporter, display: Display, opened: Callable[[str], None]
+) -> LiveFlight | None:
+    """Fly, and write what the flight leaves.
+
+    Args:
+        request: What is asked.
+        run: Its folder, and whether somebody interrupts it.
+        reporter: Told what happens before take-off and at the end.
+        display: Shows the flight.
+        opened: Called with where the page is, once it is there.
+
+    Returns:
+        The flight; None if it was interrupted before take-off.
+
+    Raises:
+        ConfigError: The method cannot be flown live.
+        PlantError: The flight could not begin, or left no log.
+    """
+    events = LiveEvents()
+    with Supervisor(live_spec(request)) as supervisor:
+        if not _warmed_up(supervisor, run, reporter):
+            return None
+        if request.page is not None and supervisor.page_port is not None:
+            opened(f"http://{request.page[0]}:{supervisor.page_port}")
+        with display(events) as show, closing(Wishes(request, supervisor)) as wishes:
+            status = watched(supervisor, request.seconds, events, show, run.stop, wishes)
+        learnt = learnt_in(supervisor.bus, status, supervisor.start) if request.method in LEARNING else None
+    reporter.say(f"flight over: {status.ended}")
+    flight, rows = flight_of(request, events.all, status, learnt)
+    found = results(request, flight, rows, status, events)
+    run.write_results(
+        found, seeds=[request.seed], preset=request.setup.preset.name, seconds=float(flight.log.t[-1]),
+        ended=status.ended, scheduling=supervisor.refused, histograms_ms=histograms(rows),
+    )  # fmt: skip
+    write_events([flight], run.folder)
+    write_learnt([flight], request.setup.preset, run.folder)
+    paths = [run.folder / "results.json", run.folder / "flight.csv", *complaints(run.folder)]
+    return LiveFlight(flight, found, paths)
+
+
+def _warmed_up(supervisor: Supervisor, run: Run, reporter: Reporter) -> bool:
+    """Wait until all are ready; return whether nobody interrupted that."""
+    with reporter.progress("warming up") as advance:
+        for waiting, _ in supervisor.warm_up():
+            advance(0.5, f"compiling; not ready: {waiting}")
+            if run.interrupted:
+                reporter.say("interrupted before take-off; nothing has flown")
+                return False
+    for role, refused in supervisor.refused.items():
+        for what in refused:
+            reporter.say(f"{role}: no {what}")
+    return True

@@ -1,0 +1,80 @@
+"""What learners on another machine have to know, and the topics that go there and back."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..adapt.updates import Layer
+from ..errors import MessageError
+from ..transport.message import describe, pack_arrays, unpack_arrays
+from .published import SLOTS, slot
+
+LAYERS: tuple[Layer, ...] = ("residual", "policy")
+OUT = ("mission", "flight", "status", "ended", "learning")
+"""Topics from the flight to the learners."""
+INTO = (
+    "ground",
+    *(f"{what}.{layer}" for what in ("ready", "parameters", "said", "learner") for layer in LAYERS),
+    *(slot(layer, i) for layer in LAYERS for i in range(SLOTS)),
+)
+"""Topics from the learners to the flight."""
+SLOWLY = ("flight",)
+"""Topics that come with each tick, though a few times a second are enough for those who learn."""
+MOST = 64 * 2**20
+"""Longest message between machines [bytes]."""
+
+
+@dataclass(frozen=True)
+class Mission:
+    """One flight, as its learners see it."""
+
+    number: int
+    """It rises when the policy's learner shall start again with another start."""
+    reference: str | None
+    seed: int
+    base: str
+    """Hash of the controller that flies."""
+    layers: tuple[Layer, ...]
+    capacities: Mapping[str, int]
+    """Longest message of each topic [bytes]."""
+    start: bytes
+    """File with what was learnt before the flight, and the preset."""
+
+    @classmethod
+    def of(cls, number: int, reference: str | None, seed: int, base: str, layers: tuple[Layer, ...],
+           capacities: Mapping[str, int], start: Path) -> "Mission":  # fmt: skip
+        """Return the mission of a flight whose learners start from a file."""
+        carried = {topic: size for topic, size in capacities.items() if topic in (*OUT, *INTO)}
+        return cls(number, reference, seed, base, layers, carried, start.read_bytes())
+
+    def pack(self) -> bytes:
+        """Return the bytes; the inverse of :meth:`unpack`."""
+        fields = {name: value for name, value in vars(self).items() if name != "start"}
+        about = {"fields": json.dumps(fields), "bytes": str(len(self.start))}
+        return pack_arrays({"start": np.frombuffer(self.start, dtype=np.uint8)}, kind="mission", about=about)
+
+    @classmethod
+    def unpack(cls, data: bytes) -> "Mission":
+        """Read a mission.
+
+        Raises:
+            MessageError: The bytes are none.
+        """
+        header = describe(data, kind="mission", source="mission")
+        try:
+            fields, length = json.loads(header["fields"]), int(header["bytes"][:12])
+            layers = tuple(layer for layer in LAYERS if layer in fields["layers"])
+            capacities = {str(topic): int(size) for topic, size in fields["capacities"].items()}
+            reference = None if fields["reference"] is None else str(fields["reference"])
+            number, seed, base = int(fields["number"]), int(fields["seed"]), str(fields["base"])
+        except (KeyError, ValueError, TypeError, AttributeError, RecursionError) as error:
+            raise MessageError(f"mission: a field is missing or wrong ({error})") from error
+        if not set(capacities) <= {*OUT, *INTO} or not all(0 < size <= MOST for size in capacities.values()):
+            raise MessageError("mission: topics that no flight has, or messages that are too long")
+        if not 0 <= length <= MOST:
+            raise MessageError(f"mission: a file of {length} bytes")
+        arrays = unpack_arrays(data, {"start": np.empty(length, np.uint8)}, kind="mission", source="mission")
+        return cls(number, reference, seed, base, layers, capacities, arrays["start"].tobytes())

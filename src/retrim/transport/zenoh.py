@@ -1,0 +1,80 @@
+"""A bus between machines by zenoh: peers, no broker. It finds nobody by itself; one end listens, others connect.
+
+Needs the extra ``zenoh``.
+"""
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from ..errors import ConfigError
+from .network import NetworkBus
+
+PREFIX = "retrim"
+BUFFER = 1  # messages of a topic that its writer keeps for those who join late
+
+
+class ZenohBus(NetworkBus):
+    """One end of the bus."""
+
+    def __init__(self, capacities: Mapping[str, int], endpoint: str, *, listen: bool) -> None:
+        """Join a bus.
+
+        Args:
+            capacities: Longest message of each topic [bytes].
+            endpoint: As ``tcp/192.168.1.5:7447``.
+            listen: Wait there for others; if not, look for who does, for as long as it takes.
+
+        Raises:
+            ConfigError: zenoh is not installed, or nobody can listen there.
+        """
+        try:
+            import zenoh
+            from zenoh import ext as _ext
+        except ImportError as error:
+            raise ConfigError("a bus by zenoh needs zenoh: pip install 'retrim[zenoh]'") from error
+        ext: Any = _ext
+        super().__init__(capacities)
+        config = zenoh.Config()
+        for key, value in {
+            "mode": "peer",
+            "scouting/multicast/enabled": False,
+            "timestamping/enabled": True,  # the history that late joiners ask for needs it
+            "listen/endpoints": [endpoint] if listen else [],
+            "connect/endpoints": [] if listen else [endpoint],
+            "connect/timeout_ms": -1,
+            "connect/exit_on_failure": False,
+        }.items():
+            config.insert_json5(key, json.dumps(value))
+        try:
+            self._session: Any = zenoh.open(config)
+        except zenoh.ZError as error:
+            reason = str(error).splitlines()[0].split(" at ")[0]
+            raise ConfigError(f"zenoh: cannot join at {endpoint!r} ({reason})") from error
+        cache = ext.CacheConfig(BUFFER)
+        history = ext.HistoryConfig(detect_late_publishers=True, max_samples=BUFFER)
+        self._publishers: dict[str, Any] = {}
+        # Nothing is dropped where the network is slow: some topics have a single message.
+        block, remote = zenoh.CongestionControl.BLOCK, zenoh.Locality.REMOTE
+        self._declare: Any = lambda key: ext.declare_advanced_publisher(
+            self._session, key, cache=cache, publisher_detection=True, congestion_control=block
+        )
+        self._subscribers = []
+        for topic in capacities:
+            key, listener = f"{PREFIX}/{topic}", self._listener(topic)
+            found = ext.declare_advanced_subscriber(
+                self._session, key, listener, history=history, allowed_origin=remote
+            )
+            self._subscribers.append(found)
+
+    def close(self) -> None:
+        """Leave the bus."""
+        self._session.close()
+
+    def _send(self, topic: str, frame: bytes) -> None:
+        if topic not in self._publishers:  # only its writer declares one
+            self._publishers[topic] = self._declare(f"{PREFIX}/{topic}")
+        self._publishers[topic].put(frame)
+
+    def _listener(self, topic: str) -> Any:
+        return lambda sample: self._received(topic, bytes(sample.payload))
