@@ -14,8 +14,8 @@ from retrim.io.trained import save_learnt
 from retrim.learn.bptt import PolicyState
 from retrim.live.controllers import adaptive_source
 from retrim.live.learner_process import LearnerLoop, LearnerPlan
-from retrim.live.published import slot
 from retrim.onboard.messages import COLUMNS, COMMAND, MEASURED, FlightRows, Parameters, pack_note
+from retrim.onboard.topics import slot
 from retrim.transport.in_process import InProcessBus
 
 pytestmark = pytest.mark.usefixtures("optax_promotion")

@@ -2,96 +2,25 @@
 
 import multiprocessing
 import os
-import shutil
 import signal
 import socket
-import subprocess
 import time
-from typing import NamedTuple
 
 import pytest
 
+from bus_ends import LOCAL, NETWORK, arrived, network, two_ends
 from retrim.errors import ConfigError, MessageError
-from retrim.transport.bus import Bus
-from retrim.transport.in_process import InProcessBus
 from retrim.transport.network import NetworkBus
 from retrim.transport.remote import Address
 from retrim.transport.shared_memory import SharedMemoryBus
 
 TOPICS = {"a": 100, "b.c": 100, "there": 100, "back": 100, "nothing": 100, "again": 100, "big": 200_000}
-LOCAL, NETWORK = ("in process", "shared memory"), ("zenoh", "ros")
-
-
-class Ends(NamedTuple):
-    """Two who share a bus."""
-
-    writer: Bus
-    reader: Bus
-
-
-def port():
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return server.getsockname()[1]
-
-
-@pytest.fixture(scope="module")
-def master():
-    """A real rosmaster; tests of ROS 1 are left out without one."""
-    if shutil.which("rosmaster") is None:
-        pytest.skip("needs rosmaster and rospy: make test-ros installs them")
-    where = port()
-    environment = os.environ | {"ROS_LOG_DIR": "/tmp", "PYTHONPATH": ""}
-    process = subprocess.Popen(
-        ["rosmaster", "--core", "-p", str(where)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=environment
-    )
-    until = time.monotonic() + 30.0
-    while time.monotonic() < until:
-        try:
-            socket.create_connection(("127.0.0.1", where), 1.0).close()
-            break
-        except OSError:
-            time.sleep(0.1)
-    yield Address("ros", "127.0.0.1", where)
-    process.terminate()
-    process.wait()
 
 
 @pytest.fixture(scope="module", params=[*LOCAL, *NETWORK])
 def ends(request):
-    """Two ends of one bus; each test has its own topics, or goes on where another one was."""
-    backend = request.param
-    if backend == "in process":
-        bus = InProcessBus(TOPICS)
-        yield Ends(bus, bus)
-        return
-    if backend == "shared memory":
-        bus = SharedMemoryBus.create(TOPICS)
-        found = Ends(bus, SharedMemoryBus(bus.folder))
-    else:
-        where = network(backend, request)
-        found = Ends(where.join(TOPICS, listen=True), where.join(TOPICS, listen=False))
-    yield found
-    found.reader.close()
-    found.writer.remove() if backend == "shared memory" else found.writer.close()
-
-
-def network(backend, request):
-    """Where a new bus of a network is."""
-    if backend == "ros":
-        return request.getfixturevalue("master")
-    pytest.importorskip("zenoh")
-    return Address("zenoh", "127.0.0.1", port())
-
-
-def arrived(bus, topic, after=0, data=None, patience=10.0):
-    """Return the message of a topic once it is there."""
-    until = time.monotonic() + patience
-    while time.monotonic() < until:
-        found = bus.latest(topic, after)
-        if found is not None and data in (None, found.data):
-            return found
-        time.sleep(1e-3)
-    raise AssertionError(f"nothing came on {topic!r} within {patience} s")
+    """One pair for all tests; each has its own topics, or goes on where another one was."""
+    yield from two_ends(request.param, TOPICS)
 
 
 def test_the_last_message_counts(ends):
@@ -143,8 +72,8 @@ def _write_once(address):
 
 
 @pytest.mark.parametrize("backend", NETWORK)
-def test_between_processes_one_who_joins_late_has_the_last_message_and_goes_on_counting(backend, request):
-    where = network(backend, request)
+def test_between_processes_one_who_joins_late_has_the_last_message_and_goes_on_counting(backend):
+    where = network(backend)
     bus = where.join(TOPICS, listen=True)
     bus.publish("again", b"before")
     version = bus.latest("again").version

@@ -6,10 +6,10 @@ from pathlib import Path
 
 from ..onboard.messages import pack_note
 from ..onboard.realtime import Lifeline
+from ..onboard.topics import INTO, MOST, OUT, SLOWLY
 from ..transport.bridge import Bridge
 from ..transport.remote import Address
 from ..transport.shared_memory import SharedMemoryBus
-from .mission import INTO, MOST, OUT, SLOWLY
 
 IDLE = 0.002  # [s]
 
@@ -28,9 +28,11 @@ def carry(plan: BridgePlan) -> None:
     """Carry until somebody ends the process: its main function."""
     bus, parent = SharedMemoryBus(plan.folder), Lifeline(plan.parent)
     network = plan.address.join(dict.fromkeys((*OUT, *INTO), MOST), listen=True)
-    bridge = Bridge(bus, network, out=OUT, into=INTO, slowly=SLOWLY)
-    bus.publish("ready.bridge", pack_note("ready"))
-    while not parent.gone():
-        if not bridge.step():
-            time.sleep(IDLE)
-    network.close()
+    try:
+        bridge = Bridge(bus, network, out=OUT, into=INTO, slowly=SLOWLY)
+        bus.publish("ready.bridge", pack_note("ready"))
+        while not parent.gone():
+            if not bridge.step():
+                time.sleep(IDLE)
+    finally:
+        network.close()  # its threads would keep the process alive

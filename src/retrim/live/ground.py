@@ -12,11 +12,12 @@ from typing import Any
 from ..errors import MessageError
 from ..onboard.launch import launch
 from ..onboard.messages import pack_note, unpack_note
+from ..onboard.topics import INTO, MOST, OUT
 from ..transport.bridge import Bridge
 from ..transport.remote import Address
 from ..transport.shared_memory import SharedMemoryBus
 from .learner_process import LearnerPlan
-from .mission import INTO, MOST, OUT, Mission
+from .mission import Mission
 from .spec import MAINS
 
 IDLE = 0.002  # [s]
@@ -65,7 +66,10 @@ class Ground:
 
     def learn(self) -> Iterator[str]:
         """Learn until the flight is over; yield how it stands, very often."""
-        bridge = Bridge(self._network, self._bus, out=OUT, into=INTO)
+        assert self._mission is not None
+        topics = self._mission.capacities  # a controller without a fitted half has no topic for it
+        out, into = ([topic for topic in carried if topic in topics] for carried in (OUT, INTO))
+        bridge = Bridge(self._network, self._bus, out=out, into=into)
         while True:
             self._look()
             if not bridge.step():

@@ -1,30 +1,17 @@
-"""What learners on another machine have to know, and the topics that go there and back."""
+"""What learners on another machine have to know."""
 
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
 from ..adapt.updates import Layer
 from ..errors import MessageError
+from ..onboard.topics import INTO, LAYERS, MOST, OUT
 from ..transport.message import describe, pack_arrays, unpack_arrays
-from .published import SLOTS, slot
-
-LAYERS: tuple[Layer, ...] = ("residual", "policy")
-OUT = ("mission", "flight", "status", "ended", "learning")
-"""Topics from the flight to the learners."""
-INTO = (
-    "ground",
-    *(f"{what}.{layer}" for what in ("ready", "parameters", "said", "learner") for layer in LAYERS),
-    *(slot(layer, i) for layer in LAYERS for i in range(SLOTS)),
-)
-"""Topics from the learners to the flight."""
-SLOWLY = ("flight",)
-"""Topics that come with each tick, though a few times a second are enough for those who learn."""
-MOST = 64 * 2**20
-"""Longest message between machines [bytes]."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +53,7 @@ class Mission:
         header = describe(data, kind="mission", source="mission")
         try:
             fields, length = json.loads(header["fields"]), int(header["bytes"][:12])
-            layers = tuple(layer for layer in LAYERS if layer in fields["layers"])
+            layers = cast("tuple[Layer, ...]", tuple(layer for layer in LAYERS if layer in fields["layers"]))
             capacities = {str(topic): int(size) for topic, size in fields["capacities"].items()}
             reference = None if fields["reference"] is None else str(fields["reference"])
             number, seed, base = int(fields["number"]), int(fields["seed"]), str(fields["base"])

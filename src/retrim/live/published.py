@@ -10,15 +10,10 @@ from typing import Any
 from ..adapt.learner import LearnerState
 from ..adapt.updates import Update, pack_update, unpack_update
 from ..errors import MessageError
+from ..onboard.topics import SLOTS, slot
 from ..transport.bus import Bus
 
 PREFIX = 8  # bytes of the version before an update
-SLOTS = 2
-
-
-def slot(layer: str, version: int) -> str:
-    """Return the topic of an update."""
-    return f"update.{layer}.{version % SLOTS}"
 
 
 def keep(bus: Bus, layer: str, version: int, update: Update) -> None:

@@ -17,11 +17,11 @@ from ..onboard.accounts import EDGES_MS, summary
 from ..onboard.guard import HOVER, Mode
 from ..onboard.messages import ACCOUNTS, COMMAND, MEASURED, TRUE
 from ..onboard.recorder import read_log
+from ..onboard.topics import LAYERS
 from ..runtime.events import Event
 from ..runtime.flight import Log, States
 from ..transport.bus import Bus
 from .events import LiveEvents
-from .mission import LAYERS
 from .published import flown_update
 from .session import LiveRequest
 from .status import Status

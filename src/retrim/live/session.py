@@ -12,6 +12,7 @@ import numpy as np
 from jax import random
 
 from ..adapt.learner import LearnerState
+from ..adapt.updates import Layer
 from ..config.scenario import Scenario
 from ..config.setup import Setup
 from ..control.policy import Policy
@@ -24,11 +25,11 @@ from ..plants.plant import as_numpy
 from ..runtime.pilot import ControllerPilot
 from ..transport.remote import Address
 from .controllers import adaptive_source, plain_source
-from .mission import LAYERS
 from .page import free_port
 from .spec import LiveSpec, PageSpec
 from .states import vector_of
 
+LAYERS: tuple[Layer, ...] = ("residual", "policy")
 LEARNING = ("full", "lora")
 PATH_S = 20.0  # [s] of the reference that the page draws
 BELOW_GROUND = 0.3  # [m], by which a fence lies below z = 0: starts may lie there, and a transient dips

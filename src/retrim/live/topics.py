@@ -1,8 +1,7 @@
 """The topics of a live flight, and the longest message of each."""
 
 from ..onboard.messages import COLUMNS
-from .mission import LAYERS
-from .published import SLOTS, slot
+from ..onboard.topics import LAYERS, SLOTS, slot
 from .spec import LiveSpec
 
 SMALL = ("sample", "setpoint", "fallback", "order", "ended", "world", "knobs", "wish", "learning", "ground")

@@ -44,6 +44,8 @@ class ZenohBus(NetworkBus):
             "connect/endpoints": [] if listen else [endpoint],
             "connect/timeout_ms": -1,
             "connect/exit_on_failure": False,
+            # A peer that is back is found again at once.
+            "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
         }.items():
             config.insert_json5(key, json.dumps(value))
         try:

@@ -1,0 +1,24 @@
+"""Names of topics that travel between machines."""
+
+LAYERS = ("residual", "policy")
+SLOTS = 2
+"""Whole updates of each layer that stay on the bus."""
+
+
+def slot(layer: str, version: int) -> str:
+    """Return the topic of an update."""
+    return f"update.{layer}.{version % SLOTS}"
+
+
+OUT = ("mission", "flight", "status", "ended", "learning")
+"""Topics from the flight to the learners."""
+INTO = (
+    "ground",
+    *(f"{what}.{layer}" for what in ("ready", "parameters", "said", "learner") for layer in LAYERS),
+    *(slot(layer, i) for layer in LAYERS for i in range(SLOTS)),
+)
+"""Topics from the learners to the flight."""
+SLOWLY = ("flight",)
+"""Topics that come with each tick, though a few times a second are enough for those who learn."""
+MOST = 64 * 2**20
+"""Longest message between machines [bytes]."""

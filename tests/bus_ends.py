@@ -1,0 +1,88 @@
+"""Two ends of a bus of each kind, for the suites that every bus passes."""
+
+import atexit
+import functools
+import os
+import shutil
+import socket
+import subprocess
+import tempfile
+import time
+from typing import NamedTuple
+
+import pytest
+
+from retrim.transport.bus import Bus
+from retrim.transport.in_process import InProcessBus
+from retrim.transport.remote import Address
+from retrim.transport.shared_memory import SharedMemoryBus
+
+LOCAL, NETWORK = ("in process", "shared memory"), ("zenoh", "ros")
+
+
+class Ends(NamedTuple):
+    """Two who share a bus."""
+
+    writer: Bus
+    reader: Bus
+
+
+def port():
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return server.getsockname()[1]
+
+
+@functools.cache
+def master():
+    """Start a real rosmaster, one for each process, since rospy knows no other; skip the test if there is none."""
+    if shutil.which("rosmaster") is None:
+        pytest.skip("needs rosmaster and rospy: make test-ros installs them")
+    where = port()
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    words = ["rosmaster", "--core", "-p", str(where)]
+    process = subprocess.Popen(words, env=os.environ | {"ROS_LOG_DIR": tempfile.mkdtemp(), "PYTHONPATH": ""}, **quiet)
+    atexit.register(process.kill)
+    until = time.monotonic() + 30.0
+    while time.monotonic() < until:
+        try:
+            socket.create_connection(("127.0.0.1", where), 1.0).close()
+            break
+        except OSError:
+            time.sleep(0.1)
+    return Address("ros", "127.0.0.1", where)
+
+
+def two_ends(backend, topics):
+    """Yield two ends of one new bus."""
+    if backend == "in process":
+        bus = InProcessBus(topics)
+        yield Ends(bus, bus)
+        return
+    if backend == "shared memory":
+        bus = SharedMemoryBus.create(topics)
+        found = Ends(bus, SharedMemoryBus(bus.folder))
+    else:
+        where = network(backend)
+        found = Ends(where.join(topics, listen=True), where.join(topics, listen=False))
+    yield found
+    found.reader.close()
+    found.writer.remove() if backend == "shared memory" else found.writer.close()
+
+
+def network(backend):
+    """Where a new bus of a network is."""
+    if backend == "ros":
+        return master()
+    pytest.importorskip("zenoh")
+    return Address("zenoh", "127.0.0.1", port())
+
+
+def arrived(bus, topic, after=0, data=None, patience=10.0):
+    """Return the message of a topic once it is there."""
+    until = time.monotonic() + patience
+    while time.monotonic() < until:
+        found = bus.latest(topic, after)
+        if found is not None and data in (None, found.data):
+            return found
+        time.sleep(1e-3)
+    raise AssertionError(f"nothing came on {topic!r} within {patience} s")

@@ -1,0 +1,133 @@
+"""Learners on another machine: a flight gets their policies, and goes on when they, their bus or a viewer are gone."""
+
+import os
+import signal
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from bus_ends import port
+from live.test_faults import Drill, controller, spec_in, whole_log  # noqa: F401
+from live_processes import HOME, DrillPlan, level
+from retrim.errors import MessageError
+from retrim.live.events import LiveEvents
+from retrim.live.ground import Ground
+from retrim.live.mission import Mission
+from retrim.live.page import free_port
+from retrim.live.spec import PageSpec
+from retrim.onboard.guard import Mode
+from retrim.onboard.launch import launch
+from retrim.onboard.topics import INTO, OUT
+from retrim.transport.bridge import EVERY, Bridge
+from retrim.transport.in_process import InProcessBus
+from retrim.transport.remote import Address
+
+SECONDS = 4.0
+
+
+class DrillGround(Ground):
+    """Its learners are those of the drill."""
+
+    def _start(self, layer):
+        plan = DrillPlan(self._bus.folder, os.getpid(), layer, level(), self._mission.base)
+        self.processes[layer] = launch("live_processes:learner", plan, self.folder / f"{layer}.log")
+
+
+def station(address, over):
+    """A ground station in a thread, until ``over`` is set."""
+    with DrillGround(address) as ground:
+        for _ in ground.wait():
+            if over.is_set():
+                return
+        for _ in ground.learn():
+            if over.is_set():
+                return
+
+
+@pytest.mark.parametrize("lost", ["nobody", "ground", "bridge", "page hangs"])
+def test_a_flight_with_learners_elsewhere(tmp_path, controller, lost):  # noqa: F811
+    pytest.importorskip("zenoh")
+    address, over = Address("zenoh", "127.0.0.1", port()), threading.Event()
+    page = PageSpec("127.0.0.1", free_port("127.0.0.1", 18180), "drill", HOME[None].repeat(2, 0), (), 0.06, 0.19)
+    changes = {"learners": address, "seconds": SECONDS, "page": page if lost == "page hangs" else None}
+    thread = threading.Thread(target=station, args=(address, over))
+    thread.start()
+    events = LiveEvents()
+    try:
+        with Drill(spec_in(tmp_path, controller, **changes)) as drill:
+            for _ in drill.warm_up():
+                pass
+            drill.take_off()
+            while (status := drill.watch()).ended is None and status.t < 20.0:
+                events.take(status)
+                if status.t > 1.5 and lost == "ground":
+                    over.set()
+                elif status.t > 1.5 and lost == "bridge":
+                    drill.processes["bridge"].kill()
+                    lost = "bridge, and it came back"
+                elif status.t > 1.5 and lost == "page hangs":
+                    os.kill(drill.processes["page"].pid, signal.SIGSTOP)
+                if status.t > SECONDS:
+                    drill.land()
+                time.sleep(0.02)
+            drill.finish()
+    finally:
+        over.set()
+        thread.join(20.0)
+    rows = whole_log(tmp_path, status)
+    assert status.ended == "landed"
+    assert (rows[rows[:, 1] < SECONDS - 0.1, -1] == Mode.POLICY).all()
+    swaps = [at for at, half, *_ in events.swaps if half == "policy"]
+    assert swaps
+    assert swaps[0] < 1.5
+    if lost == "ground":
+        assert swaps[-1] < 2.5
+        assert not status.alive["policy"]
+    else:
+        assert swaps[-1] > 3.0
+    if lost.startswith("bridge"):
+        assert status.restarts == {"bridge": 1}
+
+
+def test_a_mission_survives_the_bus_and_nothing_else_is_one(tmp_path):
+    start = tmp_path / "start"
+    start.write_bytes(np.random.default_rng(0).bytes(1000))
+    capacities = {"flight": 1000, "parameters.policy": 5000, "knobs": 10}
+    mission = Mission.of(3, "circle", 7, "abc", ("residual", "policy"), capacities, start)
+    found = Mission.unpack(mission.pack())
+    assert found == mission
+    assert found.capacities == {"flight": 1000, "parameters.policy": 5000}  # knobs stay where the flight is
+    rng, whole = np.random.default_rng(1), mission.pack()
+    for _ in range(300):
+        data = bytearray(whole)
+        data[rng.integers(len(data))] ^= int(rng.integers(1, 256))
+        with pytest.raises(MessageError):
+            Mission.unpack(bytes(data))
+    for data in (b"", whole[:-1], rng.bytes(500)):
+        with pytest.raises(MessageError):
+            Mission.unpack(data)
+
+
+def test_a_bridge_carries_each_topic_its_way_and_no_more_than_needed():
+    now = 0.0
+    topics = dict.fromkeys((*OUT, *INTO), 100)
+    here, there = InProcessBus(topics), InProcessBus(topics | {"status": 1})
+    bridge = Bridge(here, there, out=OUT, into=INTO, slowly=("flight",), clock=lambda: now)
+    here.publish("flight", b"1")
+    here.publish("parameters.policy", b"stays")
+    there.publish("parameters.residual", b"comes")
+    assert bridge.step() == 2
+    assert there.latest("flight").data == b"1"
+    assert here.latest("parameters.residual").data == b"comes"
+    assert there.latest("parameters.policy") is None
+    here.publish("flight", b"2")
+    assert bridge.step() == 0
+    here.publish("flight", b"3")
+    now += EVERY
+    assert bridge.step() == 1
+    assert there.latest("flight").data == b"3"
+    here.publish("status", b"too long for there")
+    assert bridge.step() == 0
+    assert bridge.refused == 1

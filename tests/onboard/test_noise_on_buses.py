@@ -1,0 +1,43 @@
+"""Whatever comes over whichever bus: what is no parameters of this controller is never flown, and nothing crashes."""
+
+import numpy as np
+import pytest
+
+from bus_ends import LOCAL, NETWORK, arrived, two_ends
+from live_helpers import holding
+from retrim.onboard.intake import Intake
+from retrim.onboard.messages import Parameters
+from retrim.onboard.pilot import LivePilot
+
+EACH = 1000
+
+
+@pytest.mark.parametrize("backend", [*LOCAL, *NETWORK])
+def test_mutated_parameters_and_random_bytes_are_refused(backend):
+    rng, source = np.random.default_rng(11), holding()
+    whole = Parameters("policy", 99, source.base, 0.0, {"gains": np.array([-9.0, -9.0])}).pack()
+    room = {"parameters.policy": 10_000}
+    for writer, reader in two_ends(backend, room):
+        pilot = LivePilot(source)
+        pilot.reset(np.concatenate([np.zeros(3), np.eye(3).ravel(), np.zeros(3)]))
+        intake, version = Intake(pilot, reader, source.base, 0.02), 0
+        for i in range(2 * EACH):
+            data = _mutated(whole, rng) if i % 2 else rng.bytes(int(rng.integers(0, 2000)))
+            writer.publish("parameters.policy", data)
+            version = arrived(reader, "parameters.policy", version).version
+            intake.poll(0.02 * i)
+        assert pilot.versions == {"policy": 0}
+        assert sum(intake.refused.values()) == 2 * EACH
+        writer.publish("parameters.policy", Parameters("policy", 1, source.base, 0.0, {"gains": np.ones(2)}).pack())
+        arrived(reader, "parameters.policy", version)
+        intake.poll(99.0)
+        assert pilot.versions == {"policy": 1}
+
+
+def _mutated(whole, rng):
+    """Some bytes changed, or the end cut off; never the message itself."""
+    data = bytearray(whole)
+    for _ in range(rng.integers(1, 4)):
+        at = int(rng.integers(len(data)))
+        data[at] = (data[at] + int(rng.integers(1, 256))) % 256
+    return bytes(data[: int(rng.integers(len(data)))] if rng.random() < 0.3 else data)
