@@ -7,7 +7,7 @@ STAMP := $(VENV)/.installed
 
 DEV := $(VENV)/.installed-dev
 
-.PHONY: setup dev demo test check docs wheel mutants drill test-page bench tables pins clean
+.PHONY: setup dev demo test check docs wheel mutants drill test-page test-ros bench tables pins clean
 
 setup: $(STAMP)
 
@@ -51,6 +51,13 @@ test-page: dev
 	command -v chromium >/dev/null || apt-get install --yes --no-install-recommends chromium
 	$(UV) pip install --quiet --python $(VENV) --constraints constraints.txt --group browser
 	$(BIN)/pytest -n 0 tests/live/test_page.py
+
+# Buses and whole flights over ROS 1 with a real rosmaster, which is installed if there is none, and over zenoh between
+# two network namespaces, which takes the rights of root.
+test-ros: dev
+	command -v rosmaster >/dev/null || apt-get install --yes --no-install-recommends python3-rospy python3-rosmaster python3-std-msgs
+	$(BIN)/pytest -n 0 tests/transport/test_bus.py tests/onboard/test_noise_on_buses.py
+	$(BIN)/pytest -n 0 -m slow tests/live/test_two_machines.py
 
 bench: setup
 	$(BIN)/retrim bench

@@ -51,5 +51,6 @@ MADE = (
     tables.model,
     tables.fast,
     tables.ablation,
+    tables.buses,
 )
 COMMANDS: dict[str, Callable[..., Ordered]] = {make.__name__: command_of(make) for make in MADE}

@@ -1,6 +1,7 @@
 """The paper's tables and figures, one file each; every one is a function of a run and a reporter."""
 
 from .ablation import ablation as ablation
+from .buses import buses as buses
 from .fast import fast as fast
 from .gauntlet import gauntlet as gauntlet
 from .hover import hover as hover

@@ -1,0 +1,133 @@
+"""How long a message takes between two processes. ``python -m retrim.experiments.latency`` is the other one."""
+
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from ..transport.bus import Bus
+from ..transport.remote import Address
+from ..transport.shared_memory import SharedMemoryBus
+
+SIZES = {"a measurement": 500, "the policy of hover/retrim": 74_000, "the policy of hover/paper": 1_100_000}
+"""Bytes of a message, by what it is."""
+COUNT = 200  # messages of a size
+EVERY = 0.02  # [s] between two messages
+TOPICS = dict.fromkeys(("message", "done"), 2000000)
+JOINED = 0.5  # [s], in which both ends find each other
+
+
+def measured(bus: Bus, words: Sequence[str], size: int) -> list[float]:
+    """Return how long messages took [s], by the monotonic clock that both processes share.
+
+    Args:
+        bus: The end that receives.
+        words: Command that starts the other process, before its own arguments.
+        size: Bytes of a message.
+    """
+    known = getattr(bus.latest("message"), "version", 0)
+    writer = subprocess.Popen([*words, str(size)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    took: list[float] = []
+    until = time.monotonic() + 60.0
+    while len(took) < COUNT and time.monotonic() < until and (writer.poll() is None or not took):
+        message = bus.latest("message", known)
+        if message is None:
+            time.sleep(5e-5)
+            continue
+        known, now = message.version, time.monotonic_ns()
+        if len(message.data) == size:
+            took.append(1e-9 * (now - int.from_bytes(message.data[:8], "little")))
+    writer.kill()
+    writer.wait()
+    return took
+
+
+def write(bus: Bus, size: int) -> None:
+    """Send messages that carry the time at which they were sent."""
+    time.sleep(JOINED)
+    rest = bytes(size - 8)
+    for _ in range(COUNT + 10):
+        time.sleep(EVERY)
+        bus.publish("message", time.monotonic_ns().to_bytes(8, "little") + rest)
+    time.sleep(JOINED)
+
+
+def free_port() -> int:
+    """Return a port of the loopback address that nobody uses."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return int(server.getsockname()[1])
+
+
+@contextmanager
+def rosmaster() -> Iterator[Address | None]:
+    """Run a rosmaster; None where there is none on this machine."""
+    if shutil.which("rosmaster") is None:
+        yield None
+        return
+    address = Address("ros", "127.0.0.1", free_port())
+    with TemporaryDirectory() as logs:
+        environment = os.environ | {"ROS_LOG_DIR": logs, "PYTHONPATH": ""}
+        words = ["rosmaster", "--core", "-p", str(address.port)]
+        master = subprocess.Popen(words, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        try:
+            until = time.monotonic() + 20.0
+            while time.monotonic() < until:
+                with socket.socket() as probe:
+                    if probe.connect_ex(("127.0.0.1", address.port)) == 0:
+                        break
+                time.sleep(0.1)
+            yield address
+        finally:
+            master.kill()
+            master.wait()
+
+
+@contextmanager
+def two_machines() -> Iterator[tuple[str, Sequence[str]] | None]:
+    """Make two network namespaces with a cable between them; yield the address of this one, and the words that run a
+    command in the other. None where this is not allowed.
+    """
+    name, inside = f"retrim{os.getpid()}", ("ip", "netns", "exec", f"retrim{os.getpid()}")
+    here, there = f"rt{os.getpid() % 10**6}a", f"rt{os.getpid() % 10**6}b"
+    steps = (
+        f"ip netns add {name}",
+        f"ip link add {here} type veth peer name {there} netns {name}",
+        f"ip addr add 10.213.7.1/24 dev {here}",
+        f"ip link set {here} up",
+        f"ip netns exec {name} ip addr add 10.213.7.2/24 dev {there}",
+        f"ip netns exec {name} ip link set {there} up",
+        f"ip netns exec {name} ip link set lo up",
+    )
+    made = shutil.which("ip") is not None and all(
+        subprocess.run(step.split(), capture_output=True, check=False).returncode == 0 for step in steps
+    )
+    try:
+        yield ("10.213.7.1", inside) if made else None
+    finally:
+        if shutil.which("ip") is not None:
+            subprocess.run(["ip", "netns", "del", name], capture_output=True, check=False)
+
+
+def other_process(where: str) -> list[str]:
+    """Return the command of the other process, but for the size; ``where`` is a folder or an address."""
+    return [sys.executable, "-m", "retrim.experiments.latency", where]
+
+
+def main() -> None:
+    """Be the other process."""
+    where, size = sys.argv[1], int(sys.argv[2])
+    bus = SharedMemoryBus(Path(where)) if "/" in where else Address.of(where).join(TOPICS, listen=False)
+    try:
+        write(bus, size)
+    finally:
+        bus.close()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,50 @@
+"""A whole flight whose learners are on another machine: over zenoh between two network namespaces, and over ROS 1."""
+
+import json
+import subprocess
+import sys
+from contextlib import ExitStack
+
+import pytest
+
+from retrim.experiments.latency import rosmaster, two_machines
+
+pytestmark = pytest.mark.slow
+RETRIM = [sys.executable, "-m", "retrim.cli"]
+
+
+@pytest.fixture(scope="module")
+def policy(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("policy")
+    words = [*RETRIM, "pretrain", "hover", "--preset", "hover/retrim", "--out", str(folder)]
+    subprocess.run(words, check=True, capture_output=True, timeout=300)
+    return folder
+
+
+@pytest.mark.parametrize("network", ["zenoh between namespaces", "ROS 1"])
+def test_a_flight_learns_on_another_machine(policy, tmp_path, network):
+    with ExitStack() as stack:
+        if network == "ROS 1":
+            master = stack.enter_context(rosmaster())
+            if master is None:
+                pytest.skip("needs rosmaster and rospy: make test-ros installs them")
+            address, inside = f"ros:{master.host}:{master.port}", ()
+        else:
+            machines = stack.enter_context(two_machines())
+            if machines is None:
+                pytest.skip("needs the right to make network namespaces")
+            address, inside = f"zenoh:{machines[0]}:7447", machines[1]
+        words = [*RETRIM, "live", "--policy", str(policy), "--disturbance", "large", "--seconds", "20", "--learners"]
+        flight = subprocess.Popen([*words, address, "--out", str(tmp_path)], stdout=subprocess.PIPE, text=True)
+        ground = subprocess.Popen([*inside, *RETRIM, "learn", address], stdout=subprocess.PIPE, text=True)
+        said, heard = flight.communicate(timeout=300)[0], ground.communicate(timeout=60)[0]
+    assert flight.returncode == 0, said
+    assert ground.returncode == 0, heard
+    assert "flight over: landed" in heard
+    assert ("warning: this machine listens on" in said) == (network != "ROS 1")
+    found = {row["metric"]: row["value"] for row in json.loads((tmp_path / "results.json").read_text())["rows"]}
+    assert found["policies"] > 10
+    assert found["flight_to_swap_s"] < 1.0
+    assert found["steady"] < 0.01
+    assert found["fallback_ticks"] == 0
+    assert found["refused_messages"] == 0
