@@ -107,8 +107,12 @@ def test_live_flies_against_the_clock_learns_and_lands(folder):
 
 
 def test_live_without_learning_and_what_it_refuses(folder):
-    out = retrim("live", "--policy", "p", "--adapt", "base-do", "--seconds", "2", "--out", "ld", cwd=folder)
+    words = "--adapt", "base-do", "--seconds", "2", "--page", "--page-port", "18280", "--record", "ld.mcap"
+    out = retrim("live", "--policy", "p", *words, "--out", "ld", cwd=folder)
+    assert "page: http://127.0.0.1:182" in out
     assert "flight over: landed" in out
+    assert (folder / "ld.mcap").stat().st_size > 10_000
+    assert not list((folder / "ld").glob("start*"))
     assert {row["metric"]: row["value"] for row in results(folder / "ld")["rows"]}["policies"] == 0
     for words, said in (
         (("--fence", "0.1"), "--fence 0.1 m must be between 0.5 and 1000"),
@@ -116,8 +120,16 @@ def test_live_without_learning_and_what_it_refuses(folder):
         (("--resume", "f/learnt.safetensors"), "give either --policy FILE or --resume FILE"),
         (("--adapt", "nothing"), "'nothing'"),
         (("--plant", "moon"), "'moon'"),
+        (("--page", "--no-page"), "--page and --no-page: choose one"),
+        (("--page", "--page-port", "0"), "--page-port 0 must be between 1 and 65535"),
+        (("--page", "--page-host", "192.0.2.1"), "no free port from 8080 on at '192.0.2.1'"),
+        (("--learners", "somewhere"), "'somewhere' is no address of a bus; one is zenoh:HOST:PORT or ros:HOST:PORT"),
+        (("--record", "flight.bag"), "--record flight.bag: the name must end with .mcap"),
+        (("--record", "nowhere/flight.mcap"), "nothing can be written in nowhere"),
     ):
         assert said in retrim("live", "--policy", "p", *words, "--out", "lx", cwd=folder, code=1)
+    assert "'somewhere' is no address of a bus" in retrim("learn", "somewhere", cwd=folder, code=1)
+    assert "no rosmaster at 'http://127.0.0.1:1'" in retrim("learn", "ros:127.0.0.1:1", cwd=folder, code=1)
 
 
 def test_fly_as_it_is_and_with_measured_latency(folder):

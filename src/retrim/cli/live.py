@@ -28,6 +28,7 @@ from ..live.display import live_line, live_rows
 from ..live.events import LiveEvents
 from ..live.flying import fly_live
 from ..live.page import page_address
+from ..live.recording import check_recording
 from ..live.session import LiveRequest, learners_at
 from ..live.status import Status
 from ..runtime.events import Event
@@ -60,6 +61,7 @@ def live(
     no_page: tyro.conf.FlagCreatePairsOff[bool] = False,
     page_host: str = LOOPBACK[0],
     page_port: int = 8080,
+    record: Path | None = None,
     out: Path | None = None,
 ) -> Callable[[threading.Event], int]:
     """Fly against the clock, and learn at the same time: a process for control, for each learner, and for the plant.
@@ -88,11 +90,14 @@ def live(
         no_page: Show it in the terminal only.
         page_host: Address that the page listens on. Anybody who reaches another than 127.0.0.1 may turn the knobs.
         page_port: Port of the page, or the next one that is free.
+        record: File FILE.mcap of the flight for Foxglove, PlotJuggler or rerun, written at its end.
         out: Folder of what the flight leaves; a new one under runs/ by default.
     """
 
     def ordered(stop: threading.Event) -> int:
         check_seeds([seed])
+        if record is not None:
+            check_recording(record)
         if page and no_page:
             raise ConfigError("--page and --no-page: choose one")
         if not 0.5 <= fence <= 1000.0:
@@ -123,7 +128,9 @@ def live(
         for old in (*run.folder.glob("*.log"), run.folder / "flight.csv"):
             old.unlink(missing_ok=True)
         length = seconds or LONGEST
-        request = LiveRequest(setup, weights, scenario, method, length, seed, fence, run.folder, state, address, ground)
+        request = LiveRequest(
+            setup, weights, scenario, method, length, seed, fence, run.folder, state, address, ground, record
+        )
         with interrupts_only_set(run.stop):  # a Ctrl-C lands the vehicle; whoever is in the air is not dropped
             return _fly(request, run)
 

@@ -5,12 +5,16 @@ from contextlib import AbstractContextManager, closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
+import numpy as np
+
 from ..experiments.flights import Flight
 from ..experiments.outputs import write_events, write_learnt
 from ..experiments.reporter import Reporter
 from ..experiments.run import Run
 from ..runtime.events import Event
 from .events import LiveEvents
+from .recording import write_recording
 from .report import complaints, flight_of, histograms, learnt_in, results
 from .session import LEARNING, LiveRequest, live_spec
 from .status import Status
@@ -69,7 +73,14 @@ def fly_live(
     )  # fmt: skip
     write_events([flight], run.folder)
     write_learnt([flight], request.setup.preset, run.folder)
-    paths = [run.folder / "results.json", run.folder / "flight.csv", *complaints(run.folder)]
+    recorded = []
+    if request.record is not None:
+        target = np.asarray(jax.jit(jax.vmap(request.setup.flown.target))(rows[:, 1]), dtype=float)
+        write_recording(request.record, rows, target, events.all)
+        recorded = [request.record]
+    for start in run.folder.glob("start*.safetensors"):  # what learners went on from; it is in what they learnt
+        start.unlink()
+    paths = [*recorded, run.folder / "results.json", run.folder / "flight.csv", *complaints(run.folder)]
     return LiveFlight(flight, found, paths)
 
 

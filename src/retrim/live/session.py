@@ -57,6 +57,8 @@ class LiveRequest:
     """Address and port of the page; None for no page."""
     learners: Address | None = None
     """Where learners on another machine are reached; None: they run here."""
+    record: Path | None = None
+    """File of a recording for other viewers."""
 
     @property
     def flight(self) -> FlightSpec:
