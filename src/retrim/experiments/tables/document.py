@@ -63,7 +63,8 @@ class Document:
         """Write both files; return the path of the Markdown."""
         seeds = ", ".join(map(str, self.seeds))
         head = [f"# {self.title}", "", self.intro, ""]
-        head += [f"Commit {commit()}; {describe_hardware()}; training seeds {seeds}.", ""]
+        trained = f"; training seeds {seeds}" if seeds else ""
+        head += [f"Commit {commit()}; {describe_hardware()}{trained}.", ""]
         body = [line for section in self.sections for line in section.markdown()]
         foot = self.run.watch.sentence() + (" Interrupted: incomplete." if self.run.interrupted else "")
         self.run.write_results(self._rows, seeds=self.seeds, name=self.data or self.name, **self.more)
