@@ -120,6 +120,7 @@ def test_live_without_learning_and_what_it_refuses(folder):
         (("--resume", "f/learnt.safetensors"), "give either --policy FILE or --resume FILE"),
         (("--adapt", "nothing"), "'nothing'"),
         (("--plant", "moon"), "'moon'"),
+        (("--policy-age", "-1"), "--policy-age -1 s must be positive"),
         (("--page", "--no-page"), "--page and --no-page: choose one"),
         (("--page", "--page-port", "0"), "--page-port 0 must be between 1 and 65535"),
         (("--page", "--page-host", "192.0.2.1"), "no free port from 8080 on at '192.0.2.1'"),

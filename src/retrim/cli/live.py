@@ -55,6 +55,7 @@ def live(
     residual: str | None = None,
     seconds: float | None = None,
     fence: float = 3.0,
+    policy_age: float | None = None,
     seed: int = 0,
     learners: str | None = None,
     page: tyro.conf.FlagCreatePairsOff[bool] = False,
@@ -83,6 +84,8 @@ def live(
         residual: Residual model: ensemble, regression, layered, or module:name.
         seconds: Length of the flight; until Ctrl-C by default.
         fence: How far from its reference the vehicle may be along any axis before the fallback flies [m].
+        policy_age: Age [s] of the flight that the policy was learnt from, above which the fallback flies; none by
+            default.
         seed: Seed of the start, of the learners and of what is random in the scenario.
         learners: Where learners on another machine, started by `retrim learn`, reach this one: zenoh:HOST:PORT (this
             machine listens there), or ros:HOST:PORT of a rosmaster. By default they run here.
@@ -96,6 +99,8 @@ def live(
 
     def ordered(stop: threading.Event) -> int:
         check_seeds([seed])
+        if policy_age is not None and not policy_age > 0.0:
+            raise ConfigError(f"--policy-age {policy_age:g} s must be positive")
         if record is not None:
             check_recording(record)
         if page and no_page:
@@ -127,10 +132,10 @@ def live(
         clear_outputs(run.folder)
         for old in (*run.folder.glob("*.log"), run.folder / "flight.csv"):
             old.unlink(missing_ok=True)
-        length = seconds or LONGEST
         request = LiveRequest(
-            setup, weights, scenario, method, length, seed, fence, run.folder, state, address, ground, record
-        )
+            setup, weights, scenario, method, seconds or LONGEST, seed, fence, run.folder, state, address, ground,
+            policy_age=policy_age or float("inf"), record=record,
+        )  # fmt: skip
         with interrupts_only_set(run.stop):  # a Ctrl-C lands the vehicle; whoever is in the air is not dropped
             return _fly(request, run)
 

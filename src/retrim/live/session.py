@@ -57,6 +57,8 @@ class LiveRequest:
     """Address and port of the page; None for no page."""
     learners: Address | None = None
     """Where learners on another machine are reached; None: they run here."""
+    policy_age: float = float("inf")
+    """How old the flight may be that the policy was learnt from [s]."""
     record: Path | None = None
     """File of a recording for other viewers."""
 
@@ -159,7 +161,8 @@ def _limits(request: LiveRequest) -> Limits:
     places = _places(request, request.seconds)
     low, high = places.min(0) - fence, places.max(0) + fence
     low[2] = max(low[2], min(-BELOW_GROUND, float(places[:, 2].min()) - BELOW_GROUND))
-    return Limits(low, high, as_numpy(vehicle.command_min).astype(float), as_numpy(vehicle.command_max).astype(float))
+    u_min, u_max = (as_numpy(u).astype(float) for u in (vehicle.command_min, vehicle.command_max))
+    return Limits(low, high, u_min, u_max, policy_age=request.policy_age)
 
 
 def _places(request: LiveRequest, seconds: float) -> np.ndarray:

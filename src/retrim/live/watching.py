@@ -1,8 +1,10 @@
 """A live flight from take-off to landing."""
 
+import contextlib
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 
 from ..runtime.events import Event
 from .events import LiveEvents
@@ -11,6 +13,7 @@ from .supervisor import LANDING, Supervisor
 from .wishes import Wishes
 
 EVERY = 0.05  # [s]
+LAST = 1.0  # [s] for a terminal to take the end of a flight
 
 
 def watched(
@@ -36,22 +39,54 @@ def watched(
     """
     supervisor.take_off()
     landed_by = float("inf")
-    while True:
-        status = supervisor.watch()
-        new = events.take(status, wishes.obey(status) if wishes is not None else ())
+    with _Screen(show) as screen:
+        while True:
+            status = supervisor.watch()
+            new = events.take(status, wishes.obey(status) if wishes is not None else ())
+            if not screen.show(status, new):  # nobody reads any more: whoever is in the air lands
+                stop.set()
+            if status.ended is not None or time.monotonic() > landed_by:
+                supervisor.finish()
+                return status
+            if (stop.is_set() or status.t >= seconds) and landed_by == float("inf"):
+                supervisor.land()
+                landed_by = time.monotonic() + LANDING
+            time.sleep(EVERY)
+
+
+class _Screen:
+    """Shows in a thread of its own: a terminal that stands still stops nobody else."""
+
+    def __init__(self, show: Callable[[Status, list[Event]], None]) -> None:
+        self._show, self._waiting = show, list[Event]()
+        self._last: Status | None = None
+        self._thread = ThreadPoolExecutor(1)
+        self._work: Future[None] | None = None
+        self._lost = False
+
+    def __enter__(self) -> "_Screen":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Show the end, if there is somebody to show it to within a second."""
+        with contextlib.suppress(TimeoutError, OSError, SystemExit):
+            if self._work is not None:
+                self._work.result(LAST)
+            if self._last is not None and not self._lost:
+                self._thread.submit(self._show, self._last, self._waiting).result(LAST)
+        self._thread.shutdown(wait=False, cancel_futures=True)
+
+    def show(self, status: Status, new: list[Event]) -> bool:
+        """Show how the flight stands if the last look is done; return whether there is still somebody to show it to."""
+        self._waiting += new
+        self._last = status
+        if self._lost or (self._work is not None and not self._work.done()):
+            return not self._lost
         try:
-            show(status, new)
-        except (OSError, SystemExit):  # nobody reads any more: whoever is in the air lands
-            stop.set()
-            show = _nobody
-        if status.ended is not None or time.monotonic() > landed_by:
-            supervisor.finish()
-            return status
-        if (stop.is_set() or status.t >= seconds) and landed_by == float("inf"):
-            supervisor.land()
-            landed_by = time.monotonic() + LANDING
-        time.sleep(EVERY)
-
-
-def _nobody(status: Status, new: list[Event]) -> None:
-    del status, new
+            if self._work is not None:
+                self._work.result()
+        except (OSError, SystemExit):
+            self._lost = True
+            return False
+        self._work, self._waiting = self._thread.submit(self._show, status, self._waiting), []
+        return True

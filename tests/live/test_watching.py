@@ -1,0 +1,76 @@
+"""A flight is watched and landed whatever the terminal does."""
+
+import inspect
+import threading
+import time
+
+import pytest
+
+from retrim.live.events import LiveEvents
+from retrim.live.status import Status
+from retrim.live.watching import watched
+from retrim.runtime.events import Event
+
+
+class Flying:
+    """Ends a moment after it was told to land."""
+
+    def __init__(self):
+        self.began, self.landing, self.finished = time.monotonic(), None, False
+
+    def take_off(self):
+        self.began = time.monotonic()
+
+    def land(self):
+        self.landing = self.landing or time.monotonic()
+
+    def finish(self):
+        self.finished = True
+
+    def watch(self):
+        over = self.landing is not None and time.monotonic() > self.landing + 0.2
+        t = time.monotonic() - self.began
+        control = {"mode": "policy", "swaps": [[0.1, "policy", 1, 0.1]]}
+        return Status(t, control, {}, {}, {}, "landed" if over else None, [], False, None)
+
+
+def shown_by(show, seconds=0.3, stop=None):
+    flight, stop = Flying(), stop or threading.Event()
+    status = inspect.unwrap(watched)(flight, seconds, LiveEvents(), show, stop)
+    assert flight.finished
+    assert status.ended == "landed"
+    return flight, stop
+
+
+def test_all_events_are_shown_once_and_the_end_too():
+    seen, times = list[Event](), []
+
+    def show(status, new):
+        seen.extend(new)
+        times.append(status.ended)
+
+    shown_by(show)
+    assert [event.kind for event in seen] == ["policy"]
+    assert times[-1] == "landed"
+
+
+def test_a_terminal_that_stands_still_stops_nobody():
+    blocked, stop = threading.Event(), threading.Event()
+    threading.Timer(0.3, stop.set).start()
+    began = time.monotonic()
+    try:
+        flight, _ = shown_by(lambda status, new: blocked.wait(30.0), seconds=1000.0, stop=stop)
+        assert 0.2 < flight.landing - began < 1.0
+        assert time.monotonic() - began < 5.0
+    finally:
+        blocked.set()
+
+
+@pytest.mark.parametrize("error", [BrokenPipeError, SystemExit])
+def test_when_nobody_reads_any_more_it_lands(error):
+    def show(status, new):
+        raise error
+
+    flight, stop = shown_by(show, seconds=1000.0)
+    assert stop.is_set()
+    assert flight.landing is not None
