@@ -75,7 +75,7 @@ def plant(plan: DrillPlan) -> None:
 def learner(plan: DrillPlan) -> None:
     """Gains near those that are flown, now and then."""
     bus, parent = SharedMemoryBus(plan.folder), Lifeline(plan.parent)
-    bus.publish(f"ready.{plan.role}", pack_note("ready"))
+    bus.publish(f"ready.{plan.role}", pack_note("ready", base=plan.base))
     topic, rng = "parameters.policy", np.random.default_rng()
     while not parent.gone(0.1) and bus.latest("ended") is None:
         before = bus.latest(topic)
@@ -83,3 +83,8 @@ def learner(plan: DrillPlan) -> None:
         gains = np.array([4.0, 3.5]) + 0.1 * rng.normal(size=2)
         if plan.role == "policy":
             bus.publish(topic, Parameters("policy", version, plan.base, 0.0, {"gains": gains}).pack())
+
+
+def nothing(plan) -> None:
+    """A process that does nothing for long."""
+    time.sleep(60.0)

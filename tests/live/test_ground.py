@@ -24,7 +24,7 @@ from retrim.transport.bridge import EVERY, Bridge
 from retrim.transport.in_process import InProcessBus
 from retrim.transport.remote import Address
 
-SECONDS = 4.0
+SECONDS = 3.0
 
 
 class DrillGround(Ground):
@@ -46,7 +46,7 @@ def station(address, over):
                 return
 
 
-@pytest.mark.parametrize("lost", ["nobody", "ground", "bridge", "page hangs"])
+@pytest.mark.parametrize("lost", ["ground", "bridge", "page hangs"])
 def test_a_flight_with_learners_elsewhere(tmp_path, controller, lost):  # noqa: F811
     pytest.importorskip("zenoh")
     address, over = Address("zenoh", "127.0.0.1", port()), threading.Event()
@@ -62,12 +62,12 @@ def test_a_flight_with_learners_elsewhere(tmp_path, controller, lost):  # noqa: 
             drill.take_off()
             while (status := drill.watch()).ended is None and status.t < 20.0:
                 events.take(status)
-                if status.t > 1.5 and lost == "ground":
+                if status.t > 1.0 and lost == "ground":
                     over.set()
-                elif status.t > 1.5 and lost == "bridge":
+                elif status.t > 1.0 and lost == "bridge":
                     drill.processes["bridge"].kill()
                     lost = "bridge, and it came back"
-                elif status.t > 1.5 and lost == "page hangs":
+                elif status.t > 1.0 and lost == "page hangs":
                     os.kill(drill.processes["page"].pid, signal.SIGSTOP)
                 if status.t > SECONDS:
                     drill.land()
@@ -81,21 +81,56 @@ def test_a_flight_with_learners_elsewhere(tmp_path, controller, lost):  # noqa: 
     assert (rows[rows[:, 1] < SECONDS - 0.1, -1] == Mode.POLICY).all()
     swaps = [at for at, half, *_ in events.swaps if half == "policy"]
     assert swaps
-    assert swaps[0] < 1.5
+    assert swaps[0] < 1.0
     if lost == "ground":
-        assert swaps[-1] < 2.5
+        assert swaps[-1] < 2.0
         assert not status.alive["policy"]
     else:
-        assert swaps[-1] > 3.0
+        assert swaps[-1] > 2.0
     if lost.startswith("bridge"):
         assert status.restarts == {"bridge": 1}
+
+
+def mission_in(folder, base, number=1):
+    start = folder / "start"
+    start.write_bytes(b"start")
+    capacities = dict.fromkeys((*OUT, *INTO), 10_000)
+    return Mission.of(number, None, 0, base, ("residual", "policy"), 0, capacities, start).pack()
+
+
+def test_a_new_flight_has_new_learners_and_an_old_one_none(tmp_path, monkeypatch):
+    network, started = InProcessBus(dict.fromkeys((*OUT, *INTO), 100_000)), []
+    monkeypatch.setattr(Address, "join", lambda *_, **__: network)
+
+    class Noted(Ground):
+        def _start(self, layer):
+            started.append((self._mission.base, self._mission.number, layer))
+            self.processes[layer] = launch("live_processes:nothing", None, tmp_path / "log")
+
+    with Noted(Address("zenoh", "127.0.0.1", 1)) as ground:
+        network.publish("mission", b"noise")
+        assert not ground._look()
+        network.publish("mission", mission_in(tmp_path, "first"))
+        assert ground._look()
+        first = ground._bus.folder
+        network.publish("mission", mission_in(tmp_path, "first", 2))  # another way of learning
+        ground._look()
+        assert started == [("first", 1, "residual"), ("first", 1, "policy"), ("first", 2, "policy")]
+        network.publish("mission", mission_in(tmp_path, "second"))
+        ground._look()
+        assert started[3:] == [("second", 1, "residual"), ("second", 1, "policy")]
+        assert not first.exists()
+        network.publish("status", b"whatever")
+        assert "compiling" in next(ground.learn())
+        last = ground._bus.folder
+    assert not last.exists()
 
 
 def test_a_mission_survives_the_bus_and_nothing_else_is_one(tmp_path):
     start = tmp_path / "start"
     start.write_bytes(np.random.default_rng(0).bytes(1000))
     capacities = {"flight": 1000, "parameters.policy": 5000, "knobs": 10}
-    mission = Mission.of(3, "circle", 7, "abc", ("residual", "policy"), capacities, start)
+    mission = Mission.of(3, "circle", 7, "abc", ("residual", "policy"), 5, capacities, start)
     found = Mission.unpack(mission.pack())
     assert found == mission
     assert found.capacities == {"flight": 1000, "parameters.policy": 5000}  # knobs stay where the flight is

@@ -113,6 +113,24 @@ def test_a_window_becomes_parameters_that_the_controller_takes(start):
     assert beside.parameters("residual", after=1).version == 2
 
 
+def test_on_a_bus_that_is_new_it_counts_on_from_what_is_flown(start):
+    beside = Beside(start, "policy")
+    loop = improving(beside.loops["policy"])
+    beside.says(57)
+    beside.fly()
+    assert loop.step()
+    assert beside.parameters("policy").version == 58
+
+
+def test_what_is_paused_while_it_learns_is_not_published(start):
+    beside = Beside(start, "policy")
+    note = pack_note("learning", paused=True)
+    loop = improving(beside.loops["policy"], lambda: beside.bus.publish("learning", note))
+    beside.fly()
+    loop.step()
+    assert beside.bus.latest("parameters.policy") is None
+
+
 def test_nothing_is_learnt_that_nobody_would_fly(start):
     beside = Beside(start, "residual")
     loop = beside.loops["residual"]

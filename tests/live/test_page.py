@@ -20,7 +20,18 @@ from retrim.onboard.messages import Sample, pack_note, unpack_note
 from retrim.physics import so3
 from retrim.transport.shared_memory import SharedMemoryBus
 
-SMALL = ("sample", "status", "knobs", "wish", "ended", "world", "learner.residual", "learner.policy", "ready.page")
+SMALL = (
+    "sample",
+    "status",
+    "fallback",
+    "knobs",
+    "wish",
+    "ended",
+    "world",
+    "learner.residual",
+    "learner.policy",
+    "ready.page",
+)
 BROWSER = shutil.which("chromium")
 DRAWING = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist",
            "--disable-background-networking", "--disable-component-update", "--no-first-run")  # fmt: skip

@@ -16,19 +16,23 @@ class Flying:
     """Ends a moment after it was told to land."""
 
     def __init__(self):
-        self.began, self.landing, self.finished = time.monotonic(), None, False
+        self.began, self.landed, self.finished = time.monotonic(), None, False
 
     def take_off(self):
         self.began = time.monotonic()
 
     def land(self):
-        self.landing = self.landing or time.monotonic()
+        self.landed = self.landed or time.monotonic()
+
+    @property
+    def landing(self):
+        return self.landed is not None
 
     def finish(self):
         self.finished = True
 
     def watch(self):
-        over = self.landing is not None and time.monotonic() > self.landing + 0.2
+        over = self.landing and time.monotonic() > self.landed + 0.2
         t = time.monotonic() - self.began
         control = {"mode": "policy", "swaps": [[0.1, "policy", 1, 0.1]]}
         return Status(t, control, {}, {}, {}, "landed" if over else None, [], False, None)
@@ -60,7 +64,7 @@ def test_a_terminal_that_stands_still_stops_nobody():
     began = time.monotonic()
     try:
         flight, _ = shown_by(lambda status, new: blocked.wait(30.0), seconds=1000.0, stop=stop)
-        assert 0.2 < flight.landing - began < 1.0
+        assert 0.2 < flight.landed - began < 1.0
         assert time.monotonic() - began < 5.0
     finally:
         blocked.set()
@@ -73,4 +77,4 @@ def test_when_nobody_reads_any_more_it_lands(error):
 
     flight, stop = shown_by(show, seconds=1000.0)
     assert stop.is_set()
-    assert flight.landing is not None
+    assert flight.landing

@@ -196,6 +196,22 @@ def test_what_took_off_flies_while_learning_is_not_wanted_and_the_last_policy_af
     assert flight.status["refused"] == {}
 
 
+def test_the_age_of_the_policy_is_that_of_the_one_that_flies():
+    flight = Flight(holding(), push=(0.3, 0.0, 0.0), policy_age=5.0)
+    flight.step(200)
+    flight.bus.publish("parameters.policy", flight.parameters((-3.0, -1.0), 1))  # learnt just now, and soon taken back
+    flight.step(120)
+    assert flight.status["given_up"] == [1]
+    assert flight.loop.mode != Mode.POLICY  # what flies is as old as the flight
+    assert "the policy was learnt" in flight.status["reason"]
+    late = Flight(holding())
+    late.step(10)
+    message = Parameters("policy", 1, late.loop.plan.controller.base, 1e9, {"gains": np.ones(2)}, 0)
+    late.bus.publish("parameters.policy", message.pack())
+    late.step(2)
+    assert late.status["refused"] == {"policy of a time to come": 1}
+
+
 def test_it_is_taken_back_while_fits_and_policies_keep_coming():
     flight = Flight(holding(fitted=True), push=(0.3, 0.0, 0.0))
     flight.step(200)

@@ -1,5 +1,6 @@
 """``retrim learn``."""
 
+import signal
 import threading
 from collections.abc import Callable
 
@@ -8,8 +9,6 @@ import tyro
 from ..live.ground import Ground
 from ..transport.remote import Address
 from .console import RichReporter, console
-
-LINE_EVERY = 10.0  # [s]
 
 
 def learn(address: tyro.conf.Positional[str]) -> Callable[[threading.Event], int]:
@@ -22,6 +21,7 @@ def learn(address: tyro.conf.Positional[str]) -> Callable[[threading.Event], int
     """
 
     def ordered(stop: threading.Event) -> int:
+        signal.signal(signal.SIGTERM, lambda *_: stop.set())
         with Ground(Address.of(address)) as ground, RichReporter().progress(address) as advance:
             for _ in ground.wait():
                 advance(0.0, "waiting for a flight")

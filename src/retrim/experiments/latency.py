@@ -19,7 +19,8 @@ SIZES = {"a measurement": 500, "the policy of hover/retrim": 74_000, "the policy
 """Bytes of a message, by what it is."""
 COUNT = 200  # messages of a size
 EVERY = 0.02  # [s] between two messages
-TOPICS = dict.fromkeys(("message", "done"), 2000000)
+TOPICS = {"message": 2_000_000}
+FIRST = 10  # messages that are not counted: connections are made
 JOINED = 0.5  # [s], in which both ends find each other
 
 
@@ -33,28 +34,30 @@ def measured(bus: Bus, words: Sequence[str], size: int) -> list[float]:
     """
     known = getattr(bus.latest("message"), "version", 0)
     writer = subprocess.Popen([*words, str(size)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    took: list[float] = []
+    took: dict[int, float] = {}
     until = time.monotonic() + 60.0
-    while len(took) < COUNT and time.monotonic() < until and (writer.poll() is None or not took):
+    while time.monotonic() < until and writer.poll() is None and FIRST + COUNT - 1 not in took:
         message = bus.latest("message", known)
         if message is None:
             time.sleep(5e-5)
             continue
         known, now = message.version, time.monotonic_ns()
         if len(message.data) == size:
-            took.append(1e-9 * (now - int.from_bytes(message.data[:8], "little")))
+            number, sent = (int.from_bytes(message.data[i : i + 8], "little") for i in (0, 8))
+            took[number] = 1e-9 * (now - sent)
     writer.kill()
     writer.wait()
-    return took
+    return [seconds for number, seconds in took.items() if number >= FIRST]
 
 
 def write(bus: Bus, size: int) -> None:
     """Send messages that carry the time at which they were sent."""
     time.sleep(JOINED)
-    rest = bytes(size - 8)
-    for _ in range(COUNT + 10):
+    rest = bytes(size - 16)
+    for number in range(FIRST + COUNT):
         time.sleep(EVERY)
-        bus.publish("message", time.monotonic_ns().to_bytes(8, "little") + rest)
+        stamp = number.to_bytes(8, "little") + time.monotonic_ns().to_bytes(8, "little")
+        bus.publish("message", stamp + rest)
     time.sleep(JOINED)
 
 

@@ -7,9 +7,10 @@ from .status import Status
 def live_line(status: Status) -> str:
     """Return how a flight stands, as one line."""
     control = status.control
+    flown_by = "watchdog" if status.watchdog_flies else control.get("mode", "not started")
     versions = ", ".join(f"{half} {n}" for half, n in control.get("versions", {}).items())
     return (
-        f"{max(0.0, status.t):.0f} s, {control.get('mode', 'not started')}, error {control.get('error', 0.0):.3f} m, "
+        f"{max(0.0, status.t):.0f} s, {flown_by}, error {control.get('error', 0.0):.3f} m, "
         f"versions: {versions}, missed ticks: {control.get('missed', 0)}"
     )
 
@@ -18,7 +19,7 @@ def live_rows(status: Status, events: LiveEvents) -> list[tuple[str, str]]:
     """Return how a flight stands: what, and how it is now."""
     control = status.control
     rows: list[tuple[str, str]] = []
-    rows.append(("flown by", control.get("mode", "not started")))
+    rows.append(("flown by", "watchdog" if status.watchdog_flies else control.get("mode", "not started")))
     rows.append(("error", f"{control.get('error', 0.0):.4f} m"))
     for half, version in control.get("versions", {}).items():
         rows.append((f"{half} swaps", str(version)))

@@ -1,13 +1,14 @@
 """One live flight from the warm-up to its files."""
 
 from collections.abc import Callable
-from contextlib import AbstractContextManager, closing
+from contextlib import AbstractContextManager, ExitStack, closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
+from ..adapt.learner import LearnerState
 from ..experiments.flights import Flight
 from ..experiments.outputs import write_events, write_learnt
 from ..experiments.reporter import Reporter
@@ -56,20 +57,35 @@ def fly_live(
         PlantError: The flight could not begin, or left no log.
     """
     events = LiveEvents()
-    with Supervisor(live_spec(request)) as supervisor:
-        if not _warmed_up(supervisor, run, reporter):
-            return None
-        if request.page is not None and supervisor.page_port is not None:
-            opened(f"http://{request.page[0]}:{supervisor.page_port}")
-        with display(events) as show, closing(Wishes(request, supervisor)) as wishes:
-            status = watched(supervisor, request.seconds, events, show, run.stop, wishes)
-        learnt = learnt_in(supervisor.bus, status, supervisor.start) if request.method in LEARNING else None
+    with ExitStack() as screen:  # it closes last, since a terminal that stands still would keep everything else waiting
+        with Supervisor(live_spec(request)) as supervisor:
+            if not _warmed_up(supervisor, run, reporter):
+                return None
+            if request.page is not None and supervisor.page_port is not None:
+                opened(f"http://{request.page[0]}:{supervisor.page_port}")
+            show = screen.enter_context(display(events))
+            with closing(Wishes(request, supervisor)) as wishes:
+                status = watched(supervisor, request.seconds, events, show, run.stop, wishes)
+            learnt = learnt_in(supervisor.bus, status, supervisor.start) if request.method in LEARNING else None
+        done = _written(request, run, status, events, learnt, supervisor.refused)
     reporter.say(f"flight over: {status.ended}")
+    return done
+
+
+def _written(
+    request: LiveRequest,
+    run: Run,
+    status: Status,
+    events: LiveEvents,
+    learnt: LearnerState | None,
+    refused: dict[str, list[str]],
+) -> LiveFlight:
+    """Write what a flight leaves."""
     flight, rows = flight_of(request, events.all, status, learnt)
     found = results(request, flight, rows, status, events)
     run.write_results(
         found, seeds=[request.seed], preset=request.setup.preset.name, seconds=float(flight.log.t[-1]),
-        ended=status.ended, scheduling=supervisor.refused, histograms_ms=histograms(rows),
+        ended=status.ended, scheduling=refused, histograms_ms=histograms(rows),
     )  # fmt: skip
     write_events([flight], run.folder)
     write_learnt([flight], request.setup.preset, run.folder)

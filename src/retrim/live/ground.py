@@ -10,7 +10,7 @@ from subprocess import Popen
 from typing import Any
 
 from ..errors import MessageError
-from ..onboard.launch import launch
+from ..onboard.launch import last_words, launch
 from ..onboard.messages import pack_note, unpack_note
 from ..onboard.topics import INTO, MOST, OUT
 from ..transport.bridge import Bridge
@@ -22,7 +22,7 @@ from .spec import MAINS
 
 IDLE = 0.002  # [s]
 BEAT_EVERY = 0.25  # [s]
-SILENCE = 30.0  # [s] without a word of the flight, after which it is over
+SILENCE = 5.0  # [s] without a word of the flight, after which it is told
 ATTEMPTS = 5  # to bring a learner back
 
 
@@ -41,7 +41,9 @@ class Ground:
         self.processes: dict[str, Popen[bytes]] = {}
         self.restarts: dict[str, int] = {}
         self._mission: Mission | None = None
-        self._known, self._beaten = 0, float("-inf")
+        self._bus: SharedMemoryBus | None = None
+        self._bridge: Bridge | None = None
+        self._known, self._beaten, self._standing = 0, float("-inf"), "waiting for a flight"
         self._heard = (0, time.monotonic())
 
     def __enter__(self) -> "Ground":
@@ -50,13 +52,11 @@ class Ground:
 
     def __exit__(self, *_: object) -> None:
         """End the learners and leave the bus."""
-        for process in self.processes.values():
-            process.kill()
-            process.wait()
-        if self._mission is not None:
-            self._bus.remove()
-        self._network.close()
-        self._place.cleanup()
+        try:
+            self._end()
+        finally:
+            self._network.close()
+            self._place.cleanup()
 
     def wait(self) -> Iterator[None]:
         """Yield until there is a flight to learn for."""
@@ -65,25 +65,22 @@ class Ground:
             time.sleep(0.05)
 
     def learn(self) -> Iterator[str]:
-        """Learn until the flight is over; yield how it stands, very often."""
-        assert self._mission is not None
-        topics = self._mission.capacities  # a controller without a fitted half has no topic for it
-        out, into = ([topic for topic in carried if topic in topics] for carried in (OUT, INTO))
-        bridge = Bridge(self._network, self._bus, out=out, into=into)
+        """Learn until the flight is over; yield how it stands, very often.
+
+        A flight that is not heard of any more may come back, and another one may begin.
+        """
         while True:
             self._look()
-            if not bridge.step():
+            assert self._bridge is not None
+            if not self._bridge.step():
                 time.sleep(IDLE)
             if time.monotonic() - self._beaten > BEAT_EVERY:
                 self._beaten = time.monotonic()
-                self._beat()
+                self._standing = self._beat()
             if (ended := self._note("ended")) is not None:
                 yield f"flight over: {ended.get('reason', '')}"
                 return
-            if (silent := self._silence()) > SILENCE:
-                yield f"no word of the flight for {silent:.0f} s"
-                return
-            yield self._stands()
+            yield self._standing
 
     def _look(self) -> bool:
         """Take a new mission, if there is one; return whether there is any."""
@@ -95,49 +92,80 @@ class Ground:
             mission = Mission.unpack(message.data)
         except MessageError:
             return self._mission is not None
-        before, self._mission = self._mission, mission
         (self.folder / f"start-{mission.number}.safetensors").write_bytes(mission.start)
-        if before is None:
-            self._bus = SharedMemoryBus.create(mission.capacities)
-            for layer in mission.layers:
-                self._start(layer)
+        before = self._mission
+        if before is None or mission.base != before.base:
+            self._begin(mission)
         elif mission.number > before.number:
+            self._mission = mission
             self.processes["policy"].kill()
             self.processes["policy"].wait()
             self._start("policy")
         return True
 
+    def _begin(self, mission: Mission) -> None:
+        """Learn for a flight that is new."""
+        self._end()
+        self._bus = SharedMemoryBus.create(mission.capacities)
+        topics = mission.capacities  # a controller without a fitted half has no topic for it
+        out, into = ([topic for topic in carried if topic in topics] for carried in (OUT, INTO))
+        self._bridge = Bridge(self._network, self._bus, out=out, into=into)
+        self._mission, self.restarts = mission, {}
+        for layer in mission.layers:
+            self._start(layer)
+
+    def _end(self) -> None:
+        """End the learners of a flight."""
+        for process in self.processes.values():
+            process.kill()
+            process.wait()
+        self.processes = {}
+        if self._bus is not None:
+            self._bus.remove()
+            self._bus = None
+
     def _start(self, layer: Any) -> None:
         m = self._mission
         assert m is not None
+        assert self._bus is not None
         start = self.folder / f"start-{m.number}.safetensors"
-        plan = LearnerPlan(self._bus.folder, layer, start, m.reference, m.seed, m.base, os.getpid())
+        plan = LearnerPlan(self._bus.folder, layer, start, m.reference, m.seed, m.base, os.getpid(), m.floor)
         self.processes[layer] = launch(MAINS[layer], plan, self.folder / f"{layer}.log")
 
-    def _beat(self) -> None:
-        """Tell the flight who is alive, and bring back who is not."""
+    def _beat(self) -> str:
+        """Tell the flight who is alive, bring back who is not, and return how it stands."""
+        assert self._mission is not None
+        failed = ""
         for layer, process in self.processes.items():
-            if process.poll() not in (None, 0) and self.restarts.get(layer, 0) < ATTEMPTS:
+            if process.poll() in (None, 0):
+                continue
+            if self.restarts.get(layer, 0) < ATTEMPTS:
                 self.restarts[layer] = self.restarts.get(layer, 0) + 1
                 self._start(layer)
+            else:
+                failed = f"the {layer} learner on the ground died: {last_words(self.folder / f'{layer}.log')}"
         alive = {layer: process.poll() is None for layer, process in self.processes.items()}
-        self._network.publish("ground", pack_note("ground", alive=alive, restarts=self.restarts))
+        note = pack_note("ground", base=self._mission.base, alive=alive, failed=failed)
+        self._network.publish("ground", note)
+        return failed or self._stands()
+
+    def _stands(self) -> str:
+        if (silent := self._silence()) > SILENCE:
+            return f"no word of the flight for {silent:.0f} s"
+        if not all(self._note(f"ready.{layer}", "ready") is not None for layer in self.processes):
+            return "compiling; the flight waits"
+        done = {layer: (self._note(f"learner.{layer}") or {}).get("learnt", 0) for layer in self.processes}
+        return "learnt: " + ", ".join(f"{layer} {n}" for layer, n in done.items())
 
     def _silence(self) -> float:
-        message = self._bus.latest("status")
+        message = None if self._bus is None else self._bus.latest("status")
         version = 0 if message is None else message.version
         if version != self._heard[0] or not version:
             self._heard = version, time.monotonic()
         return time.monotonic() - self._heard[1]
 
-    def _note(self, topic: str) -> dict[str, Any] | None:
-        message = self._bus.latest(topic)
+    def _note(self, topic: str, kind: str | None = None) -> dict[str, Any] | None:
+        message = None if self._bus is None else self._bus.latest(topic)
         with contextlib.suppress(MessageError):
-            return None if message is None else unpack_note(message.data, topic)
+            return None if message is None else unpack_note(message.data, kind or topic)
         return None
-
-    def _stands(self) -> str:
-        done = {layer: (self._note(f"learner.{layer}") or {}).get("learnt", 0) for layer in self.processes}
-        ready = all(self._bus.latest(f"ready.{layer}") is not None for layer in self.processes)
-        learnt = ", ".join(f"{layer} {n}" for layer, n in done.items())
-        return f"learnt: {learnt}" if ready else "compiling; the flight waits"

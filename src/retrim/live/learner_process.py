@@ -50,6 +50,8 @@ class LearnerPlan:
     base: str
     """Hash of the controller that flies."""
     parent: int
+    floor: int = 0
+    """Version of the policy up to which updates on the bus are older than ``start``."""
 
 
 class LearnerLoop:
@@ -87,6 +89,7 @@ class LearnerLoop:
         if (
             self.plan.layer == "policy"
             and (found := flown_update(self.bus, self.state, "policy", self._status())) is not None
+            and found[0] > self.plan.floor
         ):
             self._flown = [found]
             self._worker.receive(found[1])
@@ -108,7 +111,8 @@ class LearnerLoop:
         self.bus.publish(f"learner.{self.plan.layer}", note)
         if self.plan.layer == "policy" and self._judge():
             return True  # the policy that it was trained from was taken back meanwhile
-        self._publish(update)
+        if self._wanted():
+            self._publish(update)
         return True
 
     def _look(self) -> None:
@@ -133,7 +137,9 @@ class LearnerLoop:
             return
         topic = f"parameters.{layer}"
         before = self.bus.latest(topic)
-        version, parent = (1 if before is None else before.version + 1), (self._flown[-1][0] if self._flown else 0)
+        known = self._status().get("newest", {}).get(layer, 0)  # a bus that is new knows less than who flies
+        version = max(0 if before is None else before.version, known) + 1
+        parent = self._flown[-1][0] if self._flown else 0
         whole = self._learnt_by(update)
         arrays = wire.names(flown(whole.policy.policy.merged(), whole.residual)[layer])
         keep(self.bus, layer, version, update)
@@ -213,7 +219,7 @@ def learn(plan: LearnerPlan) -> None:
     loop = LearnerLoop(plan, bus)
     loop.warm_up()
     loop.catch_up()
-    bus.publish(f"ready.{plan.layer}", pack_note("ready", device=jax.devices()[0].platform))
+    bus.publish(f"ready.{plan.layer}", pack_note("ready", base=plan.base, device=jax.devices()[0].platform))
     while not parent.gone() and bus.latest("ended") is None:
         if not loop.step():
             time.sleep(CHECK_EVERY)

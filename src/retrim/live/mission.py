@@ -25,6 +25,8 @@ class Mission:
     base: str
     """Hash of the controller that flies."""
     layers: tuple[Layer, ...]
+    floor: int
+    """Version of the policy up to which updates are older than ``start``."""
     capacities: Mapping[str, int]
     """Longest message of each topic [bytes]."""
     start: bytes
@@ -32,10 +34,10 @@ class Mission:
 
     @classmethod
     def of(cls, number: int, reference: str | None, seed: int, base: str, layers: tuple[Layer, ...],
-           capacities: Mapping[str, int], start: Path) -> "Mission":  # fmt: skip
+           floor: int, capacities: Mapping[str, int], start: Path) -> "Mission":  # fmt: skip
         """Return the mission of a flight whose learners start from a file."""
         carried = {topic: size for topic, size in capacities.items() if topic in (*OUT, *INTO)}
-        return cls(number, reference, seed, base, layers, carried, start.read_bytes())
+        return cls(number, reference, seed, base, layers, floor, carried, start.read_bytes())
 
     def pack(self) -> bytes:
         """Return the bytes; the inverse of :meth:`unpack`."""
@@ -57,11 +59,12 @@ class Mission:
             capacities = {str(topic): int(size) for topic, size in fields["capacities"].items()}
             reference = None if fields["reference"] is None else str(fields["reference"])
             number, seed, base = int(fields["number"]), int(fields["seed"]), str(fields["base"])
-        except (KeyError, ValueError, TypeError, AttributeError, RecursionError) as error:
+            floor = int(fields["floor"])
+        except (KeyError, ValueError, TypeError, AttributeError, RecursionError, OverflowError) as error:
             raise MessageError(f"mission: a field is missing or wrong ({error})") from error
         if not set(capacities) <= {*OUT, *INTO} or not all(0 < size <= MOST for size in capacities.values()):
             raise MessageError("mission: topics that no flight has, or messages that are too long")
         if not 0 <= length <= MOST:
             raise MessageError(f"mission: a file of {length} bytes")
         arrays = unpack_arrays(data, {"start": np.empty(length, np.uint8)}, kind="mission", source="mission")
-        return cls(number, reference, seed, base, layers, capacities, arrays["start"].tobytes())
+        return cls(number, reference, seed, base, layers, floor, capacities, arrays["start"].tobytes())

@@ -3,6 +3,7 @@
 import contextlib
 import io
 import socket
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -97,9 +98,10 @@ class _Page:
     """Reads the bus for scene and panel, and writes what a person does."""
 
     def __init__(self, spec: PageSpec, bus: Bus, server: Any) -> None:
-        self._bus, self._wishes = bus, dict[str, Any]()
+        self._bus, self._lock = bus, threading.Lock()
+        self._wishes = self._note("wish")  # of a page before this one
         self._scene = Scene(server, spec.path, spec.arm, RATE)
-        self._panel = Panel(server, self._turn, self._wish, spec.methods, spec.mass, RATE)
+        self._panel = Panel(server, self._turn, self._wish, self._knobs(), self._wishes, spec.methods, spec.mass, RATE)
         self._scene.on_pull(self._panel.pull)
         self._tick = -1
 
@@ -114,6 +116,8 @@ class _Page:
             policies = int(status.get("newest", {}).get("policy", 0))
             self._panel.note(sample.t, float(np.linalg.norm(sample.truth[:3] - target)), policies)
         if text and status:
+            if self._bus.latest("fallback") is not None:
+                status["mode"], status["reason"] = "watchdog", "the process that flew is gone or hangs"
             self._panel.show(_text(status, self._note("ended"), self._learners(), self._note("world")))
 
     def _sample(self) -> Sample | None:
@@ -132,12 +136,22 @@ class _Page:
             return {} if message is None else unpack_note(message.data, topic)
         return {}
 
-    def _turn(self, knobs: Knobs) -> None:
-        self._bus.publish("knobs", knobs.pack())
+    def _knobs(self) -> Knobs:
+        """How the knobs stand."""
+        message = self._bus.latest("knobs")
+        with contextlib.suppress(MessageError):
+            return Knobs() if message is None else Knobs.unpack(message.data)
+        return Knobs()
+
+    def _turn(self, turned: Callable[[Knobs], Knobs]) -> None:
+        """Turn knobs from how they stand; people turn them in many threads."""
+        with self._lock:
+            self._bus.publish("knobs", turned(self._knobs()).pack())
 
     def _wish(self, **wish: Any) -> None:
-        self._wishes |= wish
-        self._bus.publish("wish", pack_note("wish", **self._wishes))
+        with self._lock:
+            self._wishes |= wish
+            self._bus.publish("wish", pack_note("wish", **self._wishes))
 
 
 def _text(
@@ -154,7 +168,7 @@ def _text(
     lines.append(f"<span style='color:#d64541'>disturbance</span> {felt} m/s²")
     lines.append(f"<span style='color:#3070d6'>estimate</span> {estimate} m/s²")
     for layer, note in learners.items():
-        lines.append(f"{layer} learner: {note['learnt']} times, {1e3 * note['took']:.0f} ms each")
+        lines.append(f"{layer} learner: {note.get('learnt')} times, {1e3 * float(note.get('took', 0.0)):.0f} ms each")
     if not status.get("learning", True):
         lines.append("what was learnt does not fly")
     if world.get("knobs_refused"):

@@ -2,7 +2,6 @@
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,8 +19,10 @@ class Panel:
     def __init__(
         self,
         server: Any,
-        turn: Callable[[Knobs], None],
+        turn: Callable[[Callable[[Knobs], Knobs]], None],
         wish: Callable[..., None],
+        knobs: Knobs,
+        wishes: dict[str, Any],
         methods: tuple[str, ...],
         mass: float,
         rate: float,
@@ -30,29 +31,32 @@ class Panel:
 
         Args:
             server: The viser server.
-            turn: Called with how the knobs stand.
+            turn: Called with a function from how the knobs stand to how they shall stand.
             wish: Called with ``method`` and ``paused``, or with ``land``.
+            knobs: How the knobs stand.
+            wishes: What was wished before.
             methods: Ways of learning to choose from, the present one first; none if nothing learns.
             mass: Of the vehicle [kg].
             rate: How often the panel is refreshed [Hz].
         """
-        self._told, self._gui = turn, server.gui
-        self._knobs, self._pull = Knobs(), np.zeros(3)
+        self._tell, self._gui, self._pull = turn, server.gui, np.zeros(3)
         self._history: deque[tuple[float, float, float]] = deque(maxlen=round(HISTORY_S * rate))
         self._text = self._gui.add_markdown(WAITING)
         self._plot = _history_plot(self._gui)
         with self._gui.add_folder("World"):
             self._gui.add_markdown("Grab the vehicle with the mouse and pull. Or:")
-            self._push = _vector(self._gui, "push [m/s²]", PUSH, 0.1)
-            self._wind = _vector(self._gui, "wind [m/s]", WIND, 0.5)
+            self._push = _vector(self._gui, "push [m/s²]", knobs.push, PUSH, 0.1)
+            self._wind = _vector(self._gui, "wind [m/s]", knobs.wind, WIND, 0.5)
             most = float(f"{min(LOAD, 0.8 * mass):.2g}")
-            self._load = self._gui.add_slider("load [kg]", 0.0, most, step=most / 50, initial_value=0.0)
+            self._load = self._gui.add_slider(
+                "load [kg]", 0.0, most, step=most / 50, initial_value=min(knobs.load, most)
+            )
             self._rotor = self._gui.add_slider(
                 "rotor",
                 WEAKEST,
                 1.0,
                 step=0.01,
-                initial_value=1.0,
+                initial_value=knobs.rotor,
                 hint="share of its thrust that the front-right rotor keeps",
             )
             kick = self._gui.add_button_group("kick", tuple(KICKS))
@@ -63,8 +67,10 @@ class Panel:
         calm.on_click(lambda _: self._calm())
         with self._gui.add_folder("Learning"):
             if methods:
-                method = self._gui.add_dropdown("method", (*methods, "none"), initial_value=methods[0])
-                paused = self._gui.add_checkbox("pause", initial_value=False)
+                method = self._gui.add_dropdown(
+                    "method", (*methods, "none"), initial_value=wishes.get("method", methods[0])
+                )
+                paused = self._gui.add_checkbox("pause", initial_value=bool(wishes.get("paused")))
                 for choice in (method, paused):
                     choice.on_update(lambda _: wish(method=method.value, paused=paused.value))
             else:
@@ -92,30 +98,28 @@ class Panel:
 
     def _turned(self, kick: tuple[float, float, float] | None = None) -> None:
         push = np.clip(np.asarray(self._push.value) + self._pull, -PUSH, PUSH)
-        self._knobs = Knobs(
-            (float(push[0]), float(push[1]), float(push[2])),
-            self._wind.value,
-            self._load.value,
-            self._rotor.value,
-            kick or self._knobs.kick,
-            self._knobs.kicks + (kick is not None),
-        )
-        self._told(self._knobs)
+
+        def turned(before: Knobs) -> Knobs:
+            return Knobs(
+                (float(push[0]), float(push[1]), float(push[2])),
+                self._wind.value,
+                self._load.value,
+                self._rotor.value,
+                kick or before.kick,
+                before.kicks + (kick is not None),
+            )
+
+        self._tell(turned)
 
     def _calm(self) -> None:
-        for knob, value in (
-            (self._push, (0.0, 0.0, 0.0)),
-            (self._wind, (0.0, 0.0, 0.0)),
-            (self._load, 0.0),
-            (self._rotor, 1.0),
-        ):
+        still = (0.0, 0.0, 0.0)
+        for knob, value in ((self._push, still), (self._wind, still), (self._load, 0.0), (self._rotor, 1.0)):
             knob.value = value
-        self._knobs = replace(Knobs(), kick=self._knobs.kick, kicks=self._knobs.kicks)
-        self._told(self._knobs)
+        self._tell(lambda before: Knobs(kick=before.kick, kicks=before.kicks))
 
 
-def _vector(gui: Any, name: str, bound: float, step: float) -> Any:
-    return gui.add_vector3(name, (0.0, 0.0, 0.0), min=(-bound,) * 3, max=(bound,) * 3, step=step)
+def _vector(gui: Any, name: str, value: tuple[float, float, float], bound: float, step: float) -> Any:
+    return gui.add_vector3(name, value, min=(-bound,) * 3, max=(bound,) * 3, step=step)
 
 
 def _history_plot(gui: Any) -> Any:

@@ -17,13 +17,14 @@ from .spec import LiveSpec
 PRIORITIES = {"control": 30, "watchdog": 40, "plant": 20}
 
 
-def plan_of(role: str, spec: LiveSpec, start: Path, bus: Path, cores: frozenset[int], control: int) -> Any:
+def plan_of(role: str, spec: LiveSpec, start: Path, floor: int, bus: Path, cores: frozenset[int], control: int) -> Any:
     """Return the plan of a role.
 
     Args:
         role: Name.
         spec: Of the flight.
         start: File with what learners go on from.
+        floor: Version of the policy up to which updates are older than it.
         bus: Folder of the bus.
         cores: Those of the processes that must be on time.
         control: The process that flies, once it runs.
@@ -46,4 +47,4 @@ def plan_of(role: str, spec: LiveSpec, start: Path, bus: Path, cores: frozenset[
         assert s.learners is not None
         return BridgePlan(bus, s.learners, parent)
     layer: Layer = "residual" if role == "residual" else "policy"
-    return LearnerPlan(bus, layer, start, s.reference, s.seed, s.controller.base, parent)
+    return LearnerPlan(bus, layer, start, s.reference, s.seed, s.controller.base, parent, floor)

@@ -31,6 +31,8 @@ def check_recording(path: Path) -> Path:
         raise ConfigError(f"--record {path}: the name must end with .mcap")
     if find_spec("rosbags") is None:
         raise ConfigError("--record needs rosbags: pip install 'retrim[mcap]'")
+    if path.is_dir():
+        raise ConfigError(f"--record {path}: it is a folder")
     if not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
         raise ConfigError(f"--record {path}: nothing can be written in {path.parent}")
     return path

@@ -3,6 +3,7 @@
 import contextlib
 import time
 from pathlib import Path
+from typing import Any
 
 from ..errors import MessageError
 from ..onboard.messages import unpack_note
@@ -25,16 +26,38 @@ class RemoteLearners:
     def announce(self, start: Path) -> None:
         """Publish what they have to know; the policy's learner starts again from ``start``."""
         s, self._missions = self._spec, self._missions + 1
-        mission = Mission.of(self._missions, s.reference, s.seed, s.controller.base, s.layers, topics(s), start)
+        message = self._bus.latest("parameters.policy")
+        floor = 0 if message is None else message.version
+        mission = Mission.of(self._missions, s.reference, s.seed, s.controller.base, s.layers, floor, topics(s), start)
         self._bus.publish("mission", mission.pack())
 
     def alive(self) -> dict[str, bool]:
         """Return which learners live, by what their machine said last."""
-        message, said = self._bus.latest("ground"), {}
+        message, said = self._bus.latest("ground"), None
         if message is not None:
             if message.version != self._beat[0]:
                 self._beat = message.version, time.monotonic()
-            with contextlib.suppress(MessageError):
-                said = unpack_note(message.data, "ground").get("alive", {})
+            said = self._said().get("alive")
         fresh = time.monotonic() - self._beat[1] < LOST
-        return {layer: fresh and bool(said.get(layer)) for layer in self._spec.layers}
+        return {layer: fresh and isinstance(said, dict) and bool(said.get(layer)) for layer in self._spec.layers}
+
+    def ready(self, layer: str) -> bool:
+        """Return whether a learner is ready for this flight, and not for an earlier one."""
+        message = self._bus.latest(f"ready.{layer}")
+        with contextlib.suppress(MessageError):
+            return message is not None and unpack_note(message.data, "ready").get("base") == self._spec.controller.base
+        return False
+
+    def failed(self) -> str | None:
+        """Return the last words of a learner that died for good; None if none did."""
+        said = self._said()
+        words = said.get("failed")
+        if said.get("base") != self._spec.controller.base or not isinstance(words, str) or not words:
+            return None
+        return words
+
+    def _said(self) -> dict[str, Any]:
+        message = self._bus.latest("ground")
+        with contextlib.suppress(MessageError):
+            return {} if message is None else unpack_note(message.data, "ground")
+        return {}

@@ -1,7 +1,8 @@
 """From a policy and a scenario to a live flight."""
 
+import secrets
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -76,6 +77,8 @@ def live_spec(request: LiveRequest) -> LiveSpec:
     """
     setup, preset = request.setup, request.setup.preset
     window = max(preset.adapt.window, round(3.0 / preset.dt))
+    if request.learners is not None:
+        _check_remote(request)
     if window > MOST_TICKS:
         raise ConfigError(f"adapt.window = {window} ticks: a live flight reports at most {MOST_TICKS}")
     start = request.folder / "start.safetensors"
@@ -89,6 +92,8 @@ def live_spec(request: LiveRequest) -> LiveSpec:
             raise ConfigError(f"method {request.method!r} is no controller, so it cannot fly live; full and lora learn")
         controller = plain_source(setup, pilot.controller)
         save_learnt(start, learner_state(request, request.policy, "full"), preset)
+    # Parameters and learners of another flight are foreign, even if the same controller flies.
+    controller = replace(controller, base=f"{controller.base}-{secrets.token_hex(4)}")
     return LiveSpec(
         controller=controller,
         layers=LAYERS if request.method in LEARNING else (),
@@ -123,9 +128,22 @@ def learners_at(text: str, say: Callable[[str], None]) -> Address:
     address = Address.of(text)
     if address.kind == "zenoh" and find_spec("zenoh") is None:
         raise ConfigError("a bus by zenoh needs zenoh: pip install 'retrim[zenoh]'")
-    if address.kind == "zenoh" and not address.loopback:
-        say(f"warning: this machine listens on {address.host}; anybody who reaches it may send policies to the vehicle")
+    if not address.loopback:
+        where = address.host if address.kind == "zenoh" else "the network of its rosmaster"
+        say(f"warning: this machine listens on {where}; anybody who reaches it may send policies to the vehicle")
     return address
+
+
+def _check_remote(request: LiveRequest) -> None:
+    """Raise :class:`ConfigError` if learners on another machine cannot learn for a flight."""
+    if request.method not in LEARNING:
+        raise ConfigError(f"--learners: {request.method!r} does not learn; full and lora do")
+    preset = request.setup.preset
+    trained_on = preset.track.reference if preset.track is not None else ""
+    flown_on = request.scenario.reference or ""
+    named = (preset.task, preset.adapt.residual, *trained_on.split("+"), *flown_on.split("+"))
+    if local := sorted({name for name in named if ":" in name or ".csv" in name.lower()}):
+        raise ConfigError(f"--learners: another machine does not have {', '.join(local)}; built-in ones only")
 
 
 def learner_state(request: LiveRequest, policy: Policy, method: str, residual: Any = None) -> LearnerState:

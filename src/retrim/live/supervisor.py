@@ -11,7 +11,7 @@ from subprocess import Popen, TimeoutExpired
 from typing import Any
 
 from ..errors import MessageError, PlantError
-from ..onboard.launch import launch
+from ..onboard.launch import last_words, launch
 from ..onboard.messages import pack_note, unpack_note
 from ..onboard.realtime import cores_of
 from ..transport.message import describe
@@ -23,6 +23,7 @@ from .status import Status
 from .topics import topics
 
 LANDING = 60.0  # [s], after which processes are ended wherever the vehicle is
+FAREWELL = 0.3  # [s] for a message to leave the machine
 ATTEMPTS = 5  # to bring a process back
 LEARN = ("residual", "policy", "recorder", "page", "bridge")
 """Roles that stay off the core of those that must be on time."""
@@ -46,7 +47,7 @@ class Supervisor:
 
     def __enter__(self) -> "Supervisor":
         """Make the bus."""
-        self.bus, self.start = SharedMemoryBus.create(topics(self.spec)), self.spec.start
+        self.bus, self.start, self.floor = SharedMemoryBus.create(topics(self.spec)), self.spec.start, 0
         self._remote = None if self.spec.learners is None else RemoteLearners(self.spec, self.bus)
         self._cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else None
         if self._cores:
@@ -60,6 +61,9 @@ class Supervisor:
             until = time.monotonic() + LANDING
             while self._alive("plant") and not self._note("ended") and time.monotonic() < until:
                 time.sleep(0.05)
+        if self._remote is not None and not self._note("ended"):  # learners elsewhere wait for it
+            self.bus.publish("ended", pack_note("ended", reason="the flight did not come to its end"))
+            time.sleep(FAREWELL)
         if self._cores:
             os.sched_setaffinity(0, self._cores)
         for process in self.processes.values():
@@ -88,8 +92,7 @@ class Supervisor:
         self._start("recorder")
         if self.spec.page is not None:
             self._start("page")
-        needed = [*self.processes, *(self.spec.layers if self._remote is not None else ())]
-        while waiting := [role for role in needed if self.bus.latest(f"ready.{role}") is None]:
+        while waiting := self._not_ready():
             self._check_alive()
             if time.monotonic() - began > READY_S:
                 raise PlantError(f"not ready after {READY_S:g} s: {', '.join(waiting)}; nothing has flown")
@@ -122,7 +125,8 @@ class Supervisor:
 
     def learn_from(self, start: Path) -> None:
         """Start the policy's learner again with what a file holds."""
-        self.start = start
+        self.start, newest = start, self.bus.latest("parameters.policy")
+        self.floor = 0 if newest is None else newest.version
         if self._remote is not None:
             self._remote.announce(start)
             return
@@ -131,6 +135,11 @@ class Supervisor:
         process.wait()
         with contextlib.suppress(OSError):
             self._start("policy")
+
+    @property
+    def landing(self) -> bool:
+        """Whether the order to land was given."""
+        return self._landing
 
     @property
     def page_port(self) -> int | None:
@@ -148,7 +157,7 @@ class Supervisor:
                 with contextlib.suppress(OSError):  # the flight goes on without it
                     self._start(role)
         if ended is None and self.processes["plant"].poll() is not None:
-            ended = f"the plant process is gone: {self._last_words('plant')}"
+            ended = f"the plant process is gone: {last_words(self._complaints('plant'))}"
         alive = {role: process.poll() is None for role, process in self.processes.items()}
         if self._remote is not None:
             alive |= self._remote.alive()
@@ -165,13 +174,21 @@ class Supervisor:
                 self.processes["control"].terminate()  # there is nothing left to fly
             time.sleep(0.02)
 
+    def _not_ready(self) -> list[str]:
+        waiting = [role for role in self.processes if self.bus.latest(f"ready.{role}") is None]
+        if self._remote is not None:
+            waiting += [layer for layer in self.spec.layers if not self._remote.ready(layer)]
+        return waiting
+
     def _alive(self, role: str) -> bool:
         return role in self.processes and self.processes[role].poll() is None
 
     def _check_alive(self) -> None:
+        if self._remote is not None and (failed := self._remote.failed()) is not None:
+            raise PlantError(failed)
         for role in self.processes:
             if not self._alive(role):
-                why = self._note("ended").get("reason") or self._last_words(role)
+                why = self._note("ended").get("reason") or last_words(self._complaints(role))
                 raise PlantError(f"the {role} process ended before take-off: {why}")
 
     def _rejections(self) -> list[str]:
@@ -181,19 +198,22 @@ class Supervisor:
             if message is None:
                 continue
             self._said[layer] = message.version
-            with contextlib.suppress(MessageError, KeyError, ValueError):
+            with contextlib.suppress(MessageError, KeyError, ValueError, TypeError):
                 said = json.loads(describe(message.data, kind="rejected", source=layer)["update"])
                 found.append(f"{layer}: {said['reason']}")
         return found
 
     def _start(self, role: str) -> None:
         cores = cores_of("learn" if role in LEARN else "fly", self._cores)
-        self.processes[role] = launch(self.spec.mains[role], self._plan(role), self.spec.folder / f"{role}.log", cores)
+        self.processes[role] = launch(self.spec.mains[role], self._plan(role), self._complaints(role), cores)
+
+    def _complaints(self, role: str) -> Path:
+        return self.spec.folder / f"{role}.log"
 
     def _plan(self, role: str) -> Any:
         control = self.processes["control"].pid if "control" in self.processes else 0
         fly = frozenset(cores_of("fly", self._cores))
-        return plan_of(role, self.spec, self.start, self.bus.folder, fly, control)
+        return plan_of(role, self.spec, self.start, self.floor, self.bus.folder, fly, control)
 
     def _note(self, topic: str, kind: str | None = None) -> dict[str, Any]:
         message = self.bus.latest(topic)
@@ -201,10 +221,3 @@ class Supervisor:
             return {} if message is None else unpack_note(message.data, kind or topic)
         except MessageError:
             return {}
-
-    def _last_words(self, role: str) -> str:
-        try:
-            lines = (self.spec.folder / f"{role}.log").read_text(errors="replace").strip().splitlines()
-        except OSError:
-            return "it left no word"
-        return lines[-1] if lines else "without a word"

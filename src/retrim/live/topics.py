@@ -12,7 +12,8 @@ def topics(spec: LiveSpec) -> dict[str, int]:
     """Return the longest message of each topic [bytes]."""
     half = {name: sum(a.nbytes for a in arrays.values()) for name, arrays in spec.controller.parameters.items()}
     rows = 8 * len(COLUMNS) * spec.window + 10_000
-    learnt = 2 * spec.start.stat().st_size + 200_000  # a policy of low rank holds its base, too
+    # A policy with the moments of its optimiser, also where what is learnt now is a low-rank part of it.
+    learnt = spec.start.stat().st_size + 3 * half.get("policy", 0) + 200_000
     return (
         dict.fromkeys(SMALL, 4096)
         | {"status": 65536, "flight": rows, "fallback.flight": rows}

@@ -48,7 +48,7 @@ def watched(
             if status.ended is not None or time.monotonic() > landed_by:
                 supervisor.finish()
                 return status
-            if (stop.is_set() or status.t >= seconds) and landed_by == float("inf"):
+            if (stop.is_set() or supervisor.landing or status.t >= seconds) and landed_by == float("inf"):
                 supervisor.land()
                 landed_by = time.monotonic() + LANDING
             time.sleep(EVERY)

@@ -9,6 +9,7 @@ from .messages import Parameters, StaleError
 from .pilot import LivePilot
 from .rollback import FlownError
 
+AHEAD = 1.0  # [s] that parameters may seem to come from the time to come
 REMEMBERED = 50  # swaps in a report, which comes ten times a second
 
 
@@ -24,7 +25,7 @@ class Intake:
             base: Hash of the controller.
             dt: Control tick [s].
         """
-        self.pilot, self.learnt = pilot, 0.0
+        self.pilot = pilot
         self.refused: dict[str, int] = {}
         self.given_up: list[int] = []
         self.newest = dict.fromkeys(pilot.versions, 0)
@@ -32,6 +33,12 @@ class Intake:
         self._bus, self._base = bus, base
         self._known = dict.fromkeys(pilot.versions, 0)
         self._dt, self._flown, self._open = dt, FlownError(dt), True
+        self._computed_from = {0: 0.0}
+
+    @property
+    def learnt(self) -> float:
+        """Flight time of the newest measurement that the policy that flies was learnt from [s]."""
+        return self._computed_from.get(self.pilot.versions.get("policy", 0), 0.0)
 
     @property
     def open(self) -> bool:
@@ -43,8 +50,8 @@ class Intake:
         if learnt == self._open:
             return
         self._open, self._flown = learnt, FlownError(self._dt)
-        if learnt:  # what came last flies again
-            self._known, self.newest = dict.fromkeys(self._known, 0), dict.fromkeys(self.newest, 0)
+        if learnt:
+            self.pilot.resume()
         else:
             self.pilot.restart()
 
@@ -66,7 +73,10 @@ class Intake:
             except MessageError:
                 self.refuse(half)
             else:
-                self._take(found, t)
+                if found.computed_from > t + AHEAD:
+                    self.refuse(f"{half} of a time to come")
+                else:
+                    self._take(found, t)
 
     def watch(self, error: float, missed: float) -> None:
         """Take what a tick of the policy says, and take back what flies clearly worse.
@@ -94,5 +104,7 @@ class Intake:
         self.pilot.swap(found)
         self.swaps.append([t, found.half, found.version, t - found.computed_from])
         if found.half == "policy":
-            self.learnt = found.computed_from
+            self._computed_from[found.version] = found.computed_from
+            for old in sorted(self._computed_from)[1:-REMEMBERED]:
+                del self._computed_from[old]
             self._flown.swapped(found.version)

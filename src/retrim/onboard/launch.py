@@ -42,6 +42,15 @@ def launch(main: str, plan: Any, complaints: Path, cores: set[int] | None = None
     return process
 
 
+def last_words(complaints: Path) -> str:
+    """Return the last line that a process wrote to its standard outputs."""
+    try:
+        lines = complaints.read_text(errors="replace").strip().splitlines()
+    except OSError:
+        return "it left no word"
+    return lines[-1] if lines else "without a word"
+
+
 def main() -> None:
     """Read the plan and run."""
     module, _, name = sys.argv[1].partition(":")

@@ -46,6 +46,7 @@ class LivePilot:
         self._parameters = {half: list(arrays.values()) for half, arrays in source.parameters.items()}
         self.versions = dict.fromkeys(source.parameters, 0)
         self._policies: dict[int, Arrays] = {0: self._parameters["policy"]}  # the last proven one, and all after it
+        self._parked: tuple[dict[str, Arrays], dict[str, int], dict[int, Arrays]] | None = None
         self._memory: Arrays = []
         self._prepared = self._prepare()
         self._old = self._prepared[1]
@@ -103,10 +104,17 @@ class LivePilot:
 
     def restart(self) -> None:
         """Fly with the parameters of take-off from the next tick on."""
+        self._parked = self._parameters, self.versions, self._policies
         self._parameters = {half: list(arrays.values()) for half, arrays in self._source.parameters.items()}
         self.versions = dict.fromkeys(self._source.parameters, 0)
         self._policies = {0: self._parameters["policy"]}
         self._change()
+
+    def resume(self) -> None:
+        """Fly again with what flew before :meth:`restart`."""
+        if self._parked is not None:
+            (self._parameters, self.versions, self._policies), self._parked = self._parked, None
+            self._change()
 
     def expected(self, half: str) -> Mapping[str, Any]:
         """Return what parameters of a half look like."""

@@ -7,7 +7,7 @@ from ..errors import ConfigError
 from .network import NetworkBus
 
 KINDS = ("zenoh", "ros")
-LOOPBACK = ("127.0.0.1", "localhost", "::1")
+LOOPBACK = ("127.0.0.1", "localhost")
 
 
 @dataclass(frozen=True)

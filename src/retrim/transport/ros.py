@@ -38,6 +38,8 @@ class RosBus(NetworkBus):
         except OSError as error:
             raise ConfigError(f"ROS: no rosmaster at {master!r} ({error})") from error
         os.environ["ROS_MASTER_URI"] = master
+        if address.hostname in ("127.0.0.1", "localhost"):  # otherwise its sockets listen everywhere
+            os.environ["ROS_IP"] = "127.0.0.1"
         rospy, message = _rospy()
         super().__init__(capacities)
         self._rospy, self._message = rospy, message
