@@ -99,7 +99,7 @@ def record(plan: RecorderPlan) -> None:
     bus.publish("ready.recorder", pack_note("ready", failed=recorder.failed))
     parent, heard = Lifeline(plan.parent), time.monotonic()
     while not (_landed(bus) or bus.latest("ended") or (parent.gone() and time.monotonic() > heard + SILENCE)):
-        if recorder.step() or bus.latest("sample") is None:
+        if recorder.step() or (bus.latest("sample") is None and not parent.gone()):
             heard = time.monotonic()
         time.sleep(plan.dt)
     recorder.step()
