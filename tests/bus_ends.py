@@ -2,16 +2,13 @@
 
 import atexit
 import functools
-import os
-import shutil
-import socket
-import subprocess
-import tempfile
 import time
+from contextlib import ExitStack
 from typing import NamedTuple
 
 import pytest
 
+from retrim.experiments.latency import free_port, rosmaster
 from retrim.transport.bus import Bus
 from retrim.transport.in_process import InProcessBus
 from retrim.transport.remote import Address
@@ -27,29 +24,15 @@ class Ends(NamedTuple):
     reader: Bus
 
 
-def port():
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return server.getsockname()[1]
-
-
 @functools.cache
 def master():
     """Start a real rosmaster, one for each process, since rospy knows no other; skip the test if there is none."""
-    if shutil.which("rosmaster") is None:
+    stack = ExitStack()
+    atexit.register(stack.close)
+    address = stack.enter_context(rosmaster())
+    if address is None:
         pytest.skip("needs rosmaster and rospy: make test-ros installs them")
-    where = port()
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    words = ["rosmaster", "--core", "-p", str(where)]
-    process = subprocess.Popen(words, env=os.environ | {"ROS_LOG_DIR": tempfile.mkdtemp(), "PYTHONPATH": ""}, **quiet)
-    atexit.register(process.kill)
-    until = time.monotonic() + 30.0
-    while time.monotonic() < until:
-        try:
-            socket.create_connection(("127.0.0.1", where), 1.0).close()
-            break
-        except OSError:
-            time.sleep(0.1)
-    return Address("ros", "127.0.0.1", where)
+    return address
 
 
 def two_ends(backend, topics):
@@ -74,7 +57,7 @@ def network(backend):
     if backend == "ros":
         return master()
     pytest.importorskip("zenoh")
-    return Address("zenoh", "127.0.0.1", port())
+    return Address("zenoh", "127.0.0.1", free_port())
 
 
 def arrived(bus, topic, after=0, data=None, patience=10.0):

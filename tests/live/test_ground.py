@@ -8,10 +8,10 @@ import time
 import numpy as np
 import pytest
 
-from bus_ends import port
 from live.test_faults import Drill, controller, spec_in, whole_log  # noqa: F401
 from live_processes import HOME, DrillPlan, level
 from retrim.errors import MessageError
+from retrim.experiments.latency import free_port as unused_port
 from retrim.live.events import LiveEvents
 from retrim.live.ground import Ground
 from retrim.live.mission import Mission
@@ -49,7 +49,7 @@ def station(address, over):
 @pytest.mark.parametrize("lost", ["ground", "bridge", "page hangs"])
 def test_a_flight_with_learners_elsewhere(tmp_path, controller, lost):  # noqa: F811
     pytest.importorskip("zenoh")
-    address, over = Address("zenoh", "127.0.0.1", port()), threading.Event()
+    address, over = Address("zenoh", "127.0.0.1", unused_port()), threading.Event()
     page = PageSpec("127.0.0.1", free_port("127.0.0.1", 18180), "drill", HOME[None].repeat(2, 0), (), 0.06, 0.19)
     changes = {"learners": address, "seconds": SECONDS, "page": page if lost == "page hangs" else None}
     thread = threading.Thread(target=station, args=(address, over))

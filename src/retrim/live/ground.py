@@ -1,6 +1,5 @@
 """Learners on another machine than the one that flies: a ground station."""
 
-import contextlib
 import os
 import tempfile
 import time
@@ -11,7 +10,7 @@ from typing import Any
 
 from ..errors import MessageError
 from ..onboard.launch import last_words, launch
-from ..onboard.messages import pack_note, unpack_note
+from ..onboard.messages import last_note, pack_note
 from ..onboard.topics import INTO, MOST, OUT
 from ..transport.bridge import Bridge
 from ..transport.remote import Address
@@ -72,12 +71,13 @@ class Ground:
         while True:
             self._look()
             assert self._bridge is not None
+            assert self._bus is not None
             if not self._bridge.step():
                 time.sleep(IDLE)
             if time.monotonic() - self._beaten > BEAT_EVERY:
                 self._beaten = time.monotonic()
                 self._standing = self._beat()
-            if (ended := self._note("ended")) is not None:
+            if ended := last_note(self._bus, "ended"):
                 yield f"flight over: {ended.get('reason', '')}"
                 return
             yield self._standing
@@ -150,11 +150,12 @@ class Ground:
         return failed or self._stands()
 
     def _stands(self) -> str:
+        assert self._bus is not None
         if (silent := self._silence()) > SILENCE:
             return f"no word of the flight for {silent:.0f} s"
-        if not all(self._note(f"ready.{layer}", "ready") is not None for layer in self.processes):
+        if not all(last_note(self._bus, f"ready.{layer}", "ready") for layer in self.processes):
             return "compiling; the flight waits"
-        done = {layer: (self._note(f"learner.{layer}") or {}).get("learnt", 0) for layer in self.processes}
+        done = {layer: last_note(self._bus, f"learner.{layer}").get("learnt", 0) for layer in self.processes}
         return "learnt: " + ", ".join(f"{layer} {n}" for layer, n in done.items())
 
     def _silence(self) -> float:
@@ -163,9 +164,3 @@ class Ground:
         if version != self._heard[0] or not version:
             self._heard = version, time.monotonic()
         return time.monotonic() - self._heard[1]
-
-    def _note(self, topic: str, kind: str | None = None) -> dict[str, Any] | None:
-        message = None if self._bus is None else self._bus.latest(topic)
-        with contextlib.suppress(MessageError):
-            return None if message is None else unpack_note(message.data, kind or topic)
-        return None

@@ -21,7 +21,7 @@ from ..config.setup import Setup
 from ..errors import MessageError
 from ..experiments.compile_cache import enable_compile_cache
 from ..io.trained import load_learnt
-from ..onboard.messages import COMMAND, MEASURED, FlightRows, Parameters, pack_note, unpack_note
+from ..onboard.messages import COMMAND, MEASURED, FlightRows, Parameters, last_note, pack_note
 from ..onboard.realtime import Lifeline
 from ..physics.state import Command, State
 from ..transport import wire
@@ -178,18 +178,13 @@ class LearnerLoop:
         return back
 
     def _status(self) -> dict[str, Any]:
-        return self._note("status")
+        return last_note(self.bus, "status")
 
     def _wanted(self) -> bool:
         """Nobody takes what is learnt after the policy has flown; what was flown last would be lost."""
-        return self._status().get("mode", "policy") == "policy" and not self._note("learning").get("paused", False)
-
-    def _note(self, topic: str) -> dict[str, Any]:
-        message = self.bus.latest(topic)
-        try:
-            return {} if message is None else unpack_note(message.data, topic)
-        except MessageError:
-            return {}
+        return self._status().get("mode", "policy") == "policy" and not last_note(self.bus, "learning").get(
+            "paused", False
+        )
 
     def _take_residual(self) -> None:
         """Take note of the newest fit, if it is new."""

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import ConfigError, MessageError
-from ..onboard.messages import Sample, pack_note, unpack_note
+from ..onboard.messages import Sample, last_note, pack_note
 from ..onboard.realtime import Lifeline
 from ..transport.bus import Bus
 from ..transport.remote import LOOPBACK
@@ -99,7 +99,7 @@ class _Page:
 
     def __init__(self, spec: PageSpec, bus: Bus, server: Any) -> None:
         self._bus, self._lock = bus, threading.Lock()
-        self._wishes = self._note("wish")  # of a page before this one
+        self._wishes = last_note(self._bus, "wish")  # of a page before this one
         self._scene = Scene(server, spec.path, spec.arm, RATE)
         self._panel = Panel(server, self._turn, self._wish, self._knobs(), self._wishes, spec.methods, spec.mass, RATE)
         self._scene.on_pull(self._panel.pull)
@@ -107,7 +107,7 @@ class _Page:
 
     def refresh(self, *, text: bool) -> None:
         """Show what is new."""
-        status, sample = self._note("status"), self._sample()
+        status, sample = last_note(self._bus, "status"), self._sample()
         if sample is not None and sample.tick != self._tick:
             self._tick = sample.tick
             felt, estimate = (np.asarray(status.get(name, (0.0, 0.0, 0.0))) for name in ("felt", "estimate"))
@@ -118,7 +118,9 @@ class _Page:
         if text and status:
             if self._bus.latest("fallback") is not None:
                 status["mode"], status["reason"] = "watchdog", "the process that flew is gone or hangs"
-            self._panel.show(_text(status, self._note("ended"), self._learners(), self._note("world")))
+            self._panel.show(
+                _text(status, last_note(self._bus, "ended"), self._learners(), last_note(self._bus, "world"))
+            )
 
     def _sample(self) -> Sample | None:
         message = self._bus.latest("sample")
@@ -127,14 +129,8 @@ class _Page:
         return None
 
     def _learners(self) -> dict[str, dict[str, Any]]:
-        found = {layer: self._note(f"learner.{layer}") for layer in ("residual", "policy")}
+        found = {layer: last_note(self._bus, f"learner.{layer}") for layer in ("residual", "policy")}
         return {layer: note for layer, note in found.items() if note}
-
-    def _note(self, topic: str) -> dict[str, Any]:
-        message = self._bus.latest(topic)
-        with contextlib.suppress(MessageError):
-            return {} if message is None else unpack_note(message.data, topic)
-        return {}
 
     def _knobs(self) -> Knobs:
         """How the knobs stand."""

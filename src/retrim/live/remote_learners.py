@@ -1,12 +1,9 @@
 """Learners on another machine, as the flight sees them."""
 
-import contextlib
 import time
 from pathlib import Path
-from typing import Any
 
-from ..errors import MessageError
-from ..onboard.messages import unpack_note
+from ..onboard.messages import last_note
 from ..transport.bus import Bus
 from .mission import Mission
 from .spec import LiveSpec
@@ -37,27 +34,18 @@ class RemoteLearners:
         if message is not None:
             if message.version != self._beat[0]:
                 self._beat = message.version, time.monotonic()
-            said = self._said().get("alive")
+            said = last_note(self._bus, "ground").get("alive")
         fresh = time.monotonic() - self._beat[1] < LOST
         return {layer: fresh and isinstance(said, dict) and bool(said.get(layer)) for layer in self._spec.layers}
 
     def ready(self, layer: str) -> bool:
         """Return whether a learner is ready for this flight, and not for an earlier one."""
-        message = self._bus.latest(f"ready.{layer}")
-        with contextlib.suppress(MessageError):
-            return message is not None and unpack_note(message.data, "ready").get("base") == self._spec.controller.base
-        return False
+        return last_note(self._bus, f"ready.{layer}", "ready").get("base") == self._spec.controller.base
 
     def failed(self) -> str | None:
         """Return the last words of a learner that died for good; None if none did."""
-        said = self._said()
+        said = last_note(self._bus, "ground")
         words = said.get("failed")
         if said.get("base") != self._spec.controller.base or not isinstance(words, str) or not words:
             return None
         return words
-
-    def _said(self) -> dict[str, Any]:
-        message = self._bus.latest("ground")
-        with contextlib.suppress(MessageError):
-            return {} if message is None else unpack_note(message.data, "ground")
-        return {}

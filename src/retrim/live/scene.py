@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 RED, BLUE, GREY, GREEN, DARK = (214, 69, 65), (48, 112, 214), (150, 150, 150), (60, 160, 90), (45, 45, 50)
 METRES = 0.25  # of an arrow, for each m/s^2
@@ -87,16 +88,9 @@ class Scene:
 
 
 def quaternion(R: np.ndarray) -> tuple[float, float, float, float]:
-    """Return an attitude as a unit quaternion, real part first (Shepperd's method)."""
-    t = np.array([np.trace(R), *np.diag(R)])
-    i = int(np.argmax(t))
-    x, y, z = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
-    xy, xz, yz = R[0, 1] + R[1, 0], R[0, 2] + R[2, 0], R[1, 2] + R[2, 1]
-    one = 1.0 + 2.0 * t[i] - t[0]
-    rows = ((1.0 + t[0], x, y, z), (x, one, xy, xz), (y, xy, one, yz), (z, xz, yz, one))
-    q = np.array(rows[i])
-    w, a, b, c = q / np.linalg.norm(q)
-    return float(w), float(a), float(b), float(c)
+    """Return an attitude as a unit quaternion, real part first."""
+    x, y, z, w = Rotation.from_matrix(R).as_quat()
+    return float(w), float(x), float(y), float(z)
 
 
 def _quadrotor(scene: Any, arm: float) -> None:

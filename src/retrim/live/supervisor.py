@@ -12,7 +12,7 @@ from typing import Any
 
 from ..errors import MessageError, PlantError
 from ..onboard.launch import last_words, launch
-from ..onboard.messages import pack_note, unpack_note
+from ..onboard.messages import last_note, pack_note
 from ..onboard.realtime import cores_of
 from ..transport.message import describe
 from ..transport.shared_memory import SharedMemoryBus
@@ -56,12 +56,12 @@ class Supervisor:
 
     def __exit__(self, *_: object) -> None:
         """Land what still flies, end what still runs, and take the bus away."""
-        if self.epoch is not None and self._alive("plant") and not self._note("ended"):
+        if self.epoch is not None and self._alive("plant") and not last_note(self.bus, "ended"):
             self.land()
             until = time.monotonic() + LANDING
-            while self._alive("plant") and not self._note("ended") and time.monotonic() < until:
+            while self._alive("plant") and not last_note(self.bus, "ended") and time.monotonic() < until:
                 time.sleep(0.05)
-        if self._remote is not None and not self._note("ended"):  # learners elsewhere wait for it
+        if self._remote is not None and not last_note(self.bus, "ended"):  # learners elsewhere wait for it
             self.bus.publish("ended", pack_note("ended", reason="the flight did not come to its end"))
             time.sleep(FAREWELL)
         if self._cores:
@@ -98,10 +98,10 @@ class Supervisor:
                 raise PlantError(f"not ready after {READY_S:g} s: {', '.join(waiting)}; nothing has flown")
             yield ", ".join(waiting), time.monotonic() - began
             time.sleep(0.1)
-        if failed := self._note("ready.recorder", "ready").get("failed"):
+        if failed := last_note(self.bus, "ready.recorder", "ready").get("failed"):
             raise PlantError(f"the flight cannot be written down: {failed}")
         for role in ("control", "plant", "watchdog"):
-            self.refused[role] = self._note(f"ready.{role}", "ready").get("refused", [])
+            self.refused[role] = last_note(self.bus, f"ready.{role}", "ready").get("refused", [])
 
     def take_off(self) -> None:
         """Give the order; the first tick is half a second away, the same for all.
@@ -144,12 +144,12 @@ class Supervisor:
     @property
     def page_port(self) -> int | None:
         """Where the page is; None if there is none."""
-        return self._note("ready.page", "ready").get("port")
+        return last_note(self.bus, "ready.page", "ready").get("port")
 
     def watch(self) -> Status:
         """Bring back processes that have died and may; return how the flight stands."""
         assert self.epoch is not None
-        ended = self._note("ended").get("reason")
+        ended = last_note(self.bus, "ended").get("reason")
         for role, process in self.processes.items():
             died = process.poll() not in (None, 0)  # who ends by itself says that the flight is over
             if role in RESTARTED and died and ended is None and self.restarts.get(role, 0) < ATTEMPTS:
@@ -161,8 +161,8 @@ class Supervisor:
         alive = {role: process.poll() is None for role, process in self.processes.items()}
         if self._remote is not None:
             alive |= self._remote.alive()
-        control, world = self._note("status"), self._note("world")
-        failed = self._note("ready.recorder", "ready").get("failed")
+        control, world = last_note(self.bus, "status"), last_note(self.bus, "world")
+        failed = last_note(self.bus, "ready.recorder", "ready").get("failed")
         t, watchdog = time.monotonic() - self.epoch, self.bus.latest("fallback") is not None
         return Status(t, control, world, alive, dict(self.restarts), ended, self._rejections(), watchdog, failed)
 
@@ -188,7 +188,7 @@ class Supervisor:
             raise PlantError(failed)
         for role in self.processes:
             if not self._alive(role):
-                why = self._note("ended").get("reason") or last_words(self._complaints(role))
+                why = last_note(self.bus, "ended").get("reason") or last_words(self._complaints(role))
                 raise PlantError(f"the {role} process ended before take-off: {why}")
 
     def _rejections(self) -> list[str]:
@@ -214,10 +214,3 @@ class Supervisor:
         control = self.processes["control"].pid if "control" in self.processes else 0
         fly = frozenset(cores_of("fly", self._cores))
         return plan_of(role, self.spec, self.start, self.floor, self.bus.folder, fly, control)
-
-    def _note(self, topic: str, kind: str | None = None) -> dict[str, Any]:
-        message = self.bus.latest(topic)
-        try:
-            return {} if message is None else unpack_note(message.data, kind or topic)
-        except MessageError:
-            return {}

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import MessageError
+from ..transport.bus import Bus
 from ..transport.message import ArrayLike, describe, pack_arrays, unpack_arrays
 
 STATE = 15  # p, R by rows, v
@@ -196,3 +197,18 @@ def unpack_note(data: bytes, kind: str) -> dict[str, Any]:
     if not isinstance(fields, dict):
         raise MessageError(f"{kind}: no fields")
     return fields
+
+
+def last_note(bus: Bus, topic: str, kind: str | None = None) -> dict[str, Any]:
+    """Return the fields of the last small message of a topic; none if there is none, or if it is damaged.
+
+    Args:
+        bus: Where it was published.
+        topic: Name.
+        kind: What it should be; by default what the topic is called.
+    """
+    message = bus.latest(topic)
+    try:
+        return {} if message is None else unpack_note(message.data, kind or topic)
+    except MessageError:
+        return {}

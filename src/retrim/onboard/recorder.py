@@ -9,7 +9,7 @@ import numpy as np
 from ..errors import MessageError
 from ..transport.bus import Bus
 from ..transport.shared_memory import SharedMemoryBus
-from .messages import COLUMNS, FlightRows, pack_note, unpack_note
+from .messages import COLUMNS, FlightRows, last_note, pack_note
 from .realtime import Lifeline
 
 SILENCE = 2.0  # [s] without a tick, after which a flight without a supervisor is over
@@ -108,8 +108,4 @@ def record(plan: RecorderPlan) -> None:
 
 
 def _landed(bus: Bus) -> bool:
-    message = bus.latest("status")
-    try:
-        return message is not None and unpack_note(message.data, "status").get("mode") == "landed"
-    except MessageError:
-        return False
+    return last_note(bus, "status").get("mode") == "landed"
