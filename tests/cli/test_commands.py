@@ -199,6 +199,6 @@ def test_a_user_s_own_task_is_pretrained_and_flown_by_its_file(folder, monkeypat
     ],
 )
 def test_words_that_name_a_module_of_the_user(word, names):
-    from retrim.cli.main import _names_a_module
+    from retrim.config.registry import _names_a_module
 
     assert _names_a_module(word) is names

@@ -1,20 +1,18 @@
 """``retrim fly``."""
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 from ..config.loading import changed, overlaid
-from ..config.presets import Preset
 from ..config.scenario import Scenario
 from ..config.setup import Latency, Setup
 from ..errors import ConfigError
 from ..experiments.asked import flown_reference, loaded, same_policy
 from ..experiments.figures import picture
 from ..experiments.fleet import Fleet, told_by
-from ..experiments.flights import Flight
 from ..experiments.interrupts import interrupts_only_set
-from ..experiments.metrics import cell, rows
+from ..experiments.metrics import cell, notes, rows
 from ..experiments.outputs import clear_outputs, write_events, write_learnt, write_logs
 from ..experiments.run import INTERRUPTED, Run
 from ..experiments.tables.document import TableSection
@@ -117,21 +115,10 @@ def _fly(fleet: Fleet, setup: Setup, scenario: Scenario, run: Run) -> int:
     title = f"{kind} error [m], last {steady:g} s of {fleet.seconds:g} s, {n} start{'s' * (n > 1)}"
     lines = tuple((row["disturbance"], row["method"], cell(row)) for row in found)
     show_table(TableSection(("disturbance", "method", "error"), lines, title))
-    _notes(flights, setup.preset)
+    for note in notes(flights, preset):
+        console.print(note, markup=False, soft_wrap=True)
     show_paths([*picture(flights, setup, scenario, run.folder), run.folder / "results.json"])
     return run.exit_code
-
-
-def _notes(flights: Sequence[Flight], preset: Preset) -> None:
-    """Say which flights crashed, and where no update took effect."""
-    for flight in flights:
-        if flight.log.terminated:
-            about = f"{flight.spec.method}, start {flight.spec.start}"
-            console.print(f"crashed: {about}, after {flight.log.t[-1]:.2f} s: {flight.events[-1].note}", markup=False)
-    learning = [f for f in flights if f.learnt is not None]
-    if learning and not any(f.swaps for f in learning):
-        first = preset.adapt.update_every + preset.adapt.update_latency
-        console.print(f"no policy update took effect; with fixed latencies the first one comes at {first:g} s")
 
 
 def _warn(setup: Setup, scenario: Scenario) -> None:

@@ -20,24 +20,21 @@ from ..experiments.asked import flown_reference, loaded
 from ..experiments.figures import picture
 from ..experiments.interrupts import interrupts_only_set
 from ..experiments.limits import check_seeds
-from ..experiments.outputs import clear_outputs
 from ..experiments.run import INTERRUPTED, Run
 from ..experiments.tables.document import TableSection
 from ..experiments.training import train
-from ..live.display import live_line, live_rows
+from ..live.display import figures, live_line, live_rows
 from ..live.events import LiveEvents
 from ..live.flying import fly_live
 from ..live.page import page_address
 from ..live.recording import check_recording
-from ..live.session import LiveRequest, learners_at
+from ..live.session import LONGEST, LiveRequest, check_limits, learners_at
 from ..live.status import Status
 from ..runtime.events import Event
 from ..transport.remote import LOOPBACK
 from .console import RichReporter, console, show_paths, show_table, started
 
-LONGEST = 3600.0  # [s]
 LINE_EVERY = 5.0  # [s], where the output is no terminal
-UNITS = {"steady": "m", "recovery_5cm": "s", "flight_to_swap_s": "s"}
 
 
 def live(
@@ -99,16 +96,11 @@ def live(
 
     def ordered(stop: threading.Event) -> int:
         check_seeds([seed])
-        if policy_age is not None and not policy_age > 0.0:
-            raise ConfigError(f"--policy-age {policy_age:g} s must be positive")
         if record is not None:
             check_recording(record)
         if page and no_page:
             raise ConfigError("--page and --no-page: choose one")
-        if not 0.5 <= fence <= 1000.0:
-            raise ConfigError(f"--fence {fence:g} m must be between 0.5 and 1000")
-        if seconds is not None and not 1.0 <= seconds <= LONGEST:
-            raise ConfigError(f"--seconds {seconds:g} must be between 1 and {LONGEST:g}")
+        check_limits(fence, seconds, policy_age)
         wanted = page or (seconds is None and not no_page)
         address = page_address(page_host, page_port, demanded=page, say=RichReporter().say) if wanted else None
         ground = learners_at(learners, RichReporter().say) if learners is not None else None
@@ -128,10 +120,6 @@ def live(
                 console.print(f"interrupted while pretraining, after {len(losses)} steps; nothing has flown")
                 return INTERRUPTED
         method = "base" if adapt == "none" else adapt
-        run.folder.mkdir(parents=True, exist_ok=True)
-        clear_outputs(run.folder)
-        for old in (*run.folder.glob("*.log"), run.folder / "flight.csv"):
-            old.unlink(missing_ok=True)
         request = LiveRequest(
             setup, weights, scenario, method, seconds or LONGEST, seed, fence, run.folder, state, address, ground,
             policy_age=policy_age or float("inf"), record=record,
@@ -147,8 +135,7 @@ def _fly(request: LiveRequest, run: Run) -> int:
     done = fly_live(request, run, RichReporter(), _display, _open_page)
     if done is None:
         return INTERRUPTED
-    lines = tuple((row["metric"], UNITS.get(row["metric"], ""), _shown(row["value"])) for row in done.rows)
-    show_table(TableSection(("figure", "unit", "value"), lines, f"live, {done.flight.log.t[-1]:.1f} s"))
+    show_table(TableSection(("figure", "unit", "value"), figures(done.rows), f"live, {done.flight.log.t[-1]:.1f} s"))
     drawn = picture([done.flight], request.setup, request.scenario, run.folder, stem="live")
     show_paths([*drawn[:1], *done.paths])
     return run.exit_code
@@ -186,7 +173,3 @@ def _screen(status: Status, events: LiveEvents) -> Table:
     for row in live_rows(status, events):
         table.add_row(*row)
     return table
-
-
-def _shown(value: object) -> str:
-    return "-" if value is None else f"{value:.3f}" if isinstance(value, float) else str(value)

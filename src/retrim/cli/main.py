@@ -87,6 +87,7 @@ def _command(name: str, words: list[str], stop: threading.Event) -> int:
 
     import tyro
 
+    from ..config.registry import told_of_own_module
     from ..errors import RetrimError
     from ..experiments.compile_cache import enable_compile_cache
     from .console import console, refuse
@@ -112,33 +113,14 @@ def _command(name: str, words: list[str], stop: threading.Event) -> int:
     except MemoryError:
         return refuse("out of memory; use fewer --starts, smaller networks or a shorter horizon")
     except Exception as error:
-        place = _place(error)
-        if not place and not any(_names_a_module(word) for word in words):
+        own = told_of_own_module(error, words)
+        if own is None:
             raise
-        # A module of the user's own takes part: its mistakes are his to read, not a stack of ours.
-        return refuse(f"{place}{type(error).__name__}: {error}; retrim.testing.check_... names a broken law")
+        return refuse(own)
     if stop.is_set():
         console.print("interrupted; what was done is kept, if anything was")
         return code or 130
     return code
-
-
-def _names_a_module(word: str) -> bool:
-    """Whether a word has a module:name in it; file.csv:once is none."""
-    import re
-
-    return re.search(r"(^|[=+])[A-Za-z_][\w.]*(?<!\.csv):[A-Za-z_]\w*", word) is not None
-
-
-def _place(error: Exception) -> str:
-    """The last place of a user's own file in the traceback, if there is one."""
-    import traceback
-    from pathlib import Path
-
-    here = str(Path.cwd())
-    frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename.startswith(here)]
-    own = [f for f in frames if "site-packages" not in f.filename and "/src/retrim/" not in f.filename]
-    return f"{own[-1].filename}, line {own[-1].lineno}: " if own else ""
 
 
 @contextlib.contextmanager

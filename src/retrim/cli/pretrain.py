@@ -1,20 +1,15 @@
 """``retrim pretrain``."""
 
-import dataclasses
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import tyro
 
-from ..config.loading import changed, load_for, overlaid
 from ..config.presets import Preset
 from ..config.setup import Setup
-from ..config.tasks import find_task
-from ..config.vehicle_file import VehicleSpec
-from ..config.vehicles import vehicle_from
-from ..errors import CheckpointError, ConfigError
+from ..errors import CheckpointError
+from ..experiments.asked import asked_preset
 from ..experiments.limits import check_seeds
 from ..experiments.outputs import write_trained
 from ..experiments.run import INTERRUPTED, Run
@@ -51,29 +46,13 @@ def pretrain(
 
     def ordered(stop: threading.Event) -> int:
         check_seeds([seed])
-        entry = find_task(task)
-        chosen = load_for(task, preset or entry.default_preset)
-        if config is not None:
-            chosen = overlaid(chosen, config)
-        if reference is not None:
-            if not entry.has_reference:
-                raise ConfigError(f"--reference {reference}: a {task} policy follows none")
-            chosen = changed(chosen, track={**_table(chosen.track), "reference": reference})
-        changes: dict[str, Any] = {k: v for k, v in (("num_updates", updates), ("num_envs", envs)) if v is not None}
-        chosen = changed(chosen, pretrain=changes)
-        if residual is not None:
-            chosen = changed(chosen, adapt={"residual": residual})
-        if vehicle is not None:
-            found = vehicle_from(vehicle)
-            chosen = changed(chosen, vehicle=_table(found) if isinstance(found, VehicleSpec) else found)
+        chosen = asked_preset(
+            task, preset, config=config, vehicle=vehicle, reference=reference, residual=residual,
+            num_updates=updates, num_envs=envs,
+        )  # fmt: skip
         return _pretrain(chosen, seed, out, stop)
 
     return ordered
-
-
-def _table(value: Any) -> dict[str, Any]:
-    """A dataclass as a plain dictionary; None as an empty one."""
-    return {} if value is None else dataclasses.asdict(value)
 
 
 def _pretrain(preset: Preset, seed: int, out: Path | None, stop: threading.Event) -> int:

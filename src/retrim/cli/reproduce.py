@@ -42,15 +42,4 @@ def command_of(make: Callable[..., None], called: str = "reproduce") -> Callable
     return command
 
 
-MADE = (
-    tables.hover,
-    tables.reversing,
-    tables.tracking,
-    tables.vision,
-    tables.plants,
-    tables.model,
-    tables.fast,
-    tables.ablation,
-    tables.buses,
-)
-COMMANDS: dict[str, Callable[..., Ordered]] = {make.__name__: command_of(make) for make in MADE}
+COMMANDS: dict[str, Callable[..., Ordered]] = {make.__name__: command_of(make) for make in tables.MADE}

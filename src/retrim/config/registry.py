@@ -5,8 +5,10 @@ imported from the Python path or the current folder.
 """
 
 import importlib
+import re
 import sys
-from collections.abc import Iterator, Mapping
+import traceback
+from collections.abc import Iterator, Mapping, Sequence
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Generic, TypeVar
@@ -80,3 +82,26 @@ class Registry(Mapping[str, T], Generic[T]):
     def __len__(self) -> int:
         """Return the number of registered names."""
         return len(self._known)
+
+
+def told_of_own_module(error: Exception, words: Sequence[str]) -> str | None:
+    """Return one line on an error in which a module of the user's own takes part, and None on another.
+
+    Its mistakes are its author's to read, not a stack of ours.
+
+    Args:
+        error: What was raised.
+        words: Those of the command line; one with ``module:name`` in it names such a module.
+    """
+    here = str(Path.cwd())
+    frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename.startswith(here)]
+    own = [f for f in frames if "site-packages" not in f.filename and "/src/retrim/" not in f.filename]
+    if not own and not any(_names_a_module(word) for word in words):
+        return None
+    place = f"{own[-1].filename}, line {own[-1].lineno}: " if own else ""
+    return f"{place}{type(error).__name__}: {error}; retrim.testing.check_... names a broken law"
+
+
+def _names_a_module(word: str) -> bool:
+    """Whether a word has a module:name in it; file.csv:once is none."""
+    return re.search(r"(^|[=+])[A-Za-z_][\w.]*(?<!\.csv):[A-Za-z_]\w*", word) is not None

@@ -1,9 +1,15 @@
-"""What a command is asked to fly: weights, preset and reference, from files and names, checked against each other."""
+"""What a command is asked for: weights, preset and reference, from files and names, checked against each other."""
 
+import dataclasses
 from pathlib import Path
+from typing import Any
 
 from ..adapt.learner import LearnerState
+from ..config.loading import changed, load_for, overlaid
 from ..config.presets import Preset
+from ..config.tasks import find_task
+from ..config.vehicle_file import VehicleSpec
+from ..config.vehicles import vehicle_from
 from ..control.policy import Policy
 from ..errors import ConfigError
 from ..io.checkpoint import load_delta
@@ -78,3 +84,49 @@ def same_policy(trained: Preset, changed_one: Preset, config: Path) -> Preset:
             f"{config}: track.observation = {after_sees!r}, but the policy was trained with {before_sees!r}"
         )
     return changed_one
+
+
+def asked_preset(
+    task: str,
+    preset: str | None = None,
+    *,
+    config: Path | None = None,
+    vehicle: str | None = None,
+    reference: str | None = None,
+    residual: str | None = None,
+    **pretrain: int | None,
+) -> Preset:
+    """Return the preset to train with.
+
+    Args:
+        task: Name of a task.
+        preset: Name of a preset; by default the task's own.
+        config: TOML file on top of it.
+        vehicle: Vehicle to train for, on top of both.
+        reference: What to track, on top of both.
+        residual: Residual model of later adaptation, on top of both.
+        **pretrain: Values of the table ``pretrain``, on top of both; None for those that stay.
+
+    Raises:
+        ConfigError: A name, key or value does not fit.
+    """
+    entry = find_task(task)
+    chosen = load_for(task, preset or entry.default_preset)
+    if config is not None:
+        chosen = overlaid(chosen, config)
+    if reference is not None:
+        if not entry.has_reference:
+            raise ConfigError(f"--reference {reference}: a {task} policy follows none")
+        chosen = changed(chosen, track={**_table(chosen.track), "reference": reference})
+    chosen = changed(chosen, pretrain={name: value for name, value in pretrain.items() if value is not None})
+    if residual is not None:
+        chosen = changed(chosen, adapt={"residual": residual})
+    if vehicle is not None:
+        found = vehicle_from(vehicle)
+        chosen = changed(chosen, vehicle=_table(found) if isinstance(found, VehicleSpec) else found)
+    return chosen
+
+
+def _table(value: Any) -> dict[str, Any]:
+    """A dataclass as a plain dictionary; None as an empty one."""
+    return {} if value is None else dataclasses.asdict(value)

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from ..config.presets import Preset
 from .flights import Flight
 
 
@@ -106,3 +107,17 @@ def cell(row: dict[str, Any], digits: int = 3) -> str:
 def _finite(value: float) -> float | None:
     """JSON has no infinity: None."""
     return value if np.isfinite(value) else None
+
+
+def notes(flights: Sequence[Flight], preset: Preset) -> list[str]:
+    """Return which flights crashed, and whether no update took effect, a line each."""
+    lines = []
+    for flight in flights:
+        if flight.log.terminated:
+            about = f"{flight.spec.method}, start {flight.spec.start}"
+            lines.append(f"crashed: {about}, after {flight.log.t[-1]:.2f} s: {flight.events[-1].note}")
+    learning = [flight for flight in flights if flight.learnt is not None]
+    if learning and not any(flight.swaps for flight in learning):
+        first = preset.adapt.update_every + preset.adapt.update_latency
+        lines.append(f"no policy update took effect; with fixed latencies the first one comes at {first:g} s")
+    return lines

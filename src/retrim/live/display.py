@@ -1,7 +1,12 @@
 """A live flight in words."""
 
+from collections.abc import Sequence
+from typing import Any
+
 from .events import LiveEvents
 from .status import Status
+
+UNITS = {"steady": "m", "recovery_5cm": "s", "flight_to_swap_s": "s"}
 
 
 def live_line(status: Status) -> str:
@@ -31,3 +36,12 @@ def live_rows(status: Status, events: LiveEvents) -> list[tuple[str, str]]:
     if events.all:
         rows.append(("last event", f"{events.all[-1].t:.1f} s {events.all[-1].kind}: {events.all[-1].note}"))
     return rows
+
+
+def figures(rows: Sequence[dict[str, Any]]) -> tuple[tuple[str, str, str], ...]:
+    """Return figure, unit and value of each row of the results."""
+    return tuple((row["metric"], UNITS.get(row["metric"], ""), _shown(row["value"])) for row in rows)
+
+
+def _shown(value: object) -> str:
+    return "-" if value is None else f"{value:.3f}" if isinstance(value, float) else str(value)

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..adapt.learner import LearnerState
 from ..experiments.flights import Flight
-from ..experiments.outputs import write_events, write_learnt
+from ..experiments.outputs import clear_outputs, write_events, write_learnt
 from ..experiments.reporter import Reporter
 from ..experiments.run import Run
 from ..runtime.events import Event
@@ -56,6 +56,10 @@ def fly_live(
         ConfigError: The method cannot be flown live.
         PlantError: The flight could not begin, or left no log.
     """
+    run.folder.mkdir(parents=True, exist_ok=True)
+    clear_outputs(run.folder)
+    for old in (*run.folder.glob("*.log"), run.folder / "flight.csv"):
+        old.unlink(missing_ok=True)
     events = LiveEvents()
     with ExitStack() as screen:  # it closes last, since a terminal that stands still would keep everything else waiting
         with Supervisor(live_spec(request)) as supervisor:

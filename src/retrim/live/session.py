@@ -34,6 +34,26 @@ LAYERS: tuple[Layer, ...] = ("residual", "policy")
 LEARNING = ("full", "lora")
 PATH_S = 20.0  # [s] of the reference that the page draws
 BELOW_GROUND = 0.3  # [m], by which a fence lies below z = 0: starts may lie there, and a transient dips
+LONGEST = 3600.0  # [s]
+
+
+def check_limits(fence: float, seconds: float | None, policy_age: float | None) -> None:
+    """Check the numbers of a live flight, before anything is trained.
+
+    Args:
+        fence: How far from the reference the vehicle may be [m].
+        seconds: Length; None for until it is stopped.
+        policy_age: How old the flight may be that the policy was learnt from [s]; None for any age.
+
+    Raises:
+        ConfigError: One of them cannot be.
+    """
+    if policy_age is not None and not policy_age > 0.0:
+        raise ConfigError(f"--policy-age {policy_age:g} s must be positive")
+    if not 0.5 <= fence <= 1000.0:
+        raise ConfigError(f"--fence {fence:g} m must be between 0.5 and 1000")
+    if seconds is not None and not 1.0 <= seconds <= LONGEST:
+        raise ConfigError(f"--seconds {seconds:g} must be between 1 and {LONGEST:g}")
 
 
 @dataclass(frozen=True)

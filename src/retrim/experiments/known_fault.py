@@ -1,0 +1,28 @@
+"""A fault of one version of JAX, and how to find it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+EXCLUDED = "0.10.2"
+"""The version that computes wrong results on the CPU."""
+
+
+def wrong_rows(n: int, dtype: jnp.dtype) -> int:
+    """Rows that ``jit`` gets wrong of: rotate n vectors (0 ... n-1, 0, 0) by the identity, square, sum.
+
+    jax 0.10.2 returns another row's result once the batch is large enough (jax-ml/jax#39103). Row i must be i^2,
+    exactly in float64 and to rounding in float32.
+    """
+    rows = np.zeros((n, 3))
+    rows[:, 0] = np.arange(n)
+    identity = jnp.eye(3, dtype=dtype)
+
+    def one(y: Float[Array, "3"]) -> Float[Array, ""]:
+        return jnp.sum((identity @ y) ** 2)
+
+    found = np.asarray(jax.jit(jax.vmap(one))(jnp.asarray(rows, dtype=dtype)), dtype=np.float64)
+    expected = np.arange(n, dtype=np.float64) ** 2
+    tolerance = 0.0 if dtype == jnp.float64 else 1e-6
+    return int(np.sum(np.abs(found - expected) > tolerance * expected))
