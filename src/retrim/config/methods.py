@@ -1,7 +1,8 @@
-"""Ways to fly a policy, by name: as it is, with classical compensation, or re-trained in flight."""
+"""Ways to fly a policy, by name: as it is, with classical compensation, or re-trained; and controllers without one."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import jax.numpy as jnp
@@ -15,6 +16,7 @@ from ..control.policy import Policy
 from ..errors import ConfigError
 from ..runtime.pilot import ControllerPilot, Pilot
 from ..tasks.keypoints import Keypoints
+from .baselines import BASELINES, Baseline
 from .learners import check_frame, felt_frame
 from .registry import Registry
 
@@ -91,6 +93,10 @@ def _gravity_frame(request: MethodRequest) -> Pilot:
     return ControllerPilot(felt_frame(request.controller(), request.setup.preset))
 
 
+def _without_policy(baseline: Baseline, request: MethodRequest) -> Pilot:
+    return ControllerPilot(baseline.controller(request.setup, request.key))
+
+
 def _full(request: MethodRequest) -> Pilot:
     return request.setup.adaptive_pilot(request.policy, request.needed_key(), request.latency, request.state)
 
@@ -104,5 +110,7 @@ def _lora(request: MethodRequest) -> Pilot:
 register_method("base", MethodEntry(_base, "base policy"))
 register_method("base-i", MethodEntry(_integral, "base policy + integral action"))
 register_method("base-do", MethodEntry(_gravity_frame, "base policy + disturbance observer"))
+for _name, _baseline in BASELINES.items():
+    register_method(_name, MethodEntry(partial(_without_policy, _baseline), _baseline.label))
 register_method("full", MethodEntry(_full, "**adapted, all weights**"))
 register_method("lora", MethodEntry(_lora, "**adapted, LoRA**"))

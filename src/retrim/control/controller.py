@@ -46,6 +46,16 @@ class AbstractController(eqx.Module, Generic[M]):
         del age
         return self
 
+    def sensing(self, omega: Float[Array, "3"], a: Float[Array, "3"]) -> "AbstractController[M]":
+        """Return the same controller for a tick in which more was measured; by default it is not looked at.
+
+        Args:
+            omega: Body rates [rad/s].
+            a: Acceleration, the mean over the last tick, world [m/s^2].
+        """
+        del omega, a
+        return self
+
     def in_frame(self, frame: FeltFrame) -> "AbstractController[M]":
         """Return the same controller for states and commands of ``frame``.
 

@@ -113,6 +113,20 @@ class Simulation(eqx.Module):
         """Return the newest sample that has arrived."""
         return jax.tree.map(lambda leaf: leaf[0], s.samples)  # type: ignore[no-any-return]
 
+    def inertial(self, s: SimState, tick: Int[ArrayLike, ""]) -> tuple[Float[Array, "3"], Float[Array, "3"]] | None:
+        """Return measured body rates [rad/s] and acceleration, world [m/s^2]; None where the model has no rates.
+
+        Args:
+            s: State at the end of a tick.
+            tick: Number of ticks since the start of the flight.
+        """
+        rotors = self.model.rotor_state(s.model)
+        if rotors is None or self.sensors is None:
+            return None if rotors is None else (rotors.omega, s.a)
+        k_gyro, k_accelerometer = random.split(random.fold_in(random.fold_in(self.key, tick), INERTIAL))
+        gyro = self.sensors.gyro * random.normal(k_gyro, (3,), s.a.dtype)
+        return rotors.omega + gyro, s.a + self.sensors.accelerometer * random.normal(k_accelerometer, (3,), s.a.dtype)
+
     def true(self, s: SimState) -> State:
         """Return the state of the vehicle."""
         return self.model.state(s.model)
@@ -132,6 +146,7 @@ def _calm(t: Float[Array, ""], x: State) -> ExternalEffects:
 
 _launch = eqx.filter_jit(Simulation.launch)
 _advance = eqx.filter_jit(Simulation.advance)
+_inertial: Any = eqx.filter_jit(Simulation.inertial)
 
 
 class SimPlant(Plant):
@@ -188,26 +203,16 @@ class SimPlant(Plant):
 
     def _measurement(self) -> Measurement:
         assert self._state is not None
-        model, sensors, state = self.simulation.model, self.simulation.sensors, self._state
-        t, rotors, truth, a = self._ticks * self.dt, model.rotor_state(state.model), model.state(state.model), state.a
-        omega = None if rotors is None else rotors.omega
+        simulation, state = self.simulation, self._state
+        t, truth, rotors = self._ticks * self.dt, simulation.true(state), simulation.model.rotor_state(state.model)
         speeds = None if rotors is None else rotors.motors
-        if sensors is None:
-            return Measurement(t, truth, omega, a, speeds, truth=truth)
-        if omega is not None:
-            omega, a = _inertial(sensors, omega, a, random.fold_in(self.simulation.key, self._ticks))
-        x = self.simulation.measured(state)
-        return Measurement(t, x, omega, a, speeds, age=self.simulation.age, truth=truth)
+        if simulation.sensors is None:
+            return Measurement(t, truth, None if rotors is None else rotors.omega, state.a, speeds, truth=truth)
+        omega, a = (
+            (None, state.a) if rotors is None else _inertial(simulation.undisturbed(), state, np.int32(self._ticks))
+        )
+        return Measurement(t, simulation.measured(state), omega, a, speeds, age=simulation.age, truth=truth)
 
     def stop(self) -> None:
         """Forget the flight."""
         self._state = None
-
-
-@eqx.filter_jit
-def _inertial(
-    sensors: SensorModel, omega: Float[Array, "3"], a: Float[Array, "3"], key: Key[Array, ""]
-) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-    k_gyro, k_accelerometer = random.split(random.fold_in(key, INERTIAL))
-    noise = random.normal(k_gyro, (3,), omega.dtype), random.normal(k_accelerometer, (3,), a.dtype)
-    return omega + sensors.gyro * noise[0], a + sensors.accelerometer * noise[1]

@@ -70,7 +70,9 @@ def fly_ticks(
 
     def tick(flight: InFlight) -> tuple[InFlight, Ticks]:
         s, k = flight.sim, flight.tick
-        issued, memory = controller(flight.memory, s.t, simulation.measured(s))
+        sensed = simulation.inertial(s, k)
+        now = controller if sensed is None else controller.sensing(*sensed)
+        issued, memory = now(flight.memory, s.t, simulation.measured(s))
         accepted = simulation.within_limits(issued)
         limited = jnp.any(accepted.vector() != issued.vector())
         memory = where(limited, controller.accepted(memory, accepted), memory)

@@ -80,7 +80,10 @@ class ControllerPilot(Pilot):
         """Call the controller once, with the time since the start of the flight."""
         x = measurement.x
         t = jnp.asarray(measurement.t - self._start, dtype=x.p.dtype)
-        u, self._memory = _decide(self.controller.aged(measurement.age), self._memory, t, x)
+        controller = self.controller.aged(measurement.age)
+        if measurement.omega is not None and measurement.a is not None:
+            controller = controller.sensing(measurement.omega, measurement.a)
+        u, self._memory = _decide(controller, self._memory, t, x)
         return u
 
     def accepted(self, u: Command) -> None:

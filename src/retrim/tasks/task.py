@@ -10,8 +10,9 @@ from jaxtyping import Array, Bool, Float, Key
 
 from ..errors import FrameError
 from ..physics.felt_frame import FeltFrame
-from ..physics.state import Command, State
+from ..physics.state import STANDARD_GRAVITY, Command, State
 from .observation import AbstractObservation
+from .reference import Point
 
 
 class Start(eqx.Module):
@@ -70,6 +71,13 @@ class AbstractTask(eqx.Module):
     def target(self, t: Float[Array, ""]) -> Float[Array, "3"]:
         """Return where the vehicle should be at time ``t`` [s], world [m]."""
         return self.home()
+
+    def wanted(self, t: Float[Array, ""]) -> Point:
+        """Return the reference at time ``t`` [s], for controllers that follow one: here, rest at the target."""
+        p = self.target(t)
+        rest, none = jnp.zeros_like(p), jnp.zeros_like(p[0])
+        hover = jnp.zeros(4, dtype=p.dtype).at[0].set(STANDARD_GRAVITY)
+        return Point(p, rest, hover, none, rest, rest, none)
 
     @abc.abstractmethod
     def reset(self, key: Key[Array, ""]) -> Start:

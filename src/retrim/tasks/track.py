@@ -13,7 +13,7 @@ from ..physics import so3
 from ..physics.felt_frame import FeltFrame
 from ..physics.state import Command, State
 from .observation import AbstractObservation
-from .reference import AbstractReference
+from .reference import AbstractReference, Point
 from .task import AbstractTask, Start, huber, within
 
 NOISE = 0.1 * math.pi  # [rad]
@@ -68,6 +68,10 @@ class AbstractTrack(AbstractTask):
     def target(self, t: Float[Array, ""]) -> Float[Array, "3"]:
         """Return where the reference is at time ``t`` [s], world [m]."""
         return self.reference(t).p
+
+    def wanted(self, t: Float[Array, ""]) -> Point:
+        """Return the reference at time ``t`` [s]."""
+        return self.reference(t)
 
     def terminated(self, t: Float[Array, ""], x: State) -> Bool[Array, ""]:
         """Return whether the vehicle is outside the box around the reference, or its state not finite."""

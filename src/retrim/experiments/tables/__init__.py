@@ -9,4 +9,8 @@ from .model import model as model
 from .plants import plants as plants
 from .reversing import reversing as reversing
 from .tracking import tracking as tracking
+from .tuning import tuning as tuning
 from .vision import vision as vision
+
+MADE = (hover, reversing, tracking, vision, plants, model, fast, ablation, buses, tuning)
+"""Those of ``retrim reproduce``; the gauntlet is a command of its own."""

@@ -1,0 +1,124 @@
+"""Classical controllers beside the policies, given what a preset declares of the vehicle: delay, lag and limits.
+
+``retrim reproduce tuning`` found their settings, on pushes, starts and seeds of its own: see docs/results/tuning.md.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import jax.numpy as jnp
+from jax import random
+from jaxtyping import Array, Key
+
+from ..control.controller import AbstractController
+from ..control.geometric import Gains, Geometric
+from ..control.indi import Incremental
+from ..control.mppi import Mppi
+from ..estimation.l1 import L1Estimator
+from ..estimation.prediction import Prediction
+
+if TYPE_CHECKING:
+    from .setup import Setup
+
+ACTUATOR_TAU = 0.033  # [s], where a preset declares no lag: what quadrotors of this size have
+INTEGRAL_LIMIT = 6.0  # [m/s^2], as the largest disturbance that the policies' observer answers
+L1_POLE = -0.2  # [1/s], as flown on hardware with DATT; its size hardly matters while it is small beside 1 / dt
+
+Settings = Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """A controller that needs no policy, its settings, and where they were searched."""
+
+    label: str
+    """Name in tables."""
+    make: Callable[["Setup", Settings, Key[Array, ""]], AbstractController[Any]]
+    """From a set-up, settings, and a seed for what is random."""
+    settings: Settings
+    ranges: Mapping[str, tuple[float, float]]
+    """Smallest and largest value that the search draws, evenly in the logarithm."""
+
+    def controller(self, setup: "Setup", key: Key[Array, ""] | None = None) -> AbstractController[Any]:
+        """Return the controller with its settings."""
+        return self.make(setup, self.settings, random.key(0) if key is None else key)
+
+
+def prediction_of(setup: "Setup") -> Prediction:
+    """Return the nominal model of a preset's vehicle."""
+    preset = setup.preset
+    return Prediction(jnp.array(preset.actuator_tau or ACTUATOR_TAU), preset.dt, preset.plant_delay_ticks)
+
+
+def _gains(s: Settings) -> Gains:
+    values = (s["position"], s["velocity"], s["attitude"], s.get("integral", 0.0))
+    return Gains(*(jnp.array(value) for value in values))
+
+
+def _geometric(setup: "Setup", s: Settings, key: Key[Array, ""]) -> Geometric:
+    return Geometric(setup.flown, _gains(s), prediction_of(setup), jnp.array(INTEGRAL_LIMIT))
+
+
+def _indi(setup: "Setup", s: Settings, key: Key[Array, ""]) -> Incremental:
+    return Incremental(setup.flown, _gains(s), prediction_of(setup), jnp.array(s["filter"]))
+
+
+def _mppi(setup: "Setup", s: Settings, key: Key[Array, ""]) -> Mppi:
+    estimator, dt = None, setup.preset.dt
+    if "estimator" in s:
+        estimator = L1Estimator(jnp.array(L1_POLE), jnp.exp(jnp.array(-dt / s["estimator"])), dt)
+    return Mppi(
+        setup.flown,
+        prediction_of(setup),
+        setup.vehicle.command_min,
+        setup.vehicle.command_max,
+        key,
+        estimator,
+        jnp.array([s["thrust"], s["rates"], s["rates"], s["rates"]]),
+        jnp.array(s["temperature"]),
+        jnp.array(s["position"]),
+        jnp.array(s["velocity"]),
+        jnp.array(s["attitude"]),
+    )
+
+
+_LOOPS = {"position": (4.0, 60.0), "velocity": (3.0, 15.0), "attitude": (5.0, 30.0)}
+_SAMPLING = {
+    "thrust": (0.5, 5.0), "rates": (0.3, 3.0), "temperature": (0.005, 0.5), "position": (2.0, 50.0),
+    "velocity": (0.01, 3.0), "attitude": (0.1, 10.0),
+}  # fmt: skip
+_RELEASED = {  # with DATT; a cost of the velocity it has none
+    "thrust": 2.45, "rates": 0.7, "temperature": 0.05, "position": 5.0, "velocity": 0.0, "attitude": 3.0,
+}  # fmt: skip
+
+BASELINES: dict[str, Baseline] = {
+    "geometric": Baseline(
+        "geometric controller",
+        _geometric,
+        {"position": 12.0, "velocity": 6.0, "attitude": 12.0},
+        _LOOPS,
+    ),
+    "geometric-i": Baseline(
+        "geometric controller + integral action",
+        _geometric,
+        {"position": 12.0, "velocity": 6.0, "attitude": 12.0, "integral": 12.0},
+        {**_LOOPS, "integral": (2.0, 60.0)},
+    ),
+    "indi": Baseline(
+        "INDI",
+        _indi,
+        {"position": 12.0, "velocity": 6.0, "attitude": 12.0, "filter": 0.08},
+        {**_LOOPS, "filter": (0.02, 0.3)},
+    ),
+    "mppi": Baseline("MPPI", _mppi, _RELEASED, _SAMPLING),
+    "l1-mpc": Baseline(
+        "MPPI + L1",
+        _mppi,
+        {**_RELEASED, "estimator": 2.0},
+        {**_SAMPLING, "estimator": (0.1, 2.0)},
+    ),
+}
+"""By name of the method. Positions [1/s^2], velocities and attitudes [1/s], integrals [1/s^3], time constants of filter
+and estimator [s]; of MPPI the noise of thrust [m/s^2] and rates [rad/s], the temperature, and costs per second of
+position [1/m], velocity [s/m] and attitude."""

@@ -1,0 +1,55 @@
+"""From the acceleration that a vehicle shall have to the command that gives it."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..physics import so3
+from ..physics.state import STANDARD_GRAVITY, Command, State
+from ..tasks.flatness import flat_command
+from ..tasks.reference import Point
+
+LEAST_LIFT = 2.0  # [m/s^2], upward part of the thrust that is asked for: an attitude needs some
+STEEPEST = 1.4  # tangent of the largest tilt that is asked for, 54 degrees
+
+
+def flyable(thrust: Float[Array, "3"]) -> Float[Array, "3"]:
+    """Return a thrust that a quadrotor can turn to: upward, and tilted by 54 degrees at most.
+
+    Args:
+        thrust: Mass-normalised thrust that is wanted, world [m/s^2].
+    """
+    up = jnp.maximum(thrust[2], LEAST_LIFT)
+    sideways = jnp.sqrt(jnp.sum(thrust[:2] ** 2) + 1e-12)
+    return jnp.append(thrust[:2] * jnp.minimum(1.0, STEEPEST * up / sideways), up)
+
+
+def attitude_of(thrust: Float[Array, "3"], heading: Float[Array, ""]) -> Float[Array, "3 3"]:
+    """Return the attitude whose z axis lies along ``thrust`` and whose x axis points towards ``heading`` [rad]."""
+    z = thrust / jnp.sqrt(jnp.sum(thrust * thrust))
+    sideways = jnp.cross(z, jnp.stack([jnp.cos(heading), jnp.sin(heading), jnp.zeros_like(heading)]))
+    y = sideways / jnp.sqrt(jnp.sum(sideways * sideways))
+    return jnp.stack([jnp.cross(y, z), y, z], axis=1)
+
+
+def thrust_of(acceleration: Float[Array, "3"]) -> Float[Array, "3"]:
+    """Return the mass-normalised thrust that gives an acceleration, world [m/s^2]."""
+    return acceleration + jnp.array([0.0, 0.0, STANDARD_GRAVITY], dtype=acceleration.dtype)
+
+
+def command_for(x: State, thrust: Float[Array, "3"], wanted: Point, gain: Float[Array, "3"]) -> Command:
+    """Return the command that turns a vehicle to a thrust, and gives what lies along its axis already.
+
+    Args:
+        x: State in which the command begins to act.
+        thrust: Mass-normalised thrust that is wanted, world [m/s^2].
+        wanted: Reference: its heading, and how fast its attitude turns.
+        gain: Body rate for each radian of attitude error, about each body axis [1/s].
+
+    Source:
+        Lee, Leok and McClamroch 2010, on the level of body rates, with the rotation vector as the attitude error.
+    """
+    thrust = flyable(thrust)
+    R = attitude_of(thrust, wanted.heading)
+    feed = flat_command(thrust, wanted.jerk, wanted.heading, wanted.heading_rate)[1:]
+    error = so3.mul(x.R.T, R)
+    return Command(jnp.maximum(jnp.sum(thrust * x.R[:, 2]), 0.0), so3.act(error, feed) + gain * so3.log(error))

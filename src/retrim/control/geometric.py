@@ -1,0 +1,84 @@
+"""The geometric tracking controller: position, velocity and attitude feedback around a reference (Lee et al. 2010)."""
+
+import dataclasses
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..estimation.prediction import Prediction, Underway
+from ..physics.state import Command, State
+from ..tasks.reference import Point
+from ..tasks.task import AbstractTask
+from .attitude import command_for, thrust_of
+from .controller import AbstractController
+
+
+class Gains(eqx.Module):
+    """Gains of a controller in three loops."""
+
+    position: Float[Array, ""]
+    """[1/s^2]"""
+    velocity: Float[Array, ""]
+    """[1/s]"""
+    attitude: Float[Array, ""]
+    """[1/s]"""
+    integral: Float[Array, ""]
+    """[1/s^3]; zero: no integral action."""
+
+    def acceleration(self, x: State, wanted: Point, integral: Float[Array, "3"]) -> Float[Array, "3"]:
+        """Return the acceleration that brings a vehicle to its reference, world [m/s^2].
+
+        Args:
+            x: State.
+            wanted: Reference.
+            integral: Of the position error [m s].
+        """
+        back = self.position * (wanted.p - x.p) + self.velocity * (wanted.v - x.v)
+        return wanted.a + back + self.integral * integral
+
+    def turning(self) -> Float[Array, "3"]:
+        """Return the gains of the attitude about each body axis [1/s]; a quadrotor turns slowly about its thrust."""
+        return self.attitude * jnp.array([1.0, 1.0, 0.4], dtype=self.attitude.dtype)
+
+
+class GeometricState(eqx.Module):
+    """Memory of the controller."""
+
+    underway: Underway
+    integral: Float[Array, "3"]
+    """Of the position error [m s]."""
+
+
+class Geometric(AbstractController[GeometricState]):
+    """Geometric tracking, with integral action where its gain is not zero."""
+
+    task: AbstractTask
+    """It says where the vehicle should be."""
+    gains: Gains
+    prediction: Prediction
+    limit: Float[Array, ""]
+    """Of what integral action asks for, per axis [m/s^2]."""
+
+    def aged(self, age: float | Float[Array, ""]) -> "Geometric":
+        """Return the same for measurements that are ``age`` old [s]."""
+        return dataclasses.replace(self, prediction=self.prediction.aged(age))
+
+    def init(self, x: State) -> GeometricState:
+        """Return the memory at the start of a flight."""
+        return GeometricState(self.prediction.init(x), jnp.zeros_like(x.p))
+
+    def __call__(self, memory: GeometricState, t: Float[Array, ""], x: State) -> tuple[Command, GeometricState]:
+        """Decide for the state in which the command begins to act."""
+        gain, dt = self.gains.integral, self.prediction.dt
+        x, _ = self.prediction(memory.underway, x, gain * -memory.integral)
+        wanted = self.task.wanted(t + self.prediction.delay_ticks * dt)
+        bound = self.limit / jnp.maximum(gain, 1e-6)
+        integral = jnp.clip(memory.integral + dt * (wanted.p - x.p), -bound, bound)
+        acceleration = self.gains.acceleration(x, wanted, integral)
+        u = command_for(x, thrust_of(acceleration), wanted, self.gains.turning())
+        return u, GeometricState(self.prediction.issued(memory.underway, u), integral)
+
+    def accepted(self, memory: GeometricState, u: Command) -> GeometricState:
+        """Remember the accepted command."""
+        return GeometricState(self.prediction.accepted(memory.underway, u), memory.integral)

@@ -1,0 +1,74 @@
+"""Incremental nonlinear dynamic inversion: the thrust that acts, corrected by what the measured acceleration lacks.
+
+Whatever disturbs the vehicle is in the acceleration that is measured, so that no model of it is needed: the wanted
+thrust is f + (a_wanted - a), with the thrust f that acts and the acceleration a behind one filter, so that they belong
+to the same moment (Smeur, de Croon and Chu 2018; Tal and Karaman 2021, here above the loop of the body rates).
+"""
+
+import dataclasses
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..estimation.prediction import Prediction, Underway
+from ..physics.state import Command, State
+from ..tasks.task import AbstractTask
+from .attitude import command_for, thrust_of
+from .controller import AbstractController
+from .geometric import Gains
+
+
+class IncrementalState(eqx.Module):
+    """Memory of the controller."""
+
+    underway: Underway
+    last: State
+    """State measured one tick ago."""
+    excess: Float[Array, "3"]
+    """What the thrust that acts has beyond the measured acceleration and gravity, filtered, world [m/s^2]."""
+
+
+class Incremental(AbstractController[IncrementalState]):
+    """INDI on the level of the thrust vector."""
+
+    task: AbstractTask
+    """It says where the vehicle should be."""
+    gains: Gains
+    prediction: Prediction
+    tau: Float[Array, ""]
+    """Time constant of the filter of acceleration and thrust [s]."""
+    omega: Float[Array, "3"] | None = None
+    """Measured body rates [rad/s]; None: those that the commands give."""
+    a: Float[Array, "3"] | None = None
+    """Measured acceleration, the mean over the last tick, world [m/s^2]; None: that of the measured velocities."""
+
+    def aged(self, age: float | Float[Array, ""]) -> "Incremental":
+        """Return the same for measurements that are ``age`` old [s]."""
+        return dataclasses.replace(self, prediction=self.prediction.aged(age))
+
+    def sensing(self, omega: Float[Array, "3"], a: Float[Array, "3"]) -> "Incremental":
+        """Return the same for a tick in which body rates and acceleration were measured."""
+        return dataclasses.replace(self, omega=omega, a=a)
+
+    def init(self, x: State) -> IncrementalState:
+        """Return the memory at the start of a flight."""
+        return IncrementalState(self.prediction.init(x), x, jnp.zeros_like(x.p))
+
+    def __call__(self, memory: IncrementalState, t: Float[Array, ""], x: State) -> tuple[Command, IncrementalState]:
+        """Decide for the state in which the command begins to act."""
+        dt, last = self.prediction.dt, memory.last
+        acted, _ = self.prediction.acted(memory.underway)
+        a = (x.v - last.v) / dt if self.a is None else self.a
+        thrust = acted.c * 0.5 * (last.R[:, 2] + x.R[:, 2])
+        share = 1.0 - jnp.exp(-dt / self.tau.astype(a.dtype))
+        excess = memory.excess + share * (thrust - thrust_of(a) - memory.excess)
+        soon, _ = self.prediction(memory.underway, x, -excess, self.omega)
+        wanted = self.task.wanted(t + self.prediction.delay_ticks * dt)
+        acceleration = self.gains.acceleration(soon, wanted, jnp.zeros_like(x.p))
+        u = command_for(soon, thrust_of(acceleration) + excess, wanted, self.gains.turning())
+        return u, IncrementalState(self.prediction.issued(memory.underway, u), x, excess)
+
+    def accepted(self, memory: IncrementalState, u: Command) -> IncrementalState:
+        """Remember the accepted command."""
+        return dataclasses.replace(memory, underway=self.prediction.accepted(memory.underway, u))

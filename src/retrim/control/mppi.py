@@ -1,0 +1,152 @@
+"""Model-predictive path integral control: many random command sequences, weighted by what they would cost.
+
+Each tick the mean of the last tick, shifted, is perturbed by noise; every sequence is rolled out in the nominal model,
+with the disturbance that an estimator sees, if there is one; and the new mean is that of all, each with the weight
+exp(-cost / temperature) (Williams et al. 2017; costs and noise as flown beside DATT, Huang et al. 2023).
+"""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax, random
+from jaxtyping import Array, Float, Int, Key
+
+from ..estimation.l1 import L1Estimator, L1State
+from ..estimation.prediction import Prediction, Underway
+from ..physics import so3
+from ..physics.state import STANDARD_GRAVITY, Command, State
+from ..tasks.reference import Point
+from ..tasks.task import AbstractTask
+from .controller import AbstractController
+
+
+class MppiState(eqx.Module):
+    """Memory of the controller."""
+
+    underway: Underway
+    mean: Float[Array, "horizon 4"]
+    """Commands that are planned, [c, omega] each."""
+    estimate: L1State
+    last: State
+    """State measured one tick ago."""
+    tick: Int[Array, ""]
+
+
+class Mppi(AbstractController[MppiState]):
+    """MPPI over commands, in the nominal model with actuator lag."""
+
+    task: AbstractTask
+    """It says where the vehicle should be."""
+    prediction: Prediction
+    low: Command
+    """Smallest command of the vehicle."""
+    high: Command
+    """Largest command of the vehicle."""
+    key: Key[Array, ""]
+    estimator: L1Estimator | None
+    """It corrects the model; None: the model stays nominal."""
+    spread: Float[Array, "4"]
+    """Standard deviation of the noise: thrust [m/s^2], body rates [rad/s]."""
+    temperature: Float[Array, ""]
+    """Of the weights; in the unit of the cost."""
+    position_cost: Float[Array, ""]
+    """Per metre and second."""
+    velocity_cost: Float[Array, ""]
+    """Per metre, of the difference of velocities."""
+    attitude_cost: Float[Array, ""]
+    """Per unit of 1 - <q, q_ref>^2 and second."""
+    samples: int = eqx.field(static=True, default=1024)
+    """Sequences in a tick."""
+    horizon: int = eqx.field(static=True, default=40)
+    """Ticks of a sequence."""
+
+    def aged(self, age: float | Float[Array, ""]) -> "Mppi":
+        """Return the same for measurements that are ``age`` old [s]."""
+        return dataclasses.replace(self, prediction=self.prediction.aged(age))
+
+    def init(self, x: State) -> MppiState:
+        """Return the memory at the start of a flight: hover is planned."""
+        mean = jnp.tile(Command.hover(x.p.dtype).vector(), (self.horizon, 1))
+        nothing = L1State(x.v, jnp.zeros_like(x.v), jnp.zeros_like(x.v))
+        return MppiState(self.prediction.init(x), mean, nothing, x, jnp.array(0))
+
+    def __call__(self, memory: MppiState, t: Float[Array, ""], x: State) -> tuple[Command, MppiState]:
+        """Plan from the state in which the command begins to act, and return the first command of the plan."""
+        dtype, underway, estimate = x.p.dtype, memory.underway, memory.estimate
+        if self.estimator is not None:
+            acted, _ = self.prediction.acted(underway)
+            thrust = acted.c * 0.5 * (memory.last.R[:, 2] + x.R[:, 2])
+            estimate = self.estimator(estimate, x, thrust)
+        soon, acting = self.prediction(underway, x, estimate.d_hat)
+        dt = self.prediction.dt
+        times = t + dt * (self.prediction.delay_ticks + 1 + jnp.arange(self.horizon, dtype=dtype))
+        wanted = jax.vmap(self.task.wanted)(times)
+        low, high = self.low.vector().astype(dtype), self.high.vector().astype(dtype)
+        noise = random.normal(random.fold_in(self.key, memory.tick), (self.horizon, 4, self.samples), dtype)
+        plans = memory.mean[:, :, None] + self.spread.astype(dtype)[None, :, None] * noise
+        plans = jnp.clip(plans, low[None, :, None], high[None, :, None])
+        cost = self._costs(plans, soon, acting, wanted, estimate.d_hat)
+        weights = jax.nn.softmax(-(cost - jnp.min(cost)) / self.temperature.astype(dtype))
+        mean = plans @ weights
+        u = Command.of(mean[0])
+        planned = jnp.concatenate([mean[1:], mean[-1:]])
+        return u, MppiState(self.prediction.issued(underway, u), planned, estimate, x, memory.tick + 1)
+
+    def accepted(self, memory: MppiState, u: Command) -> MppiState:
+        """Remember the accepted command."""
+        return dataclasses.replace(memory, underway=self.prediction.accepted(memory.underway, u))
+
+    def _costs(
+        self,
+        plans: Float[Array, "horizon 4 samples"],
+        x: State,
+        acting: Command,
+        wanted: Point,
+        d: Float[Array, "3"],
+    ) -> Float[Array, " samples"]:
+        """Return what each plan costs. Samples lie along the last axis, so that every operation is a long row."""
+        dt, dtype = self.prediction.dt, x.p.dtype
+        decay = jnp.exp(-dt / self.prediction.tau.astype(dtype))
+        pull = d + jnp.array([0.0, 0.0, -STANDARD_GRAVITY], dtype=dtype)
+
+        def rows(a: Array) -> Array:
+            return jnp.broadcast_to(a[..., None], (*a.shape, self.samples))
+
+        def tick(carry: Any, plan: tuple[Array, Point]) -> tuple[Any, None]:
+            p, R, v, u, cost = carry
+            commanded, goal = plan
+            u = commanded + decay * (u - commanded)
+            R = _turned(R, dt * u[1:])
+            a = R[:, 2] * u[:1] + pull[:, None]
+            p, v = p + dt * v + 0.5 * dt**2 * a, v + dt * a
+            away = jnp.sqrt(jnp.sum((p - goal.p[:, None]) ** 2, axis=0) + 1e-12)
+            apart = jnp.sqrt(jnp.sum((v - goal.v[:, None]) ** 2, axis=0) + 1e-12)
+            heading = so3.rotz(goal.heading)
+            askew = 0.25 * (3.0 - jnp.sum(heading[:, :, None] * R, axis=(0, 1)))
+            weights = (self.position_cost, self.velocity_cost, self.attitude_cost)
+            terms = zip(weights, (away, apart, askew), strict=True)
+            cost = cost + dt * sum(weight.astype(dtype) * term for weight, term in terms)
+            return (p, R, v, u, cost), None
+
+        start = (rows(x.p), rows(x.R), rows(x.v), rows(acting.vector()), jnp.zeros(self.samples, dtype))
+        last, _ = lax.scan(tick, start, (plans, wanted))
+        cost: Array = last[-1]
+        return cost
+
+
+def _turned(R: Float[Array, "3 3 n"], w: Float[Array, "3 n"]) -> Float[Array, "3 3 n"]:
+    """Return attitudes turned by rotation vectors [rad] in the body frame, all at once (Rodrigues' formula)."""
+    squared = jnp.sum(w * w, axis=0) + 1e-12
+    angle = jnp.sqrt(squared)
+    once = _hatted(R, w)
+    s, c = jnp.sin(angle) / angle, (1.0 - jnp.cos(angle)) / squared
+    return R + s[None, None] * once + c[None, None] * _hatted(once, w)
+
+
+def _hatted(R: Float[Array, "3 3 n"], w: Float[Array, "3 n"]) -> Float[Array, "3 3 n"]:
+    """Return R [w]x, column by column."""
+    (x, y, z), (i, j, k) = w[:, None], jnp.moveaxis(R, 1, 0)
+    return jnp.stack([j * z - k * y, k * x - i * z, i * y - j * x], axis=1)

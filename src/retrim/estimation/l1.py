@@ -1,0 +1,63 @@
+"""L1 adaptive estimation of a disturbance: a predictor of the velocity, a law that is constant over a tick, a filter.
+
+The predictor's velocity v_hat follows the measured one, v, as fast as its pole A_s < 0 says. The law picks the sigma
+that would take all of the prediction error away within a tick, and the filter makes the estimate of it,
+
+    v_hat <- v_hat + dt (g + f - sigma + A_s (v_hat - v)),
+    sigma <- exp(A_s dt) phi^-1 (v_hat - v),   phi = (exp(A_s dt) - 1) / A_s,
+    d_hat <- alpha d_hat - (1 - alpha) sigma,
+
+where f is the thrust that was commanded (Hovakimyan and Cao 2010; as flown with DATT, Huang et al. 2023). A constant
+disturbance d shows in -sigma from the second tick on, so that d_hat approaches it with the time constant
+-dt / ln(alpha).
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..physics.state import STANDARD_GRAVITY, State
+
+
+class L1State(eqx.Module):
+    """Memory of the estimator; all are world vectors."""
+
+    v_hat: Float[Array, "3"]
+    """Predicted velocity [m/s]."""
+    sigma: Float[Array, "3"]
+    """Correction of the last tick [m/s^2]."""
+    d_hat: Float[Array, "3"]
+    """Estimated disturbance [m/s^2]."""
+
+
+class L1Estimator(eqx.Module):
+    """Estimates the disturbance that acts, from velocities and commanded thrust."""
+
+    pole: Float[Array, ""]
+    """A_s, of the predictor [1/s]; negative."""
+    alpha: Float[Array, ""]
+    """Share of the old estimate that stays in a tick, 0 to 1."""
+    dt: float = eqx.field(static=True)
+    """Control tick [s]."""
+
+    def init(self, x: State) -> L1State:
+        """Return the memory at the start of a flight."""
+        return L1State(x.v, jnp.zeros_like(x.v), jnp.zeros_like(x.v))
+
+    def __call__(self, s: L1State, x: State, thrust: Float[Array, "3"]) -> L1State:
+        """Return the memory after a tick.
+
+        Args:
+            s: Memory.
+            x: State measured at the end of the tick.
+            thrust: Mass-normalised thrust that acted over the tick, world [m/s^2].
+        """
+        dtype = x.v.dtype
+        pole, alpha = self.pole.astype(dtype), self.alpha.astype(dtype)
+        gravity = jnp.array([0.0, 0.0, -STANDARD_GRAVITY], dtype=dtype)
+        decay = jnp.exp(pole * self.dt)
+        # The predictor over the tick that has ended, from the error at its beginning, which sigma was made of.
+        error = s.sigma * jnp.expm1(pole * self.dt) / pole / decay
+        v_hat = s.v_hat + self.dt * (gravity + thrust - s.sigma + pole * error)
+        sigma = decay * pole / jnp.expm1(pole * self.dt) * (v_hat - x.v)
+        return L1State(v_hat, sigma, alpha * s.d_hat - (1.0 - alpha) * sigma)

@@ -1,0 +1,136 @@
+"""Settings of the classical baselines, by random search on flights that no table flies."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from jax import random
+
+from ...config.baselines import BASELINES, Baseline, Settings
+from ...config.loading import load
+from ...config.scenario import Scenario
+from ...config.setup import Setup
+from ...errors import ConfigError
+from ...plants.sim import SimPlant
+from ...runtime.pilot import ControllerPilot
+from ...runtime.together import fly_together
+from ..flights import FlightSpec
+from ..flying import scored, until_terminated
+from ..limits import check_flights, check_seeds
+from ..reporter import Reporter
+from ..run import Run
+from .document import Document, TableSection
+
+CONDITIONS = (
+    ("hover/retrim", Scenario("push=1.2", sensors="onboard")),
+    ("hover/retrim", Scenario("gusts=3+step=-1.5")),
+    ("track/retrim", Scenario("wind=5+push=-0.8", sensors="onboard", reference="figure8")),
+)
+"""Preset, for task and declared lag, and where it is flown."""
+CRASH = 1.0  # [m], the error that a crashed flight counts as
+SETTLING = 3.0  # [s] at the start that do not count
+
+
+def tuning(
+    run: Run,
+    reporter: Reporter,
+    *,
+    methods: tuple[str, ...] = tuple(BASELINES),
+    candidates: int = 48,
+    starts: int = 2,
+    seconds: float = 12.0,
+    seed: int = 100,
+    plant: str = "bem",
+) -> None:
+    """Settings of the classical baselines: the best of random candidates on pushes, starts and seeds of their own.
+
+    Args:
+        run: Folder of tuning.md and tuning.json.
+        reporter: Receives progress and the sections.
+        methods: Which baselines.
+        candidates: Settings that are tried for each, beside the present ones.
+        starts: Flights of a candidate under each condition.
+        seconds: Length of a flight [s]; the first 3 s do not count.
+        seed: Seed of candidates, starts and gusts.
+        plant: Where they fly; bem or simple.
+    """
+    check_seeds([seed])
+    check_flights(starts, seconds)
+    if unknown := [name for name in methods if name not in BASELINES]:
+        raise ConfigError(f"{', '.join(unknown)}: no baseline with settings; there are {', '.join(BASELINES)}")
+    conditions = "; ".join(
+        f"{preset.partition('/')[0]}{f' ({s.reference})' if s.reference else ''}, {s.disturbance}, sensors {s.sensors}"
+        for preset, s in CONDITIONS
+    )
+    intro = (
+        f"Made by `retrim reproduce tuning`. {candidates} candidates for each method, drawn evenly in the logarithm "
+        f"of each range, and the present settings, fly the small quadrotor on plant `{plant}` from {starts} starts "
+        f"(seed {seed}) under: {conditions}. The score is the mean error after {SETTLING:g} s [m], a crash "
+        f"counting {CRASH:g} m. No table flies these conditions, starts or seeds."
+    )
+    document = Document(run, "tuning", "Settings of the baselines", intro, [], reporter)
+    for name in methods:
+        if run.interrupted:
+            break
+        tried = [dict(BASELINES[name].settings), *_drawn(BASELINES[name], candidates, seed)]
+        with run.interruptible(), reporter.progress(name) as advance:
+            scores = np.zeros(len(tried))
+            for i, (preset, scenario) in enumerate(CONDITIONS):
+                advance(i / len(CONDITIONS), f"condition {i + 1} of {len(CONDITIONS)}")
+                found = _flown(BASELINES[name], tried, Setup.of(load(preset), scenario.reference), scenario,
+                               starts=starts, seconds=seconds, seed=seed, plant=plant, stop=run.stop)  # fmt: skip
+                scores += np.array(found) / len(CONDITIONS)
+            document.add(_section(name, tried, scores), _rows(name, tried, scores))
+    document.write()
+
+
+def _drawn(baseline: Baseline, n: int, seed: int) -> list[Settings]:
+    """Candidates; a baseline's own follow from the seed alone."""
+    low, high = np.array(list(baseline.ranges.values())).T
+    shares = np.asarray(random.uniform(random.key(seed), (n, len(low))))
+    drawn = low * (high / low) ** shares
+    return [dict(zip(baseline.ranges, row, strict=True)) for row in drawn.tolist()]
+
+
+def _flown(
+    baseline: Baseline,
+    tried: Sequence[Settings],
+    setup: Setup,
+    scenario: Scenario,
+    *,
+    starts: int,
+    seconds: float,
+    seed: int,
+    plant: str,
+    stop: Any,
+) -> list[float]:
+    """Mean error of each candidate, all flown as one batch."""
+    specs = [FlightSpec(scenario, "base", start, seed) for start in range(starts)]
+    begun, dt = setup.flight_starts(starts, seed), setup.preset.dt
+    made = [Scenario(scenario.disturbance, plant, sensors=scenario.sensors).make("small", dt=dt, seed=s.plant_seed)
+            for _ in tried for s in specs]  # fmt: skip
+    plants = [each for each in made if isinstance(each, SimPlant)]
+    if len(plants) < len(made):
+        raise ConfigError(f"plant {plant!r}: candidates are flown as one batch, which bem and simple can be")
+    pilots = [ControllerPilot(baseline.make(setup, settings, spec.key())) for settings in tried for spec in specs]
+    logs = fly_together(plants, pilots, begun * len(tried), ticks=round(seconds / dt), stop=stop)
+    flights = [scored(setup, specs[0], until_terminated(setup.flown, log)) for log in logs]
+    errors = [
+        CRASH if flight.log.terminated else float(np.mean(flight.error[flight.log.t > SETTLING])) for flight in flights
+    ]
+    means: list[float] = np.reshape(errors, (len(tried), starts)).mean(axis=1).tolist()
+    return means
+
+
+def _rows(name: str, tried: Sequence[Settings], scores: np.ndarray) -> list[dict[str, Any]]:
+    scored_ones = zip(tried, scores.tolist(), strict=True)
+    return [{"method": name, "settings": dict(settings), "score": score} for settings, score in scored_ones]
+
+
+def _section(name: str, tried: Sequence[Settings], scores: np.ndarray) -> TableSection:
+    """The present settings and the best three."""
+    best = [int(i) for i in np.argsort(scores)[:3]]
+    columns = ("settings", *tried[0], "score [m]")
+    shown = [("present", 0), *((f"{'best' if k == 0 else f'{k + 1}.'}", i) for k, i in enumerate(best))]
+    lines = tuple((word, *(f"{v:.3g}" for v in tried[i].values()), f"{scores[i]:.4f}") for word, i in shown)
+    return TableSection(columns, lines, BASELINES[name].label)

@@ -1,0 +1,127 @@
+"""Controllers without a policy: geometric tracking and INDI hold, reject, follow, and do not care where they are."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax, random
+
+from helpers import GOAL, hover_task, random_state
+from retrim.control.attitude import LEAST_LIFT, attitude_of, command_for, flyable, thrust_of
+from retrim.control.geometric import Gains, Geometric
+from retrim.control.indi import Incremental
+from retrim.estimation.prediction import Prediction
+from retrim.physics import Command, PointMass, State, small, so3
+from retrim.physics.actuators import Lagged
+from retrim.tasks import Preview, Track
+from retrim.tasks.shapes import figure8
+
+DT, TAU = 0.02, 0.033
+PREDICTION = Prediction(jnp.array(TAU), DT, 1)
+
+
+def gains(integral=0.0):
+    return Gains(jnp.array(12.0), jnp.array(6.0), jnp.array(12.0), jnp.array(integral))
+
+
+def made(kind, task):
+    if kind == "indi":
+        return Incremental(task, gains(), PREDICTION, jnp.array(0.08))
+    return Geometric(task, gains(12.0 if kind == "geometric-i" else 0.0), PREDICTION, jnp.array(6.0))
+
+
+def flown(controller, x0, push, seconds=8.0, start=0.0):
+    """States by tick, in the lagged model with a command delay of one tick, pushed from ``start`` on [s]."""
+    model = Lagged(PointMass(DT), jnp.array(TAU))
+
+    def tick(carry, k):
+        s, memory, waiting = carry
+        t = DT * k.astype(float)
+        u, memory = controller(memory, t, model.state(s))
+        s = model.step(s, waiting, jnp.where(t >= start, push, 0.0))
+        return (s, memory, u), model.state(s)
+
+    first = (model.init(x0), controller.init(x0), Command.hover(x0.p.dtype))
+    return jax.jit(lambda: lax.scan(tick, first, jnp.arange(round(seconds / DT)))[1])()
+
+
+@pytest.mark.parametrize("kind", ["geometric", "geometric-i", "indi"])
+def test_it_comes_to_hover_from_anywhere_near(kind, key):
+    task = hover_task()
+    for k in random.split(key, 3):
+        x0 = State(jnp.array(GOAL) + random.uniform(k, (3,), minval=-1.0), random_state(k, 0.3).R, jnp.zeros(3))
+        path = flown(made(kind, task), x0, jnp.zeros(3))
+        np.testing.assert_allclose(path.p[-1], GOAL, atol=2e-3)
+        assert float(jnp.max(jnp.abs(path.v[-50:]))) < 5e-3
+
+
+@pytest.mark.parametrize("kind", ["geometric-i", "indi"])
+@pytest.mark.parametrize("push", [(2.0, 2.0, 2.0), (-1.0, 0.5, -3.0)])
+def test_it_rejects_a_step(kind, push):
+    task, d = hover_task(), jnp.array(push)
+    path = flown(made(kind, task), State.at(jnp.array(GOAL)), d, start=1.0, seconds=12.0)
+    error = jnp.sqrt(jnp.sum((path.p - jnp.array([GOAL])) ** 2, axis=1))
+    assert float(jnp.max(error)) > 0.02  # the step is felt
+    assert float(error[-1]) < 2e-3
+
+
+def test_without_integral_action_it_rests_where_its_spring_balances_the_push():
+    d = jnp.array([0.6, -0.3, 0.2])
+    path = flown(made("geometric", hover_task()), State.at(jnp.array(GOAL)), d)
+    expected = d / 12.0 * (1.0 + 6.0 * DT + 0.5 * 12.0 * DT**2)  # what it predicts knows of no push
+    np.testing.assert_allclose(path.p[-1] - jnp.array(GOAL), expected, rtol=0.01)
+
+
+def test_indi_believes_the_accelerometer():
+    """A measured acceleration beyond that of the velocities is a disturbance to it."""
+    task, x = hover_task(), State.at(jnp.array(GOAL))
+    plain = made("indi", task)
+    memory = plain.init(x)
+    level, _ = plain(memory, jnp.array(0.0), x)
+    pulled, _ = plain.sensing(jnp.zeros(3), jnp.array([0.0, 0.0, -1.0]))(memory, jnp.array(0.0), x)
+    share = 1.0 - np.exp(-DT / 0.08)  # of 1 m/s^2; and the vehicle will have fallen a little until it is answered
+    assert share < float(pulled.c - level.c) < 1.2 * share
+
+
+@pytest.mark.parametrize("kind", ["geometric", "geometric-i", "indi"])
+def test_it_follows_a_figure_8(kind):
+    reference = figure8()
+    task = Track(reference, Preview(reference, small().omega_max, 0), jnp.array(1.0), jnp.array(5.0))
+    here = reference(jnp.array(0.0))
+    path = flown(made(kind, task), State(here.p, jnp.eye(3), here.v), jnp.zeros(3), seconds=10.0)
+    wanted = jax.vmap(reference)(DT * jnp.arange(1.0, path.p.shape[0] + 1)).p
+    error = jnp.sqrt(jnp.sum((path.p - wanted) ** 2, axis=1))
+    assert float(jnp.mean(error[250:])) < 0.03
+
+
+@pytest.mark.parametrize("kind", ["geometric", "indi"])
+def test_it_does_not_care_where_it_is_or_where_north_is(kind, key):
+    task, x = hover_task(), random_state(key, 0.5)
+    turn, shift = so3.rotz(jnp.array(1.2)), jnp.array([5.0, -3.0, 2.0])
+    here = dataclasses.replace(task, goal=jnp.array(GOAL))
+
+    def decided(x, goal, heading):
+        controller = made(kind, dataclasses.replace(here, goal=goal))
+        point = controller.task.wanted(jnp.array(0.0))._replace(heading=jnp.array(heading))
+        thrust = thrust_of(controller.gains.acceleration(x, point, jnp.zeros(3)))
+        return command_for(x, thrust, point, controller.gains.turning()).vector()
+
+    first = decided(x, jnp.array(GOAL), 0.0)
+    moved = State(turn @ x.p + shift, turn @ x.R, turn @ x.v)
+    np.testing.assert_allclose(decided(moved, turn @ jnp.array(GOAL) + shift, 1.2), first, atol=1e-9)
+
+
+def test_attitudes_are_rotations_and_a_vehicle_in_its_attitude_is_told_the_reference(key):
+    for k in random.split(key, 5):
+        thrust = flyable(thrust_of(5.0 * random.normal(k, (3,))))
+        R = attitude_of(thrust, jnp.array(0.7))
+        np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+        np.testing.assert_allclose(R[:, 2] * jnp.linalg.norm(thrust), thrust, atol=1e-12)
+        assert thrust[2] >= LEAST_LIFT
+    point = figure8()(jnp.array(1.3))
+    thrust = thrust_of(point.a)
+    x = State(point.p, attitude_of(thrust, point.heading), point.v)
+    u = command_for(x, thrust, point, jnp.full(3, 12.0))
+    np.testing.assert_allclose(u.vector(), point.u, atol=2e-2)

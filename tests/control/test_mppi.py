@@ -1,0 +1,106 @@
+"""MPPI plans better with more samples, stays within the limits, and an estimator takes a push off it."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax, random
+
+from helpers import GOAL, hover_task, random_state
+from retrim.control.mppi import Mppi, _turned
+from retrim.estimation.l1 import L1Estimator
+from retrim.estimation.prediction import Prediction
+from retrim.physics import Command, PointMass, State, small, so3
+from retrim.physics.actuators import Lagged
+
+DT, TAU = 0.02, 0.033
+L1 = L1Estimator(jnp.array(-0.2), jnp.exp(jnp.array(-DT / 0.3)), DT)
+
+
+def mppi(estimator=None, samples=256, seed=0):
+    numbers = (jnp.array(v) for v in (0.05, 10.0, 1.0, 1.0))
+    return Mppi(
+        hover_task(),
+        Prediction(jnp.array(TAU), DT, 1),
+        small().command_min,
+        small().command_max,
+        random.key(seed),
+        estimator,
+        jnp.array([2.0, 1.0, 1.0, 1.0]),
+        *numbers,
+        samples=samples,
+        horizon=30,
+    )
+
+
+def test_attitudes_turn_as_one_by_one(key):
+    R = jax.vmap(lambda k: random_state(k).R)(random.split(key, 5))
+    w = jnp.concatenate([random.normal(key, (4, 3)), jnp.zeros((1, 3))])
+    found = _turned(jnp.moveaxis(R, 0, -1), w.T)
+    np.testing.assert_allclose(jnp.moveaxis(found, -1, 0), jax.vmap(lambda R, w: R @ so3.exp(w))(R, w), atol=1e-9)
+
+
+def test_a_plan_costs_what_it_does(key):
+    """Of a plan that stays where the vehicle should be: nothing; and a metre away: its distance, for the horizon."""
+    controller = mppi(samples=3)
+    hover = jnp.tile(Command.hover(float).vector()[None, :, None], (30, 1, 3))
+    wanted = jax.vmap(controller.task.wanted)(DT * jnp.arange(30.0))
+    for away in (0.0, 1.0):
+        x = State.at(jnp.array(GOAL) + jnp.array([away, 0.0, 0.0]))
+        cost = controller._costs(hover, x, Command.hover(float), wanted, jnp.zeros(3))
+        np.testing.assert_allclose(cost, 10.0 * away * 30 * DT, atol=1e-4)
+
+
+def test_more_samples_plan_better(key):
+    """Mean over seeds of the cost of the mean that is planned, from a start that is off and tilted."""
+    x = State(jnp.array([0.4, -0.3, 1.2]), so3.exp(jnp.array([0.2, -0.1, 0.3])), jnp.array([0.5, 0.0, -0.2]))
+    wanted = jax.vmap(hover_task().wanted)(DT * jnp.arange(30.0))
+
+    def planned(samples):
+        def cost(key):
+            controller = dataclasses.replace(mppi(samples=samples), key=key)
+            _, memory = controller(controller.init(x), jnp.array(0.0), x)
+            plan = jnp.concatenate([memory.mean[:1], memory.mean[:-1]])[:, :, None]
+            one = dataclasses.replace(controller, samples=1)
+            return one._costs(plan, x, Command.hover(float), wanted, jnp.zeros(3))[0]
+
+        return float(jnp.mean(jax.jit(jax.vmap(cost))(random.split(key, 16))))
+
+    few, some, many = (planned(n) for n in (8, 64, 512))
+    hover = mppi(samples=1)._costs(
+        jnp.tile(Command.hover(float).vector()[None, :, None], (30, 1, 1)),
+        x,
+        Command.hover(float),
+        wanted,
+        jnp.zeros(3),
+    )[0]
+    assert many < some < few
+    assert many < 0.9 * float(hover)
+
+
+@pytest.mark.parametrize("push", [0.0, 2.0])
+def test_it_hovers_within_the_limits_and_the_estimator_takes_the_push_off(push):
+    def flown(controller):
+        model, d = Lagged(PointMass(DT), jnp.array(TAU)), jnp.full(3, push)
+
+        def tick(carry, k):
+            s, memory, waiting = carry
+            u, memory = controller(memory, DT * k, model.state(s))
+            s = model.step(s, waiting, d)
+            return (s, memory, u), (model.state(s).p, u.vector())
+
+        x0 = State.at(jnp.array([0.8, -0.5, 1.4]))
+        first = (model.init(x0), controller.init(x0), Command.hover(x0.p.dtype))
+        return jax.jit(lambda: lax.scan(tick, first, jnp.arange(300.0))[1])()
+
+    errors = []
+    for estimator in (None, L1):
+        p, u = flown(mppi(estimator))
+        low, high = small().command_min.vector(), small().command_max.vector()
+        assert bool(jnp.all((u >= low[None]) & (u <= high[None])))
+        errors.append(float(jnp.mean(jnp.sqrt(jnp.sum((p[-100:] - jnp.array([GOAL])) ** 2, axis=1)))))
+    assert errors[1] < 0.15
+    if push:
+        assert errors[1] < 0.5 * errors[0]

@@ -1,0 +1,47 @@
+"""The L1 estimator converges to a constant as its law says, whatever the vehicle does meanwhile."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax, random
+
+from retrim.estimation.l1 import L1Estimator
+from retrim.physics import State, so3
+
+DT = 0.02
+
+
+def estimates(estimator, d, key, ticks=400):
+    """Estimates of a vehicle that tumbles under random thrust and a disturbance ``d``, by tick."""
+
+    def tick(carry, k):
+        x, memory = carry
+        k_c, k_w = random.split(k)
+        thrust = (9.81 + 3.0 * random.normal(k_c)) * x.R[:, 2]
+        v = x.v + DT * (thrust + jnp.array([0.0, 0.0, -9.81]) + d)
+        x = State(x.p + DT * x.v, x.R @ so3.exp(DT * random.normal(k_w, (3,))), v)
+        memory = estimator(memory, x, thrust)
+        return (x, memory), memory.d_hat
+
+    x = State.at(jnp.zeros(3))
+    return lax.scan(tick, (x, estimator.init(x)), random.split(key, ticks))[1]
+
+
+@pytest.mark.parametrize("pole", [-0.01, -0.2, -2.0])
+@pytest.mark.parametrize("tau", [0.2, 2.0])
+def test_it_converges_to_a_constant_with_its_time_constant(pole, tau, key):
+    d = jnp.array([2.0, -0.5, 1.0])
+    estimator = L1Estimator(jnp.array(pole), jnp.exp(jnp.array(-DT / tau)), DT)
+    found = np.asarray(jax.jit(lambda: estimates(estimator, d, key))())
+    t = DT * np.arange(1, len(found) + 1)
+    expected = np.asarray(d) * (1.0 - np.exp(-t / tau))[:, None]
+    np.testing.assert_allclose(found, expected, atol=2.0 * DT * abs(pole) * 1.1 + 1e-3)  # the law is exact to A_s dt
+    np.testing.assert_allclose(found[0] / found[-1], -np.expm1(-DT / tau) / -np.expm1(-t[-1] / tau), rtol=0.05)
+
+
+def test_it_is_linear_in_the_disturbance(key):
+    estimator = L1Estimator(jnp.array(-0.2), jnp.array(0.95), DT)
+    one, other = jnp.array([1.0, 0.0, -2.0]), jnp.array([0.0, 3.0, 0.5])
+    a, b, both = (estimates(estimator, d, key, ticks=50) for d in (one, other, one + 2.0 * other))
+    np.testing.assert_allclose(both, a + 2.0 * b, atol=1e-9)
