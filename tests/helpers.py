@@ -2,18 +2,23 @@
 
 import dataclasses
 import math
+from functools import partial
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax import random
+import numpy as np
+from jax import lax, random
 
+from retrim import learn
 from retrim.config import changed, load
 from retrim.learn import Env, Window
 from retrim.physics import AbstractSubstepDynamics, Command, PointMass, State, small, so3
 from retrim.tasks import Hover, StateObs
 
 GOAL = (0.0, 0.0, 1.0)
+
+residual_targets = eqx.filter_jit(learn.residual_targets)  # one program instead of one for each operation
 
 
 class CheapModel(AbstractSubstepDynamics[State]):
@@ -61,14 +66,22 @@ def random_field_flight(field, key, *, n=100, delay_ticks=0):
 
     Commands act ``delay_ticks`` ticks after they were issued.
     """
-    model, commands, states = PointMass(0.02), [], [State.at(jnp.array(GOAL))]
-    step = jax.jit(lambda x, u: model.step(x, u, field(x, u)))
-    for k in random.split(key, n):
+    return _field_flight(field, key, n, delay_ticks)
+
+
+@partial(jax.jit, static_argnums=(0, 2, 3))
+def _field_flight(field, key, n, delay_ticks):
+    model = PointMass(0.02)
+
+    def command(k):
         kc, kw = random.split(k)
-        commands.append(Command(9.81 + random.normal(kc, ()), 0.5 * random.normal(kw, (3,))))
-        acting = commands[-1 - delay_ticks] if len(commands) > delay_ticks else Command.hover()
-        states.append(step(states[-1], acting))
-    return Window(0.02 * jnp.arange(float(n)), stacked(states[:n]), stacked(commands), jnp.ones(n, dtype=bool))
+        return Command(9.81 + random.normal(kc, ()), 0.5 * random.normal(kw, (3,)))
+
+    commands = jax.vmap(command)(random.split(key, n))
+    hover = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (delay_ticks, *leaf.shape)), Command.hover(float))
+    acting = jax.tree.map(lambda early, all_: jnp.concatenate([early, all_])[:n], hover, commands)
+    _, states = lax.scan(lambda x, u: (model.step(x, u, field(x, u)), x), State.at(jnp.array(GOAL)), acting)
+    return Window(0.02 * jnp.arange(float(n)), states, commands, jnp.ones(n, dtype=bool))
 
 
 def tiny_preset(**changes):
@@ -82,7 +95,7 @@ def tiny_preset(**changes):
 
 
 def stacked(trees):
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
+    return jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *trees)
 
 
 def replaced(module, **fields):

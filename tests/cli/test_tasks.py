@@ -69,6 +69,7 @@ def test_a_family_asks_which_to_fly(folder):
 def test_vision_learns_to_see_and_flies_with_occlusion(folder):
     words = "--config", "see.toml", "--out", "v"
     assert "vision error in its own model" in retrim("pretrain", "vision", *words, cwd=folder)
-    retrim("fly", "--policy", "v", "--seconds", "3", "--disturbance", "none", "--out", "vf", cwd=folder)
+    words = "--adapt", "base-do", "--seconds", "3", "--disturbance", "none", "--out", "vf"  # 03_vision.py adapts
+    retrim("fly", "--policy", "v", *words, cwd=folder)
     assert (folder / "vf" / "vision_none.png").exists()
     assert results(folder / "vf")["rows"][0]["n"] == 1

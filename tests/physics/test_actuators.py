@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from jax import lax, random
 
-from helpers import GOAL, random_command, random_state, replaced, stacked
-from retrim.learn import Window, residual_targets
+from helpers import GOAL, random_command, random_state, replaced, residual_targets, stacked
+from retrim.learn import Window
 from retrim.physics import Command, Hybrid, Lagged, PointMass, State, StraightThrough, f_a, so3
 from retrim.physics.actuators import LagState
 

@@ -3,6 +3,7 @@
 import math
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 
 from ..adapt.learner import OnlineLearner
@@ -79,7 +80,7 @@ def check_frame(preset: Preset, task: AbstractTask) -> None:
             "filter, which [vision] occlusion = true has"
         )
     try:
-        task.in_frame(FeltFrame.of(jnp.zeros(3)))
+        eqx.filter_eval_shape(lambda: task.in_frame(FeltFrame.of(jnp.zeros(3))))
     except FrameError as error:
         raise ConfigError(f"task {preset.task!r} has no frame of felt gravity: {error}") from error
 

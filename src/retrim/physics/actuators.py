@@ -67,7 +67,7 @@ class Lagged(AbstractDynamics[LagState[X]]):
     @property
     def settling_ticks(self) -> Float[Array, ""]:
         """Three time constants, on top of the base model's settling time [ticks]."""
-        return jnp.ceil(3.0 * self.tau / self.dt) + self.base.settling_ticks
+        return jnp.ceil(3.0 * self.tau / self.dt - 0.01) + self.base.settling_ticks  # whole ticks are, to rounding
 
     def init(self, x: State) -> LagState[X]:
         """Lift to the base model's state, with the actuators at hover."""

@@ -8,6 +8,7 @@ import dataclasses
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .propeller import Propeller, five_inch, three_inch
@@ -80,7 +81,7 @@ class Vehicle(eqx.Module):
             value = getattr(self, field.name)
             if isinstance(value, eqx.Module):
                 continue
-            if not bool(jnp.all(jnp.isfinite(value) & (value > 0))):
+            if not np.all(np.isfinite(value) & (np.asarray(value) > 0)):  # no program to compile for each check
                 raise ValueError(f"Vehicle.{field.name} = {value} must be positive and finite")
         if self.thrust_max <= self.mass * STANDARD_GRAVITY:
             raise ValueError(

@@ -80,14 +80,7 @@ class Keypoints(AbstractObservation[KeypointMemory]):
         plain = cls(Camera.published(), goal, omega_max, jnp.array(noise), jnp.zeros(70), jnp.eye(70), dt)
         if not whitened:
             return plain
-        key = random.key(0)
-        frames = jax.vmap(lambda k: plain.stacked(plain.history(*random_motion(k, goal))))(random.split(key, 20000))
-        mean = jnp.mean(frames, axis=0)
-        centred = frames - mean[None]
-        # symmetric: unique, so that a policy means the same on every machine; the floor is one pixel's variance
-        lam, V = jnp.linalg.eigh(centred.T @ centred / frames.shape[0])
-        scale = (jnp.maximum(lam, 0.0) + 1e-5) ** -0.5
-        whitened_: Keypoints = eqx.tree_at(lambda o: (o.mean, o.whiten), plain, (mean, (V * scale[None]) @ V.T))
+        whitened_: Keypoints = eqx.tree_at(lambda o: (o.mean, o.whiten), plain, _whitening(plain))
         return whitened_
 
     @property
@@ -163,6 +156,19 @@ class Keypoints(AbstractObservation[KeypointMemory]):
 def key_of(x: State) -> Key[Array, ""]:
     """Return the key of the noise of a flight that starts in ``x``."""
     return random.key(lax.bitcast_convert_type(jnp.sum(x.p + x.v).astype(jnp.float32), jnp.int32))
+
+
+@eqx.filter_jit
+def _whitening(plain: Keypoints) -> tuple[Float[Array, "70"], Float[Array, "70 70"]]:
+    """Return mean and whitening matrix of the frames of random short motions, always the same ones."""
+    keys = random.split(random.key(0), 20000)
+    frames = jax.vmap(lambda k: plain.stacked(plain.history(*random_motion(k, plain.goal))))(keys)
+    mean = jnp.mean(frames, axis=0)
+    centred = frames - mean[None]
+    # symmetric: unique, so that a policy means the same on every machine; the floor is one pixel's variance
+    lam, V = jnp.linalg.eigh(centred.T @ centred / frames.shape[0])
+    scale = (jnp.maximum(lam, 0.0) + 1e-5) ** -0.5
+    return mean, (V * scale[None]) @ V.T
 
 
 def random_motion(key: Key[Array, ""], goal: Float[Array, "3"]) -> tuple[State, Float[Array, "3"]]:

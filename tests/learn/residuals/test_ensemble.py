@@ -8,8 +8,8 @@ import optax
 import pytest
 from jax import random
 
-from helpers import GOAL, random_command, random_field_flight, random_state, replaced
-from retrim.learn import EnsembleModel, FittedResidual, ResidualModel, residual_targets
+from helpers import GOAL, random_command, random_field_flight, random_state, replaced, residual_targets
+from retrim.learn import EnsembleModel, FittedResidual, ResidualModel
 from retrim.learn.residuals import EnsembleResidual, EnsembleState, fit_ensemble
 from retrim.learn.residuals.ensemble import _spectral
 from retrim.physics import Command, PointMass, State, small
@@ -20,7 +20,8 @@ pytestmark = pytest.mark.usefixtures("optax_promotion")
 
 
 def ensemble(key, members=3, hidden=(128, 128)):
-    return EnsembleResidual.of(jnp.array(GOAL), small().omega_max, key=key, members=members, hidden=hidden)
+    fresh = eqx.filter_jit(EnsembleResidual.of)
+    return fresh(jnp.array(GOAL), small().omega_max, key=key, members=members, hidden=hidden)
 
 
 def linear_drag(x, u):

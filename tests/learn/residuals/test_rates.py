@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from jax import lax, random
 
-from helpers import random_state, replaced
-from retrim.learn import Window, residual_targets
+from helpers import random_state, replaced, residual_targets
+from retrim.learn import Window
 from retrim.learn.residuals import RateModel
 from retrim.physics import Command, Lagged, PointMass, so3
 from retrim.physics.actuators import RateBiased

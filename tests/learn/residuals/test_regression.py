@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from jax import random
 
-from helpers import random_command, random_field_flight, random_state, replaced
-from retrim.learn import residual_targets
+from helpers import random_command, random_field_flight, random_state, replaced, residual_targets
 from retrim.learn.residuals import RegressionModel, Targets
 from retrim.learn.residuals.regression import BLOCK, features_of
 from retrim.physics import PointMass, so3

@@ -13,6 +13,8 @@ from ...physics.dynamics import AbstractDynamics
 from ...physics.state import Command, State
 from ..window import Window
 
+ROUNDING = 0.01  # ticks: an age that is a whole number of ticks counts as one
+
 
 class Targets(eqx.Module):
     """Rows of a residual fit: inputs, the acceleration that the model missed, and which rows count."""
@@ -97,7 +99,7 @@ def _acting(window: Window, rows: int, delay_ticks: int, dt: float) -> tuple[Com
         return (1.0 - weight) * leaf[before] + weight * leaf[before + 1]
 
     acting: Command = jax.tree.map(mixed, window.u)
-    return acting, (at >= 0.0) & window.valid[before]
+    return acting, (at > -ROUNDING) & window.valid[before]
 
 
 def _turned(before: Float[Array, "3 3"], after: Float[Array, "3 3"]) -> Float[Array, "3"]:
