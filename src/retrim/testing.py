@@ -22,6 +22,7 @@ from .learn.residuals.targets import Targets
 from .physics import so3
 from .physics.state import STANDARD_GRAVITY, Command, State
 from .plants.plant import Plant, as_numpy
+from .tasks.observation import AbstractObservation
 from .tasks.task import AbstractTask
 
 
@@ -102,15 +103,15 @@ def check_task(task: AbstractTask, *, starts: int = 16) -> None:
         AssertionError: A law does not hold.
     """
     keys = random.split(random.key(0), starts)
-    x0 = jax.jit(jax.vmap(task.reset))(keys)
-    again = jax.jit(jax.vmap(task.reset))(keys)
+    reset = jax.jit(jax.vmap(task.reset))
+    x0, again = reset(keys), reset(keys)
     _require(all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(x0)), "starts are finite")
     _close(x0.x.p, again.x.p, 0.0, "a start follows from its key")
     _require(starts < 2 or not np.array_equal(x0.x.p[0], x0.x.p[1]), "starts differ")
-    _require(not bool(jax.vmap(task.terminated)(x0.t, x0.x).any()), "no start is terminated")
+    _require(not bool(jax.jit(jax.vmap(task.terminated))(x0.t, x0.x).any()), "no start is terminated")
     one = jax.tree.map(lambda leaf: leaf[0], x0)
     u = Command.hover()
-    reward, slopes = jax.value_and_grad(lambda x, u: task.reward(one.t, x, u), argnums=(0, 1))(one.x, u)
+    reward, slopes = _slopes(task, one.t, one.x, u)
     _require(jnp.shape(reward) == (), "the reward is a scalar")
     _require(
         all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((reward, slopes))), "reward and gradient are finite"
@@ -126,14 +127,24 @@ def check_task(task: AbstractTask, *, starts: int = 16) -> None:
     off = float(task.error(one.t, State.at(task.target(one.t))))
     _require(abs(off) < 1e-3, "the error at the target is zero")
     for observation, name in ((task.observation, "training"), (task.observation_in_flight, "flight")):
-        memory = observation.init(one.x)
-        o, later = observation(memory, one.t, one.x, u)
+        memory, (o, later) = _observed(observation, one.t, one.x, u)
         _require(o.shape == (observation.size,), f"the observation of {name} has its stated size")
         _require(bool(np.isfinite(o).all()), f"the observation of {name} is finite")
         _require(_shapes(memory) == _shapes(later), f"the memory of the observation of {name} keeps its shapes")
     _require(
         task.observation.size == task.observation_in_flight.size, "training and flight observe equally many numbers"
     )
+
+
+@eqx.filter_jit
+def _slopes(task: AbstractTask, t: Any, x: State, u: Command) -> Any:
+    return jax.value_and_grad(lambda x, u: task.reward(t, x, u), argnums=(0, 1))(x, u)
+
+
+@eqx.filter_jit
+def _observed(observation: AbstractObservation[Any], t: Any, x: State, u: Command) -> Any:
+    memory = observation.init(x)
+    return memory, observation(memory, t, x, u)
 
 
 def check_controller(controller: AbstractController[Any], *, x0: State | None = None) -> None:

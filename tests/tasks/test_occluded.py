@@ -46,7 +46,8 @@ def sure(observation, x):
 
 
 def gentle(key, n):
-    return [Command(9.81 + 0.5 * random.normal(k, ()), 0.3 * random.normal(k, (3,))) for k in random.split(key, n)]
+    draws = jax.jit(jax.vmap(lambda k: (random.normal(k, ()), random.normal(k, (3,)))))(random.split(key, n))
+    return [Command(jnp.asarray(9.81 + 0.5 * c), jnp.asarray(0.3 * w)) for c, w in zip(*map(np.asarray, draws))]
 
 
 def test_while_everything_is_seen_it_shows_what_training_shows(key):

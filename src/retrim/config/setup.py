@@ -4,6 +4,7 @@ import math
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
 import jax
@@ -32,6 +33,7 @@ from ..runtime.lockstep import LockstepLearner
 from ..runtime.pilot import Pilot
 from ..tasks.hover import TILT, Hover
 from ..tasks.keypoints import Keypoints
+from ..tasks.observation import StateObs
 from ..tasks.reference import Reference
 from ..tasks.task import AbstractTask
 from .learners import felt_frame, make_learner
@@ -226,9 +228,7 @@ class Setup:
 
         They follow from the seed and the home alone, so that all presets of a task fly from the same ones.
         """
-        nearby = Hover(self.flown.home(), self.flown.observation, jnp.array(1.0), jnp.array(TILT))
-        key = random.fold_in(random.key(seed), START_TAG)
-        batch = jax.jit(lambda key: jax.vmap(nearby.reset)(random.split(key, n)).x)(key)
+        batch = _starts(self.flown.home(), random.fold_in(random.key(seed), START_TAG), n)
         return [jax.tree.map(lambda leaf, i=i: jnp.asarray(np.asarray(leaf)[i]), batch) for i in range(n)]
 
     def limits_exceeded(self, vehicle: Vehicle | None = None) -> str | None:
@@ -244,3 +244,10 @@ class Setup:
 @jax.jit
 def _low_rank(policy: Policy, key: Key[Array, ""]) -> LoraPolicy:
     return LoraPolicy.of(policy, key=key)
+
+
+@partial(jax.jit, static_argnames="n")
+def _starts(home: Float[Array, "3"], key: Key[Array, ""], n: int) -> State:
+    nearby = Hover(home, StateObs(home, jnp.ones_like(home), 0), jnp.array(1.0), jnp.array(TILT))
+    begun: State = jax.vmap(nearby.reset)(random.split(key, n)).x
+    return begun
