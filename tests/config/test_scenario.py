@@ -124,6 +124,7 @@ def test_what_is_random_follows_from_the_seed():
 
 BOUNDS = {
     "push": (-10.0, 10.0),
+    "push-x": (-10.0, 10.0),
     "step": (-10.0, 10.0),
     "kick": (0.0, 10.0),
     "reversing": (-10.0, 10.0),

@@ -47,7 +47,9 @@ def sure(observation, x):
 
 def gentle(key, n):
     draws = jax.jit(jax.vmap(lambda k: (random.normal(k, ()), random.normal(k, (3,)))))(random.split(key, n))
-    return [Command(jnp.asarray(9.81 + 0.5 * c), jnp.asarray(0.3 * w)) for c, w in zip(*map(np.asarray, draws))]
+    return [
+        Command(jnp.asarray(9.81 + 0.5 * c), jnp.asarray(0.3 * w)) for c, w in zip(*map(np.asarray, draws), strict=True)
+    ]
 
 
 def test_while_everything_is_seen_it_shows_what_training_shows(key):

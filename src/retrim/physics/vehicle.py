@@ -4,11 +4,11 @@ The quadrotors are functions rather than constants, since an array made at impor
 """
 
 import dataclasses
+import math
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from .propeller import Propeller, five_inch, three_inch
@@ -81,7 +81,8 @@ class Vehicle(eqx.Module):
             value = getattr(self, field.name)
             if isinstance(value, eqx.Module):
                 continue
-            if not np.all(np.isfinite(value) & (np.asarray(value) > 0)):  # no program to compile for each check
+            numbers = value.tolist() if value.ndim else [value.item()]  # no program is compiled for a check
+            if not all(math.isfinite(number) and number > 0 for number in numbers):
                 raise ValueError(f"Vehicle.{field.name} = {value} must be positive and finite")
         if self.thrust_max <= self.mass * STANDARD_GRAVITY:
             raise ValueError(

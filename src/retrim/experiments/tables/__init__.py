@@ -2,6 +2,7 @@
 
 from .ablation import ablation as ablation
 from .buses import buses as buses
+from .design import design as design
 from .fast import fast as fast
 from .gauntlet import gauntlet as gauntlet
 from .hover import hover as hover
@@ -12,5 +13,5 @@ from .tracking import tracking as tracking
 from .tuning import tuning as tuning
 from .vision import vision as vision
 
-MADE = (hover, reversing, tracking, vision, plants, model, fast, ablation, buses, tuning)
+MADE = (hover, reversing, tracking, vision, plants, model, fast, ablation, design, buses, tuning)
 """Those of ``retrim reproduce``; the gauntlet is a command of its own."""

@@ -20,6 +20,7 @@ from ..reporter import Reporter
 from ..run import Run
 from ..training import nominal_error, train
 from .document import Document, TableSection
+from .kept import keep, kept, section_key
 
 LEVELS = {"none": "no disturbance", "small": "small, 0.5 m/s² per axis", "large": "large, 2 m/s² per axis"}
 """The paper's disturbances, and what they are called."""
@@ -143,6 +144,14 @@ def fly_levels(document: Document, sections: Sequence[Levels], *, starts: int, s
     for section in sections:
         refuse_misfits(section.preset, section.scenarios, methods=section.methods, starts=starts, seconds=seconds)
     for section in sections:
+        name = section_key(
+            preset=dump(section.preset), scenarios=[repr(each) for each in section.scenarios], title=section.title,
+            methods=list(section.methods), seeds=list(document.seeds), starts=starts, seconds=seconds,
+        )  # fmt: skip
+        if (made := kept(run, name)) is not None:
+            reporter.say(f"{section.title}: as an earlier run of this folder has made it")
+            document.add(*made)
+            continue
         key = dump(section.preset)
         if key not in studies:
             studies[key] = train_all(section.preset, document.seeds, run, reporter)
@@ -151,6 +160,8 @@ def fly_levels(document: Document, sections: Sequence[Levels], *, starts: int, s
             document.add(*made)
         if run.interrupted:
             break
+        if made is not None:
+            keep(run, name, *made)
     document.write()
 
 

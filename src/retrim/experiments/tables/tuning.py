@@ -22,11 +22,11 @@ from ..run import Run
 from .document import Document, TableSection
 
 CONDITIONS = (
-    ("hover/retrim", Scenario("push=1.2", sensors="onboard")),
-    ("hover/retrim", Scenario("gusts=3+step=-1.5")),
-    ("track/retrim", Scenario("wind=5+push=-0.8", sensors="onboard", reference="figure8")),
+    ("hover/retrim", "push=1.2", "onboard", None),
+    ("hover/retrim", "gusts=3+step=-1.5", "ideal", None),
+    ("track/retrim", "wind=5+push=-0.8", "onboard", "figure8"),
 )
-"""Preset, for task and declared lag, and where it is flown."""
+"""Preset, for task and declared lag; disturbance, sensors and reference."""
 CRASH = 1.0  # [m], the error that a crashed flight counts as
 SETTLING = 3.0  # [s] at the start that do not count
 
@@ -59,8 +59,8 @@ def tuning(
     if unknown := [name for name in methods if name not in BASELINES]:
         raise ConfigError(f"{', '.join(unknown)}: no baseline with settings; there are {', '.join(BASELINES)}")
     conditions = "; ".join(
-        f"{preset.partition('/')[0]}{f' ({s.reference})' if s.reference else ''}, {s.disturbance}, sensors {s.sensors}"
-        for preset, s in CONDITIONS
+        f"{preset.partition('/')[0]}{f' ({reference})' if reference else ''}, {disturbed}, sensors {sensors}"
+        for preset, disturbed, sensors, reference in CONDITIONS
     )
     intro = (
         f"Made by `retrim reproduce tuning`. {candidates} candidates for each method, drawn evenly in the logarithm "
@@ -75,10 +75,11 @@ def tuning(
         tried = [dict(BASELINES[name].settings), *_drawn(BASELINES[name], candidates, seed)]
         with run.interruptible(), reporter.progress(name) as advance:
             scores = np.zeros(len(tried))
-            for i, (preset, scenario) in enumerate(CONDITIONS):
+            for i, (preset, disturbed, sensors, reference) in enumerate(CONDITIONS):
+                scenario = Scenario(disturbed, plant, sensors=sensors, reference=reference)
                 advance(i / len(CONDITIONS), f"condition {i + 1} of {len(CONDITIONS)}")
                 found = _flown(BASELINES[name], tried, Setup.of(load(preset), scenario.reference), scenario,
-                               starts=starts, seconds=seconds, seed=seed, plant=plant, stop=run.stop)  # fmt: skip
+                               starts=starts, seconds=seconds, seed=seed, stop=run.stop)  # fmt: skip
                 scores += np.array(found) / len(CONDITIONS)
             document.add(_section(name, tried, scores), _rows(name, tried, scores))
     document.write()
@@ -101,17 +102,15 @@ def _flown(
     starts: int,
     seconds: float,
     seed: int,
-    plant: str,
     stop: Any,
 ) -> list[float]:
     """Mean error of each candidate, all flown as one batch."""
     specs = [FlightSpec(scenario, "base", start, seed) for start in range(starts)]
     begun, dt = setup.flight_starts(starts, seed), setup.preset.dt
-    made = [Scenario(scenario.disturbance, plant, sensors=scenario.sensors).make("small", dt=dt, seed=s.plant_seed)
-            for _ in tried for s in specs]  # fmt: skip
+    made = [scenario.make("small", dt=dt, seed=spec.plant_seed) for _ in tried for spec in specs]
     plants = [each for each in made if isinstance(each, SimPlant)]
     if len(plants) < len(made):
-        raise ConfigError(f"plant {plant!r}: candidates are flown as one batch, which bem and simple can be")
+        raise ConfigError(f"plant {scenario.plant!r}: candidates are flown as one batch, which bem and simple can be")
     pilots = [ControllerPilot(baseline.make(setup, settings, spec.key())) for settings in tried for spec in specs]
     logs = fly_together(plants, pilots, begun * len(tried), ticks=round(seconds / dt), stop=stop)
     flights = [scored(setup, specs[0], until_terminated(setup.flown, log)) for log in logs]

@@ -1,0 +1,140 @@
+"""The paper's design study (Sec. IV-C): which model is simulated, and through what the gradient flows."""
+
+import time
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax import random
+from jaxtyping import Array, Key
+
+from ..config.scenario import Scenario
+from ..config.setup import Setup
+from ..control.controller import PolicyController
+from ..control.policy import Policy
+from ..learn.bptt import PolicyState
+from ..learn.env import Env
+from ..learn.pretrain import train_chunk
+from ..learn.residuals.ensemble import EnsembleResidual, EnsembleState, fit_ensemble
+from ..learn.residuals.targets import Targets, residual_targets
+from ..learn.window import Window
+from ..physics.dynamics import AbstractDynamics, Hybrid, PointMass, StraightThrough
+from ..physics.rotors import LinearDragQuadrotor
+from ..plants.sim import SimPlant
+from ..runtime.flight import Log
+from ..runtime.pilot import ControllerPilot
+from ..runtime.together import fly_together
+from .flights import FlightSpec
+
+PUSH, PLANT = "push-x=2", "bem"  # the paper's push: 2 m/s^2 along +x
+ROLLOUTS, ROLLOUT_S = 50, 3.0
+FIT_EPOCHS, POLICY_EPOCHS, ENVS = 200, 100, 100
+CHUNK = 10  # epochs of one program
+SCORED_S = 10.0  # [s]
+
+CHOICES = {
+    "low fidelity, res-fwd": (False, False),
+    "low fidelity, res-fwd + res-back": (False, True),
+    "high fidelity, res-fwd": (True, False),
+    "high fidelity, res-fwd + res-back": (True, True),
+}
+"""Whether the simulated model has rotors, and whether gradients flow through the residual."""
+
+
+class Trained(NamedTuple):
+    """What one choice came to."""
+
+    policy: Policy
+    compile_s: float
+    epoch_s: list[float]
+    """Time of an epoch, of each program that was run [s]."""
+    residual_rms: float
+    """What the fit left [m/s^2]."""
+
+
+def flown(setup: Setup, policy: Policy, n: int, seconds: float, seed: int) -> list[Log]:
+    """Fly a policy as it is from random starts, on the study's plant, as one batch."""
+    scenario = Scenario(PUSH, PLANT)
+    specs = [FlightSpec(scenario, "base", start, seed) for start in range(n)]
+    plants = [scenario.make(setup.preset.vehicle, dt=setup.preset.dt, seed=spec.plant_seed) for spec in specs]
+    controller = PolicyController(setup.flown.observation_in_flight, policy)
+    return fly_together(
+        [plant for plant in plants if isinstance(plant, SimPlant)],
+        [ControllerPilot(controller) for _ in specs],
+        setup.flight_starts(n, seed),
+        ticks=round(seconds / setup.preset.dt),
+    )
+
+
+def design_dynamics(setup: Setup, residual: Any, *, rotors: bool, backprop: bool) -> AbstractDynamics[Any]:
+    """Return the model of a choice: what is simulated, and what the gradient flows through.
+
+    Args:
+        setup: Vehicle and control period.
+        residual: What was learnt for the simulated model.
+        rotors: Simulate rotors, thrust map, drag and the rate controller; their gradient is the point mass's.
+        backprop: Let gradients flow through the residual, too.
+    """
+    simple = PointMass(setup.preset.dt)
+    if not rotors:
+        return Hybrid(simple, residual, backprop=backprop)
+    forward = Hybrid(_rotors(setup), residual)
+    return StraightThrough(forward, Hybrid(simple, residual, backprop=True) if backprop else simple)
+
+
+def retrained(setup: Setup, policy: Policy, logs: Sequence[Log], key: Key[Array, ""], *, rotors: bool, backprop: bool,
+              fit_epochs: int = FIT_EPOCHS, epochs: int = POLICY_EPOCHS, envs: int = ENVS) -> Trained:  # fmt: skip
+    """Fit one residual network to flights, and re-train the policy with it.
+
+    Args:
+        setup: Preset of the policy.
+        policy: Where training begins.
+        logs: The flights.
+        key: Consumed.
+        rotors: See :func:`design_dynamics`.
+        backprop: See :func:`design_dynamics`.
+        fit_epochs: Of the residual network.
+        epochs: Of the policy; a multiple of ten.
+        envs: Roll-outs of an epoch.
+    """
+    k_fit, k_train = random.split(key)
+    nominal: AbstractDynamics[Any] = _rotors(setup) if rotors else PointMass(setup.preset.dt)
+    rows = _rows([log.window(len(log.t) - 1) for log in logs], nominal, setup.preset.plant_delay_ticks)
+    adam = optax.adam(setup.preset.adapt.fit_learning_rate)
+    residual = EnsembleResidual.of(setup.flown.home(), setup.vehicle.omega_max, key=k_fit, members=1)
+    fitted, errors = _fitted(EnsembleState.of(residual, adam), rows, adam, fit_epochs)
+    dynamics = design_dynamics(setup, fitted.residual, rotors=rotors, backprop=backprop)
+    env = Env(dynamics, setup.env.task, setup.env.delay_ticks)
+    optimiser = optax.adam(setup.preset.adapt.learning_rate)
+    state = PolicyState(policy, optimiser.init(policy.params))
+    times = list[float]()
+    for k in random.split(k_train, 1 + epochs // CHUNK):  # the first one compiles, and is not kept
+        began = time.perf_counter()
+        after, _ = jax.block_until_ready(train_chunk(state, env, k, optimiser, CHUNK, envs))
+        times.append(time.perf_counter() - began)
+        state = after if len(times) > 1 else state
+    run = float(np.median(times[1:]))
+    return Trained(state.policy.merged(), times[0] - run, [t / CHUNK for t in times[1:]], float(errors[-1]) ** 0.5)
+
+
+def _rotors(setup: Setup) -> LinearDragQuadrotor:
+    return LinearDragQuadrotor.of(setup.vehicle, setup.preset.dt, thrust_error=0.0)
+
+
+def _rows(windows: Sequence[Window], nominal: AbstractDynamics[Any], delay_ticks: int) -> Targets:
+    together = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *windows)
+    many: Targets = eqx.filter_jit(
+        lambda nominal, windows: jax.vmap(lambda w: residual_targets(w, nominal, delay_ticks=delay_ticks))(windows)
+    )(nominal, together)
+    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), many)  # type: ignore[no-any-return]
+
+
+@eqx.filter_jit
+def _fitted(
+    state: EnsembleState, rows: Targets, optimiser: optax.GradientTransformation, steps: int
+) -> tuple[EnsembleState, Array]:
+    return fit_ensemble(state, rows, optimiser=optimiser, steps=steps, spectral_weight=1e-3)

@@ -1,0 +1,47 @@
+"""Sections that a run has finished are kept in its folder: the same command goes on where it was killed."""
+
+import dataclasses
+import hashlib
+import json
+from typing import Any
+
+from ..provenance import commit, versions
+from ..run import Run
+from .document import TableSection
+
+FOLDER = "sections"
+
+
+def section_key(**what: Any) -> str:
+    """Return what tells a section apart: everything that it follows from, and the code that makes it.
+
+    Args:
+        **what: Numbers, texts, and lists and dictionaries of them.
+    """
+    text = json.dumps({"commit": commit(), "versions": versions(), **what}, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def keep(run: Run, key: str, section: TableSection, rows: list[dict[str, Any]]) -> None:
+    """Write a section and the rows behind it to the folder of the run."""
+    whole = dataclasses.asdict(section) | {"picture": None if section.picture is None else section.picture.name}
+    run.write_text(f"{FOLDER}/{key}.json", json.dumps({"section": whole, "rows": rows}) + "\n")
+
+
+def kept(run: Run, key: str) -> tuple[TableSection, list[dict[str, Any]]] | None:
+    """Return a section that an earlier run of this folder has finished, with its rows; None if there is none.
+
+    Local changes to the code are told by nothing but ``-dirty``, so that with them nothing counts as finished.
+    """
+    path = run.folder / FOLDER / f"{key}.json"
+    if commit().endswith("-dirty") or not path.is_file():
+        return None
+    try:
+        found = json.loads(path.read_text())
+        whole, rows = found["section"], found["rows"]
+        picture = None if whole["picture"] is None else run.folder / whole["picture"]
+        lines = tuple(tuple(row) for row in whole["rows"])
+        section = TableSection(tuple(whole["columns"]), lines, whole["title"], whole["about"], picture)
+    except (OSError, ValueError, KeyError, TypeError):
+        return None  # it is made again
+    return None if picture is not None and not picture.is_file() else (section, rows)

@@ -1,0 +1,123 @@
+"""Training of DATT: tracking of random references under a random disturbance, in the nominal model with lag."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import random
+from jaxtyping import Array, Float, Int, Key
+
+from ..control.datt import AHEAD, APART, datt_command, datt_observation
+from ..physics import so3
+from ..physics.actuators import lagged
+from ..physics.dynamics import PointMass
+from ..physics.state import Command, State
+from .ppo import Outcome
+
+EPISODE = 500  # ticks
+WALK = 0.02  # [m/s^2], standard deviation of a step of the disturbance, per axis
+DISCOUNT = 0.99
+KNOWN = 1.0  # [m/s^2], largest disturbance per axis
+
+
+class DattEnv(NamedTuple):
+    """An episode under way."""
+
+    x: State
+    acting: Command
+    """What the actuators make of the commands so far."""
+    d: Float[Array, "3"]
+    """Disturbance, world [m/s^2]."""
+    reference: Int[Array, ""]
+    """Its number in the bank."""
+    tick: Int[Array, ""]
+
+
+class DattProblem(eqx.Module):
+    """The environment; see :class:`retrim.learn.ppo.Problem`."""
+
+    bank: Float[Array, "n ticks 3"]
+    """References, around the origin [m]."""
+    tau: Float[Array, ""]
+    """Time constant of the actuators [s]."""
+    low: Command
+    high: Command
+    dt: float = eqx.field(static=True, default=0.02)
+
+    def reset(self, key: Key[Array, ""]) -> DattEnv:
+        """Begin beside the start of a random reference, somewhat tilted, under a random disturbance."""
+        k_p, k_v, k_a, k_yaw, k_d, k_r = random.split(key, 6)
+        number = random.randint(k_r, (), 0, self.bank.shape[0])
+        p = self.bank[number, 0] + random.uniform(k_p, (3,), minval=-0.7, maxval=0.7)
+        tilt = jnp.append(0.3 * random.uniform(k_a, (2,), minval=-1.0, maxval=1.0), 0.0)
+        R = so3.rotz(0.5 * random.normal(k_yaw, ())) @ so3.exp(tilt)
+        x = State(p, R, 0.3 * random.normal(k_v, (3,)))
+        d = random.uniform(k_d, (3,), minval=-KNOWN, maxval=KNOWN)
+        return DattEnv(x, Command.hover(p.dtype), d, number, jnp.array(0))
+
+    def observe(self, s: DattEnv, key: Key[Array, ""]) -> Float[Array, " o"]:
+        """Return what the policy sees, with 5 mm of noise on the position, as DATT has it."""
+        every = round(APART / self.dt)
+        at = jnp.minimum(s.tick + every * jnp.arange(AHEAD), self.bank.shape[1] - 1)
+        x = State(s.x.p + 0.005 * random.normal(key, (3,), s.x.p.dtype), s.x.R, s.x.v)
+        return datt_observation(x, s.acting, s.d, self.bank[s.reference, at])
+
+    def step(self, s: DattEnv, action: Float[Array, "4"], key: Key[Array, ""]) -> tuple[DattEnv, Outcome]:
+        """Fly a tick; the reward is DATT's: minus the distance, half the heading, and a tenth of the speed."""
+        mean, acting = lagged(s.acting, datt_command(action, self.low, self.high), self.dt, self.tau)
+        x = PointMass(self.dt).step(s.x, mean, s.d)
+        d = jnp.clip(s.d + WALK * random.normal(key, (3,), s.d.dtype), -KNOWN, KNOWN)
+        after = DattEnv(x, acting, d, s.reference, s.tick + 1)
+        away = jnp.sqrt(jnp.sum((x.p - self.bank[s.reference, s.tick + 1]) ** 2) + 1e-12)
+        heading = jnp.arctan2(x.R[1, 0], x.R[0, 0])
+        speed = jnp.sqrt(jnp.sum(x.v * x.v) + 1e-12)
+        reward = -(jnp.minimum(away, 5.0) + 0.5 * jnp.abs(heading) + 0.1 * jnp.minimum(speed, 1.0))
+        lost = away > 5.0
+        reward = jnp.where(lost, reward / (1.0 - DISCOUNT), reward)  # as if it stayed there for ever
+        return after, Outcome(reward, lost, after.tick >= EPISODE)
+
+
+def reference_bank(seed: int, n: int = 512, *, dt: float = 0.02) -> np.ndarray:
+    """Return random references: a quarter points, a quarter zigzags, half chains of polynomials.
+
+    Args:
+        seed: All follow from it.
+        n: Number of references.
+        dt: Time between rows [s].
+
+    Returns:
+        Positions around the origin, shape (n, ticks, 3) [m].
+    """
+    draw, ticks = np.random.default_rng(seed), EPISODE + AHEAD * round(APART / dt) + 1
+    t = dt * np.arange(ticks)
+    bank = np.zeros((n, ticks, 3))
+    for i in range(n):
+        if i % 4 == 1:
+            bank[i] = _zigzag(draw, t)
+        elif i % 4 > 1:
+            bank[i] = _chain(draw, t)
+    return bank
+
+
+def _zigzag(draw: np.random.Generator, t: np.ndarray) -> np.ndarray:
+    """Straight lines between way-points on alternating sides, of 0.6 to 1.5 s each."""
+    knots = np.concatenate([[0.0], np.cumsum(draw.uniform(0.6, 1.5, 30))])
+    sides = np.where(np.arange(len(knots)) % 2, 1.0, -1.0)[:, None]
+    points = sides * draw.uniform(0.0, 1.0, (len(knots), 3)) * np.array([1.0, 1.0, 0.3])
+    points[0] = 0.0
+    return np.stack([np.interp(t, knots, points[:, axis]) for axis in range(3)], axis=1)
+
+
+def _chain(draw: np.random.Generator, t: np.ndarray) -> np.ndarray:
+    """Cubics through the origin, axis by axis, of 1.2 to 4 s each, whose speeds at the knots agree."""
+    path = np.zeros((len(t), 3))
+    for axis, share in enumerate((1.0, 1.0, 0.3)):
+        knots = np.concatenate([[0.0], np.cumsum(draw.uniform(1.2, 4.0, 12))])
+        speeds = share * draw.uniform(-2.5, 2.5, len(knots))
+        speeds[0] = 0.0
+        which = np.clip(np.searchsorted(knots, t, side="right") - 1, 0, len(knots) - 2)
+        T = knots[which + 1] - knots[which]
+        s = (t - knots[which]) / T
+        path[:, axis] = T * (speeds[which] * s * (1 - s) ** 2 - speeds[which + 1] * s**2 * (1 - s))
+    return path

@@ -1,0 +1,241 @@
+"""Proximal policy optimisation (Schulman et al. 2017): learning from rewards alone, for what has no gradient.
+
+Many environments are stepped at once; advantages are estimated as in Schulman et al. 2016; a few passes over what was
+seen, in minibatches, maximise the clipped objective. An episode that is cut off by its time limit, and not by what the
+vehicle did, goes on in the estimate by the value of where it was cut. Values are sums of rewards scaled by 1 - gamma,
+so that they are of the size of a reward whatever the discount.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar, runtime_checkable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from jax import lax, random
+from jaxtyping import Array, Bool, Float, Int, Key
+
+S = TypeVar("S")
+
+
+class Outcome(NamedTuple):
+    """What a step of an environment led to."""
+
+    reward: Float[Array, ""]
+    terminated: Bool[Array, ""]
+    """The episode is over, and nothing more can be won."""
+    truncated: Bool[Array, ""]
+    """The episode is cut off by its time limit."""
+
+
+@runtime_checkable
+class Problem(Protocol, Generic[S]):
+    """An environment to learn in; all are pure functions of one state."""
+
+    def reset(self, key: Key[Array, ""]) -> S:
+        """Return the state at the start of an episode; the key is consumed."""
+        ...
+
+    def observe(self, s: S, key: Key[Array, ""]) -> Float[Array, " o"]:
+        """Return the observation; the key is for its noise."""
+        ...
+
+    def step(self, s: S, action: Float[Array, " a"], key: Key[Array, ""]) -> tuple[S, Outcome]:
+        """Return the next state, and what the action led to."""
+        ...
+
+
+@runtime_checkable
+class ActorCritic(Protocol):
+    """A policy, its exploration, and its judgement of a state; an :class:`equinox.Module`."""
+
+    log_std: Float[Array, " a"]
+    """Logarithm of the standard deviation of actions."""
+
+    def __call__(self, o: Float[Array, " o"]) -> tuple[Float[Array, " a"], Float[Array, ""]]:
+        """Return the mean action and the value of an observation."""
+        ...
+
+
+@dataclass(frozen=True)
+class PpoSettings:
+    """Sizes and rates of the learning."""
+
+    envs: int = 256
+    steps: int = 64
+    """Steps of each environment between two updates."""
+    minibatches: int = 4
+    epochs: int = 4
+    """Passes over what was seen."""
+    learning_rate: float = 1e-3
+    """At the beginning; it falls to zero along a cosine."""
+    discount: float = 0.99
+    trace: float = 0.95
+    """lambda of the generalised advantage estimate."""
+    clip: float = 0.2
+    value_cost: float = 0.5
+    entropy_gain: float = 0.0
+    max_grad_norm: float = 0.5
+
+    def __post_init__(self) -> None:
+        """Raise ``ValueError`` if what is seen cannot be split into the minibatches."""
+        if (self.envs * self.steps) % self.minibatches:
+            raise ValueError(f"PPO: {self.envs} x {self.steps} samples cannot be split into {self.minibatches} batches")
+
+    def updates(self, steps: int) -> int:
+        """Return the number of updates in which at least so many steps are made."""
+        return -(-steps // (self.envs * self.steps))
+
+
+class PpoState(eqx.Module):
+    """Everything that learning goes on from."""
+
+    net: Any
+    """The :class:`ActorCritic`."""
+    optimiser: Any
+    envs: Any
+    """States of the environments."""
+    key: Key[Array, ""]
+
+
+class Seen(NamedTuple):
+    """Samples, with leading axes of steps and environments."""
+
+    o: Float[Array, "... o"]
+    action: Float[Array, "... a"]
+    log_prob: Float[Array, "..."]
+    value: Float[Array, "..."]
+    outcome: Outcome
+    """Its reward is scaled by 1 - gamma, so that values are means of rewards; what a truncated episode would have gone on
+    to win is in it."""
+
+
+def ppo(
+    problem: Problem[Any], net: Any, key: Key[Array, ""], settings: PpoSettings, *, steps: int
+) -> Iterator[tuple[Any, dict[str, float]]]:
+    """Learn.
+
+    Args:
+        problem: The environment.
+        net: Where learning begins: an :class:`ActorCritic`.
+        key: Consumed.
+        settings: Sizes and rates.
+        steps: Steps of all environments together.
+
+    Yields:
+        After each update the network, and figures: mean reward of a step, loss, and the share of clipped samples.
+    """
+    updates = settings.updates(steps)
+    rate = optax.cosine_decay_schedule(settings.learning_rate, updates * settings.epochs * settings.minibatches)
+    optimiser = optax.chain(optax.clip_by_global_norm(settings.max_grad_norm), optax.adam(rate, eps=1e-5))
+    k_reset, k_learn = random.split(key)
+    envs = jax.jit(jax.vmap(problem.reset))(random.split(k_reset, settings.envs))
+    state = PpoState(net, optimiser.init(eqx.filter(net, eqx.is_inexact_array)), envs, k_learn)
+    for _ in range(updates):
+        state, figures = update(problem, state, optimiser, settings)
+        yield state.net, {name: float(value) for name, value in figures.items()}
+
+
+@eqx.filter_jit
+def update(
+    problem: Problem[Any], state: PpoState, optimiser: optax.GradientTransformation, settings: PpoSettings
+) -> tuple[PpoState, dict[str, Float[Array, ""]]]:
+    """Step the environments, and make one update from what was seen."""
+    k_next, k_roll, k_epochs = random.split(state.key, 3)
+    envs, seen, last, reward = _rolled(problem, state.net, state.envs, k_roll, settings)
+    advantage = advantages(seen, last, settings.discount, settings.trace)
+    samples = (seen, advantage, advantage + seen.value)
+    size = settings.envs * settings.steps
+    flat = jax.tree.map(lambda leaf: leaf.reshape(size, *leaf.shape[2:]), samples)
+    arrays, fixed = eqx.partition(state.net, eqx.is_inexact_array)
+
+    def minibatch(carry: Any, rows: Int[Array, " n"]) -> tuple[Any, dict[str, Array]]:
+        arrays, moments = carry
+        batch = jax.tree.map(lambda leaf: leaf[rows], flat)
+        slopes, figures = jax.grad(_loss, has_aux=True)(arrays, fixed, batch, settings)
+        steps, moments = optimiser.update(slopes, moments, arrays)
+        return (eqx.apply_updates(arrays, steps), moments), figures
+
+    def epoch(carry: Any, key: Key[Array, ""]) -> tuple[Any, dict[str, Array]]:
+        order = random.permutation(key, size).reshape(settings.minibatches, -1)
+        return lax.scan(minibatch, carry, order)
+
+    keys = random.split(k_epochs, settings.epochs)
+    (arrays, moments), figures = lax.scan(epoch, (arrays, state.optimiser), keys)
+    mean = {name: jnp.mean(values) for name, values in figures.items()}
+    after = PpoState(eqx.combine(arrays, fixed), moments, envs, k_next)
+    return after, {"reward": reward, **mean}
+
+
+def advantages(seen: Seen, last: Float[Array, " envs"], discount: float, trace: float) -> Float[Array, "steps envs"]:
+    """Return the generalised advantage estimates (Schulman et al. 2016, Eq. 16).
+
+    Args:
+        seen: Samples; an episode that ends in one does not go on in the next.
+        last: Value of the states after the last step.
+        discount: gamma.
+        trace: lambda.
+    """
+    over = seen.outcome.terminated | seen.outcome.truncated
+
+    def back(carry: Any, row: Any) -> tuple[Any, Array]:
+        later, value_later = carry
+        reward, over, value = row
+        goes_on = jnp.where(over, 0.0, discount)
+        advantage = reward + goes_on * value_later - value + goes_on * trace * later
+        return (advantage, value), advantage
+
+    rows = (seen.outcome.reward, over, seen.value)
+    found: Array = lax.scan(back, (jnp.zeros_like(last), last), rows, reverse=True)[1]
+    return found
+
+
+def log_prob(action: Float[Array, " a"], mean: Float[Array, " a"], log_std: Float[Array, " a"]) -> Float[Array, ""]:
+    """Return the logarithm of the density of an action, normal around ``mean``."""
+    scaled = (action - mean) * jnp.exp(-log_std)
+    return jnp.sum(-0.5 * scaled * scaled - log_std) - 0.5 * action.shape[0] * jnp.log(2.0 * jnp.pi)
+
+
+def _rolled(
+    problem: Problem[Any], net: Any, envs: Any, key: Key[Array, ""], settings: PpoSettings
+) -> tuple[Any, Seen, Float[Array, " envs"], Float[Array, ""]]:
+    """Step all environments; where an episode ends, the next one begins."""
+
+    def one(s: Any, key: Key[Array, ""]) -> tuple[Any, tuple[Seen, Array]]:
+        k_see, k_act, k_step, k_new, k_after = random.split(key, 5)
+        o = problem.observe(s, k_see)
+        mean, value = net(o)
+        action = mean + jnp.exp(net.log_std) * random.normal(k_act, mean.shape, mean.dtype)
+        after, outcome = problem.step(s, action, k_step)
+        beyond = settings.discount * net(problem.observe(after, k_after))[1]
+        cut = outcome.truncated & ~outcome.terminated
+        reward = (1.0 - settings.discount) * outcome.reward + jnp.where(cut, beyond, 0.0)
+        over, fresh = outcome.terminated | outcome.truncated, problem.reset(k_new)
+        s = jax.tree.map(lambda new, old: jnp.where(over, new, old), fresh, after)
+        seen = Seen(o, action, log_prob(action, mean, net.log_std), value, outcome._replace(reward=reward))
+        return s, (seen, outcome.reward)
+
+    def step(envs: Any, key: Key[Array, ""]) -> tuple[Any, tuple[Seen, Array]]:
+        return jax.vmap(one)(envs, random.split(key, settings.envs))
+
+    k_steps, k_last = random.split(key)
+    envs, (seen, rewards) = lax.scan(step, envs, random.split(k_steps, settings.steps))
+    last = jax.vmap(lambda s, k: net(problem.observe(s, k))[1])(envs, random.split(k_last, settings.envs))
+    return envs, seen, last, jnp.mean(rewards)
+
+
+def _loss(arrays: Any, fixed: Any, batch: Any, settings: PpoSettings) -> tuple[Array, dict[str, Array]]:
+    """Return the clipped objective with its sign turned, and figures."""
+    net, (seen, advantage, target) = eqx.combine(arrays, fixed), batch
+    advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8)
+    mean, value = jax.vmap(net)(seen.o)
+    now = jax.vmap(log_prob, in_axes=(0, 0, None))(seen.action, mean, net.log_std)
+    ratio = jnp.exp(now - seen.log_prob)
+    kept = jnp.clip(ratio, 1.0 - settings.clip, 1.0 + settings.clip)
+    gain = jnp.mean(jnp.minimum(ratio * advantage, kept * advantage))
+    missed = jnp.mean((value - target) ** 2)
+    entropy = jnp.sum(net.log_std)
+    loss = -gain + settings.value_cost * missed - settings.entropy_gain * entropy
+    return loss, {"loss": loss, "clipped": jnp.mean(jnp.abs(ratio - 1.0) > settings.clip), "missed": missed}

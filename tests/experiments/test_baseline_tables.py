@@ -1,0 +1,79 @@
+"""The tables of the baselines' settings and of the design study, at reduced size."""
+
+import importlib
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import random
+
+from commands import retrim
+from helpers import random_command, random_state, tiny_preset
+from retrim import Setup
+from retrim.config import named_presets
+from retrim.config.baselines import BASELINES
+from retrim.experiments import design
+
+design_table = importlib.import_module("retrim.experiments.tables.design")  # the package has a function of that name
+
+pytestmark = pytest.mark.usefixtures("as_a_user")
+
+
+def test_every_baseline_has_a_range_for_every_setting_that_it_does_not_switch_off():
+    for baseline in BASELINES.values():
+        assert {name for name, value in baseline.settings.items() if value} <= set(baseline.ranges)
+        assert all(0.0 < low < high for low, high in baseline.ranges.values())
+
+
+def test_settings_are_searched_by_their_command(tmp_path):
+    words = "--methods", "indi", "--candidates", "3", "--starts", "1", "--seconds", "4", "--plant", "simple"
+    out = retrim("reproduce", "tuning", *words, "--out", "t", cwd=tmp_path)
+    assert "| present |" in out
+    rows = json.loads((tmp_path / "t" / "tuning.json").read_text())["rows"]
+    assert [row["method"] for row in rows] == ["indi"] * 4
+    assert rows[0]["settings"] == dict(BASELINES["indi"].settings)
+    for row in rows[1:]:
+        assert all(low <= row["settings"][name] <= high for name, (low, high) in BASELINES["indi"].ranges.items())
+    assert 0.0 < rows[0]["score"] < 0.3
+    assert "no baseline with settings" in retrim("reproduce", "tuning", "--methods", "base", cwd=tmp_path, code=1)
+
+
+@pytest.mark.parametrize("rotors", [False, True])
+def test_gradients_through_the_residual_change_gradients_alone(rotors, key):
+    setup = Setup.of(tiny_preset())
+    x, u = random_state(key, 0.3), random_command(key)
+
+    def end(x, backprop):
+        model = design.design_dynamics(setup, lambda x, u: -0.5 * x.v, rotors=rotors, backprop=backprop)
+        return jnp.sum(model.state(model.step(model.init(x), u, jnp.zeros(3))).v)
+
+    without, through = (jax.jit(jax.value_and_grad(lambda x, b=b: end(x, b)))(x) for b in (False, True))
+    np.testing.assert_allclose(without[0], through[0], rtol=1e-6)
+    np.testing.assert_allclose(through[1].v - without[1].v, -0.5 * 0.02, rtol=0.05)
+
+
+def test_the_design_study_by_its_command(tmp_path, monkeypatch):
+    monkeypatch.setitem(named_presets.PRESETS, "hover/fast", tiny_preset())
+    monkeypatch.setattr(design, "CHUNK", 10)
+    for name, small in (("ROLLOUTS", 2), ("ROLLOUT_S", 1.0), ("SCORED_S", 3.0)):
+        monkeypatch.setattr(design_table, name, small)
+    monkeypatch.setattr(design_table, "CHOICES", dict(list(design.CHOICES.items())[:2]))
+    out = retrim("reproduce", "design", "--seeds", "0", "--starts", "1", "--epochs", "10", "--out", "d", cwd=tmp_path)
+    assert "low fidelity, res-fwd + res-back" in out
+    rows = json.loads((tmp_path / "d" / "design.json").read_text())["rows"]
+    assert [row["model"] for row in rows] == list(design.CHOICES)[:2]
+    assert all(time > 0 for row in rows for time in row["epoch_s"])
+    said = retrim("reproduce", "design", "--epochs", "15", cwd=tmp_path, code=1)
+    assert "--epochs 15 must be a positive multiple of 10" in said
+
+
+def test_a_policy_is_retrained_from_where_it_was():
+    setup = Setup.of(tiny_preset())
+    policy = setup.new_policy(random.key(0))
+    logs = design.flown(setup, policy, 2, 1.0, 0)
+    made = design.retrained(setup, policy, logs, random.key(1), rotors=False, backprop=False,
+                            fit_epochs=20, epochs=10, envs=4)  # fmt: skip
+    assert made.residual_rms < 3.0
+    assert any(np.any(a.weight != b.weight) for a, b in zip(made.policy.layers, policy.layers, strict=True))
