@@ -4,6 +4,7 @@ import dataclasses
 import importlib
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -14,13 +15,14 @@ from made_up import DT, flight, log
 from retrim import Scenario, Setup, changed, load
 from retrim.config import named_presets as presets
 from retrim.config.presets import Adapt
-from retrim.experiments import Run
+from retrim.experiments import Run, rivals
 from retrim.experiments.reporter import Silent
 from retrim.experiments.tables.document import Document, TableSection
 from retrim.experiments.tables.reversing import METHODS, _errors, _moments, _section
 from retrim.experiments.tables.study import Levels, fly_levels, train_all
 
-fast = importlib.import_module("retrim.experiments.tables.fast")  # the package has a function of that name
+# The package has functions of some of these names.
+fast, kept, study = (importlib.import_module(f"retrim.experiments.tables.{name}") for name in ("fast", "kept", "study"))
 
 pytestmark = pytest.mark.usefixtures("as_a_user")
 
@@ -33,11 +35,13 @@ def test_a_table_of_hover_by_its_command(tmp_path, monkeypatch):
     small = changed(tiny_preset(), pretrain=TINY, adapt={**SOON, "num_updates": 2, "num_envs": 2})
     monkeypatch.setitem(presets.PRESETS, "hover/fast", small)
     words = "--presets", "fast", "--seeds", "0", "3", "--seconds", "1", "--starts", "1", "--plant", "simple"
+    words += "--methods", "base", "indi", "full", "lora"
     out = retrim("reproduce", "hover", *words, "--out", "t", cwd=tmp_path)
     text = (tmp_path / "t" / "hover.md").read_text()
     assert text.startswith("# Hover (Table I of the paper)\n")
     assert "training seeds 0, 3." in text
-    assert "| paper, base | 0.128 ± 0.004 | 0.328 ± 0.001 | 1.228 ± 0.073 |" in text
+    assert " (0.128 ± 0.004) |" in text
+    assert "| DATT, the paper's | (0.013 ± 0.004) | (0.009 ± 0.005) | (0.231 ± 0.004) |" in text
     assert "t/hover.md" in out
     found = results(tmp_path / "t", "hover.json")
     methods = list(dict.fromkeys(row["method"] for row in found["rows"]))
@@ -59,7 +63,9 @@ def test_a_section_of_tracking_has_cross_track_and_the_papers_rows(tmp_path):
         adapt={**SOON, "num_updates": 2, "num_envs": 2},
     )
     scenario = Scenario(plant="simple", reference="circle")
-    circle = Levels("circle", preset, scenario, "x", ("base", "lora"), (("base", ("1", "2", "3")),))
+    circle = Levels(
+        "circle", preset, scenario, "x", ("base", "lora"), {"base": ("1", "2", "3"), "datt": ("4", "5", "6")}
+    )
     document = Document(Run("test", tmp_path), "table", "Title", "Intro.", [0], Silent())
     fly_levels(document, [circle], starts=1, seconds=1.0)
     (section,), found = document.sections, results(tmp_path, "table.json")["rows"]
@@ -67,11 +73,55 @@ def test_a_section_of_tracking_has_cross_track_and_the_papers_rows(tmp_path):
         (level, method, "circle") for level in LEVELS for method in ("base", "lora")
     ]
     assert [row[0] for row in section.rows] == [
-        "base policy", "... cross-track", "**adapted, LoRA**", "... cross-track", "paper, base"
+        "base policy", "... cross-track", "**adapted, LoRA**", "... cross-track", "DATT, the paper's"
     ]  # fmt: skip
-    assert section.rows[-1] == ("paper, base", "1", "2", "3")
+    assert section.rows[0][1].endswith(" (1)")
+    assert section.rows[-1] == ("DATT, the paper's", "(4)", "(5)", "(6)")
     assert section.rows[1][1] == f"{found[0]['cross_track_m']:.3f}"
     assert section.picture == tmp_path / "x.png"
+
+
+def test_a_run_goes_on_where_it_was_killed(tmp_path, monkeypatch):
+    """What is finished is not flown again, and the table is the same; another size, or other code, is flown."""
+    preset = changed(tiny_preset(), pretrain=TINY)
+    sections = [Levels(f"{n}", preset, Scenario(plant="simple"), f"x{n}", ("base", "indi")) for n in (1, 2)]
+    monkeypatch.setattr(kept, "commit", lambda: "abc")
+    flown = []
+    made = study._level_section
+    monkeypatch.setattr(study, "_level_section", lambda *a, **k: flown.append(a[1].title) or made(*a, **k))
+
+    def table(sections, starts=1):
+        document = Document(Run("test", tmp_path), "table", "Title", "Intro.", [0], Silent())
+        fly_levels(document, sections, starts=starts, seconds=1.0)
+        return document.sections, results(tmp_path, "table.json")["rows"]
+
+    table(sections[:1])  # and killed
+    whole = table(sections)
+    again = table(sections)
+    assert flown == ["1", "2"]
+    assert whole == again
+    table(sections, starts=2)
+    assert flown == ["1", "2"] * 2
+    monkeypatch.setattr(kept, "commit", lambda: "abc-dirty")
+    table(sections[:1])
+    assert flown[4:] == ["1"]
+
+
+def test_datt_is_trained_once_for_a_folder(tmp_path):
+    """Of a seed and a vehicle; a file that is damaged is made again."""
+    said = []
+    reporter = Silent()
+    reporter.say = said.append
+    run, preset = Run("test", tmp_path), load("hover/retrim")
+    first = rivals.trained_datt(preset, [0, 1], run, reporter, steps=20_000)
+    again = rivals.trained_datt(preset, [0], run, reporter, steps=20_000)
+    jax.tree.map(np.testing.assert_array_equal, first[0], again[0])
+    assert any(np.any(a != b) for a, b in zip(jax.tree.leaves(first[0]), jax.tree.leaves(first[1]), strict=True))
+    (file,) = tmp_path.glob("datt_*_seed0.safetensors")
+    file.write_bytes(file.read_bytes()[:-100])
+    other = rivals.trained_datt(preset, [0], run, reporter, steps=20_000)
+    assert "trained again" in said[0]
+    jax.tree.map(np.testing.assert_array_equal, first[0], other[0])
 
 
 def test_a_table_of_fast_flight_flies_a_file_too(tmp_path):

@@ -21,6 +21,7 @@ from ..experiments.tables.study import LEVELS, Study, fly_all, level_table
 from ..experiments.training import nominal_error, train
 from .console import RichReporter, console, show_paths, show_table, started
 
+SHOWN = ("base", "full")
 WHY = {
     "hover/retrim": "felt gravity turns the frame in milliseconds, a closed-form residual and short bursts do the rest",
     "hover/fast": "the paper's loop with a command delay in the model, trained in seconds",
@@ -78,7 +79,7 @@ def _demo(
         run.write_results(found, seeds=[seed], preset=preset.name, losses=losses)
         write_events(flights, run.folder)
     title = f"steady-state hover error [m]: mean ± std over {starts} starts, last 2 s of {seconds:g} s"
-    show_table(level_table(found, ("base", "full"), PAPER, title))
+    show_table(level_table(found, SHOWN, {method: PAPER[method] for method in SHOWN}, title))
     console.print(run.watch.sentence())
     pictures = [path for each in scenarios for path in picture(flights, setup, each, run.folder)]
     show_paths([path for path in pictures if path.suffix == ".png"])

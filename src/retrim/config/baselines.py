@@ -12,11 +12,13 @@ from jax import random
 from jaxtyping import Array, Key
 
 from ..control.controller import AbstractController
+from ..control.datt import Datt, DattNet
 from ..control.geometric import Gains, Geometric
 from ..control.indi import Incremental
 from ..control.mppi import Mppi
 from ..estimation.l1 import L1Estimator
 from ..estimation.prediction import Prediction
+from ..learn.datt import KNOWN
 
 if TYPE_CHECKING:
     from .setup import Setup
@@ -24,6 +26,8 @@ if TYPE_CHECKING:
 ACTUATOR_TAU = 0.033  # [s], where a preset declares no lag: what quadrotors of this size have
 INTEGRAL_LIMIT = 6.0  # [m/s^2], as the largest disturbance that the policies' observer answers
 L1_POLE = -0.2  # [1/s], as flown on hardware with DATT; its size hardly matters while it is small beside 1 / dt
+
+DATT_ESTIMATOR = 0.5  # [s], time constant of the filter; DATT's own is 2 s
 
 Settings = Mapping[str, float]
 
@@ -80,6 +84,15 @@ def _mppi(setup: "Setup", s: Settings, key: Key[Array, ""]) -> Mppi:
         jnp.array(s["position"]),
         jnp.array(s["velocity"]),
         jnp.array(s["attitude"]),
+    )
+
+
+def datt_of(setup: "Setup", net: DattNet) -> Datt:
+    """Return a trained network of DATT in flight."""
+    dt, vehicle = setup.preset.dt, setup.vehicle
+    estimator = L1Estimator(jnp.array(L1_POLE), jnp.exp(jnp.array(-dt / DATT_ESTIMATOR)), dt)
+    return Datt(
+        net, setup.flown, prediction_of(setup), estimator, jnp.array(KNOWN), vehicle.command_min, vehicle.command_max
     )
 
 

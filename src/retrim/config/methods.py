@@ -3,20 +3,19 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 from jaxtyping import Array, Key
 
 from ..adapt.learner import LearnerState
 from ..control.controller import PolicyController
+from ..control.datt import DattNet
 from ..control.integral import IntegralAction
-from ..control.lora import LoraPolicy
-from ..control.policy import Policy
 from ..errors import ConfigError
 from ..runtime.pilot import ControllerPilot, Pilot
 from ..tasks.keypoints import Keypoints
-from .baselines import BASELINES, Baseline
+from .baselines import BASELINES, Baseline, datt_of
 from .learners import check_frame, felt_frame
 from .registry import Registry
 
@@ -29,7 +28,8 @@ class MethodRequest:
     """What is asked of a method."""
 
     setup: "Setup"
-    policy: Policy | LoraPolicy
+    policy: Any
+    """A policy; for a method with a network of its own, that network."""
     key: Key[Array, ""] | None = None
     """Seed of what is random in the method; None where nothing is."""
     latency: "Latency" = "fixed"
@@ -97,6 +97,12 @@ def _without_policy(baseline: Baseline, request: MethodRequest) -> Pilot:
     return ControllerPilot(baseline.controller(request.setup, request.key))
 
 
+def _datt(request: MethodRequest) -> Pilot:
+    if not isinstance(request.policy, DattNet):
+        raise ConfigError("method 'datt' flies a network of its own: `retrim reproduce hover --methods datt` trains it")
+    return ControllerPilot(datt_of(request.setup, request.policy))
+
+
 def _full(request: MethodRequest) -> Pilot:
     return request.setup.adaptive_pilot(request.policy, request.needed_key(), request.latency, request.state)
 
@@ -112,5 +118,6 @@ register_method("base-i", MethodEntry(_integral, "base policy + integral action"
 register_method("base-do", MethodEntry(_gravity_frame, "base policy + disturbance observer"))
 for _name, _baseline in BASELINES.items():
     register_method(_name, MethodEntry(partial(_without_policy, _baseline), _baseline.label))
+register_method("datt", MethodEntry(_datt, "DATT"))
 register_method("full", MethodEntry(_full, "**adapted, all weights**"))
 register_method("lora", MethodEntry(_lora, "**adapted, LoRA**"))

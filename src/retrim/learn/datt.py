@@ -79,7 +79,7 @@ class DattProblem(eqx.Module):
 
 
 def reference_bank(seed: int, n: int = 512, *, dt: float = 0.02) -> np.ndarray:
-    """Return random references: a quarter points, a quarter zigzags, half chains of polynomials.
+    """Return random references: points, zigzags, chains of polynomials and Lissajous figures, a quarter each.
 
     Args:
         seed: All follow from it.
@@ -93,10 +93,8 @@ def reference_bank(seed: int, n: int = 512, *, dt: float = 0.02) -> np.ndarray:
     t = dt * np.arange(ticks)
     bank = np.zeros((n, ticks, 3))
     for i in range(n):
-        if i % 4 == 1:
-            bank[i] = _zigzag(draw, t)
-        elif i % 4 > 1:
-            bank[i] = _chain(draw, t)
+        if i % 4:
+            bank[i] = (_zigzag, _chain, _lissajous)[i % 4 - 1](draw, t)
     return bank
 
 
@@ -120,4 +118,14 @@ def _chain(draw: np.random.Generator, t: np.ndarray) -> np.ndarray:
         T = knots[which + 1] - knots[which]
         s = (t - knots[which]) / T
         path[:, axis] = T * (speeds[which] * s * (1 - s) ** 2 - speeds[which + 1] * s**2 * (1 - s))
+    return path
+
+
+def _lissajous(draw: np.random.Generator, t: np.ndarray) -> np.ndarray:
+    """A sine along each axis, of 2.5 to 6 s and up to 1.5 m, whose speed rises within the first two seconds."""
+    period, phase = draw.uniform(2.5, 6.0), draw.uniform(0.0, 2.0 * np.pi, 3)
+    size = draw.uniform(0.2, 1.0, 3) * np.array([1.5, 1.5, 0.3])
+    beats = np.array([1.0, draw.integers(1, 3), 1.0])
+    eased = np.where(t < 2.0, t**2 / 4.0, t - 1.0)
+    path: np.ndarray = size * (np.sin(2.0 * np.pi * np.outer(eased, beats) / period + phase) - np.sin(phase))
     return path

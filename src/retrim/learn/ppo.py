@@ -108,8 +108,7 @@ class Seen(NamedTuple):
     log_prob: Float[Array, "..."]
     value: Float[Array, "..."]
     outcome: Outcome
-    """Its reward is scaled by 1 - gamma, so that values are means of rewards; what a truncated episode would have gone on
-    to win is in it."""
+    """Its reward is scaled by 1 - gamma, and has what a truncated episode would have gone on to win."""
 
 
 def ppo(

@@ -6,6 +6,7 @@ from typing import Any
 
 from jax import random
 
+from ...config.baselines import BASELINES
 from ...config.loading import dump, load_for
 from ...config.methods import find_method
 from ...config.presets import Preset
@@ -17,6 +18,7 @@ from ..fleet import Fleet, Flights, told_by
 from ..limits import check_flights, check_seeds
 from ..metrics import cell, rows
 from ..reporter import Reporter
+from ..rivals import DATT_STEPS, RIVALS, check_steps
 from ..run import Run
 from ..training import nominal_error, train
 from .document import Document, TableSection
@@ -24,8 +26,15 @@ from .kept import keep, kept, section_key
 
 LEVELS = {"none": "no disturbance", "small": "small, 0.5 m/s² per axis", "large": "large, 2 m/s² per axis"}
 """The paper's disturbances, and what they are called."""
-PaperRows = tuple[tuple[str, tuple[str, str, str]], ...]
-"""Label and figures of the paper for the three levels [m]."""
+PaperRows = Mapping[str, tuple[str, str, str]]
+"""Figures of the paper for the three levels [m], by method."""
+METHODS = ("base", "base-i", "base-do", "geometric", "geometric-i", "indi", "mppi", "l1-mpc", "full", "lora")
+"""Those of the tables of the paper, but for what takes minutes of training."""
+
+
+def of_policies(methods: Sequence[str]) -> tuple[str, ...]:
+    """Return those methods that fly a policy of the table's preset."""
+    return tuple(method for method in methods if method not in BASELINES and method not in RIVALS)
 
 
 @dataclass(frozen=True)
@@ -33,7 +42,7 @@ class Study:
     """Policies of one preset, one per seed."""
 
     preset: Preset
-    policies: dict[int, Policy]
+    policies: dict[int, Any]
     errors: tuple[float, ...]
     """Error of each in its own model [m]."""
 
@@ -118,7 +127,7 @@ class Levels:
     stem: str
     """Name of the picture."""
     methods: Sequence[str] = ("base", "full", "lora")
-    paper: PaperRows = ()
+    paper: PaperRows = field(default_factory=dict)
     levels: Mapping[str, str] = field(default_factory=lambda: LEVELS)
     """Disturbances, and what they are called."""
 
@@ -128,7 +137,14 @@ class Levels:
         return [replace(self.scenario, disturbance=level) for level in self.levels]
 
 
-def fly_levels(document: Document, sections: Sequence[Levels], *, starts: int, seconds: float | None) -> None:
+def fly_levels(
+    document: Document,
+    sections: Sequence[Levels],
+    *,
+    starts: int,
+    seconds: float | None,
+    datt_steps: int = DATT_STEPS,
+) -> None:
     """Train, fly and lay out every section; the document is written after each, and when it is interrupted.
 
     Args:
@@ -136,17 +152,21 @@ def fly_levels(document: Document, sections: Sequence[Levels], *, starts: int, s
         sections: What to fly; a preset is trained once.
         starts: Flights per disturbance, method and seed.
         seconds: Length of a flight; the task's own by default.
+        datt_steps: Steps of training DATT, where it is among the methods.
 
     Raises:
         ConfigError: Something does not exist, or does not fit together; nothing has been trained.
     """
     run, reporter, studies = document.run, document.reporter, dict[str, Study]()
+    check_steps(datt_steps)
     for section in sections:
-        refuse_misfits(section.preset, section.scenarios, methods=section.methods, starts=starts, seconds=seconds)
+        own = [method for method in section.methods if method not in RIVALS]
+        refuse_misfits(section.preset, section.scenarios, methods=own, starts=starts, seconds=seconds)
     for section in sections:
         name = section_key(
             preset=dump(section.preset), scenarios=[repr(each) for each in section.scenarios], title=section.title,
             methods=list(section.methods), seeds=list(document.seeds), starts=starts, seconds=seconds,
+            datt_steps=datt_steps if "datt" in section.methods else 0,
         )  # fmt: skip
         if (made := kept(run, name)) is not None:
             reporter.say(f"{section.title}: as an earlier run of this folder has made it")
@@ -155,7 +175,9 @@ def fly_levels(document: Document, sections: Sequence[Levels], *, starts: int, s
         key = dump(section.preset)
         if key not in studies:
             studies[key] = train_all(section.preset, document.seeds, run, reporter)
-        made = _level_section(studies[key], section, run, reporter, starts=starts, seconds=seconds)
+        made = _level_section(
+            studies[key], section, run, reporter, starts=starts, seconds=seconds, datt_steps=datt_steps
+        )
         if made is not None:
             document.add(*made)
         if run.interrupted:
@@ -166,11 +188,25 @@ def fly_levels(document: Document, sections: Sequence[Levels], *, starts: int, s
 
 
 def _level_section(
-    study: Study, section: Levels, run: Run, reporter: Reporter, *, starts: int, seconds: float | None
+    study: Study,
+    section: Levels,
+    run: Run,
+    reporter: Reporter,
+    *,
+    starts: int,
+    seconds: float | None,
+    datt_steps: int,
 ) -> tuple[TableSection, list[dict[str, Any]]] | None:
     """The section and its rows of results; None if nothing was flown."""
     methods, title = section.methods, section.title
-    flown = fly_all(study, section.scenarios, run, reporter, methods=methods, starts=starts, seconds=seconds).flown
+    own = [method for method in methods if method not in RIVALS]
+    flown = fly_all(study, section.scenarios, run, reporter, methods=own, starts=starts, seconds=seconds).flown
+    for rival in (method for method in methods if method in RIVALS):
+        nets = RIVALS[rival](study.preset, tuple(study.policies), run, reporter, steps=datt_steps)
+        trained = Study(study.preset, nets, ())
+        flown += fly_all(
+            trained, section.scenarios, run, reporter, methods=[rival], starts=starts, seconds=seconds
+        ).flown
     if not flown:
         return None
     found = [{**row, "preset": study.preset.name, "section": title} for row in rows(flown)]
@@ -194,14 +230,17 @@ def level_table(
     title: str,
     levels: Mapping[str, str] = LEVELS,
 ) -> TableSection:
-    """Lay rows of results out as the paper does: methods down, levels of disturbance across, its own rows below."""
+    """Lay rows of results out as the paper does: methods down, disturbances across, its figures in brackets."""
     by = {(row["method"], row["disturbance"]): row for row in found}
     cells = list[tuple[str, ...]]()
     for method in methods:
         ours = [by.get((method, level)) for level in levels]
-        cells.append((find_method(method).label, *("-" if row is None else cell(row) for row in ours)))
+        theirs = [f" ({figure})" for figure in paper[method]] if method in paper else [""] * len(levels)
+        figures = ("-" if row is None else cell(row) + they for row, they in zip(ours, theirs, strict=True))
+        cells.append((find_method(method).label, *figures))
         cross = ["-" if row is None or "cross_track_m" not in row else f"{row['cross_track_m']:.3f}" for row in ours]
         if set(cross) != {"-"}:
             cells.append(("... cross-track", *cross))
-    cells += [(f"paper, {label}", *figures) for label, figures in paper]
+    absent = [method for method in paper if method not in methods]
+    cells += [(f"{find_method(m).label}, the paper's", *(f"({figure})" for figure in paper[m])) for m in absent]
     return TableSection(("error [m]", *levels.values()), tuple(cells), title)

@@ -6,29 +6,33 @@ from ...config.loading import changed
 from ...config.presets import Preset
 from ...config.scenario import Scenario
 from ..reporter import Reporter
+from ..rivals import DATT_STEPS
 from ..run import Run
 from .document import Document
-from .study import Levels, PaperRows, fly_levels, table_presets
+from .study import METHODS, Levels, PaperRows, fly_levels, of_policies, table_presets
 
 PAPER: dict[str, PaperRows] = {  # Table II [m]
-    "circle": (
-        ("base", ("0.365 ± 0.124", "0.571 ± 0.091", "1.479 ± 0.213")),
-        ("adapted", ("0.167 ± 0.048", "0.135 ± 0.101", "0.349 ± 0.175")),
-        ("LoRA", ("0.129 ± 0.051", "0.159 ± 0.043", "0.326 ± 0.061")),
-        ("best baseline", ("0.058 ± 0.016", "0.040 ± 0.024", "0.410 ± 0.155")),
-    ),
-    "figure8": (
-        ("base", ("0.313 ± 0.087", "0.492 ± 0.155", "1.363 ± 0.382")),
-        ("adapted", ("0.068 ± 0.040", "0.045 ± 0.030", "0.137 ± 0.098")),
-        ("LoRA", ("0.069 ± 0.047", "0.059 ± 0.043", "0.110 ± 0.037")),
-        ("best baseline", ("0.078 ± 0.037", "0.082 ± 0.046", "0.281 ± 0.097")),
-    ),
-    "star": (
-        ("base", ("0.453 ± 0.190", "0.467 ± 0.236", "0.844 ± 0.389")),
-        ("adapted", ("0.126 ± 0.094", "0.133 ± 0.075", "0.211 ± 0.116")),
-        ("LoRA", ("0.129 ± 0.069", "0.130 ± 0.099", "0.231 ± 0.076")),
-        ("best baseline", ("0.087 ± 0.059", "0.102 ± 0.093", "0.417 ± 0.086")),
-    ),
+    "circle": {
+        "base": ("0.365 ± 0.124", "0.571 ± 0.091", "1.479 ± 0.213"),
+        "l1-mpc": ("0.113 ± 0.027", "0.096 ± 0.063", "0.410 ± 0.155"),
+        "datt": ("0.058 ± 0.016", "0.040 ± 0.024", "crash"),
+        "full": ("0.167 ± 0.048", "0.135 ± 0.101", "0.349 ± 0.175"),
+        "lora": ("0.129 ± 0.051", "0.159 ± 0.043", "0.326 ± 0.061"),
+    },
+    "figure8": {
+        "base": ("0.313 ± 0.087", "0.492 ± 0.155", "1.363 ± 0.382"),
+        "l1-mpc": ("0.109 ± 0.063", "0.121 ± 0.025", "0.281 ± 0.097"),
+        "datt": ("0.078 ± 0.037", "0.082 ± 0.046", "crash"),
+        "full": ("0.068 ± 0.040", "0.045 ± 0.030", "0.137 ± 0.098"),
+        "lora": ("0.069 ± 0.047", "0.059 ± 0.043", "0.110 ± 0.037"),
+    },
+    "star": {
+        "base": ("0.453 ± 0.190", "0.467 ± 0.236", "0.844 ± 0.389"),
+        "l1-mpc": ("0.295 ± 0.086", "0.218 ± 0.111", "0.417 ± 0.086"),
+        "datt": ("0.087 ± 0.059", "0.102 ± 0.093", "crash"),
+        "full": ("0.126 ± 0.094", "0.133 ± 0.075", "0.211 ± 0.116"),
+        "lora": ("0.129 ± 0.069", "0.130 ± 0.099", "0.231 ± 0.076"),
+    },
 }
 INTRO = """\
 Made by `retrim reproduce tracking`. Mean distance from where the reference is at the time [m], over the last 10
@@ -36,7 +40,8 @@ s: mean ± standard deviation over flights. Cross-track: distance from the neare
 quadrotor. Presets `track/retrim` and `track/preview`: one policy, trained on all three references, sees them
 ahead; `track/retrim` is flown and adapted in the frame of the gravity that it feels. `track/paper`: the paper's
 observation o = [p, R, v] and reward, one policy per reference. Learning is charged to flight time by the
-preset's fixed latencies. The paper's rows are from its own plant; its circle and ours take 3 s."""
+preset's fixed latencies. In brackets the paper's figures, which are from its own plant; its circle and ours
+take 3 s."""
 
 
 def tracking(
@@ -44,7 +49,8 @@ def tracking(
     reporter: Reporter,
     *,
     presets: tuple[str, ...] = ("track/retrim", "track/preview", "track/paper"),
-    methods: tuple[str, ...] = ("base", "base-i", "base-do", "full", "lora"),
+    methods: tuple[str, ...] = METHODS,
+    datt_steps: int = DATT_STEPS,
     seeds: tuple[int, ...] = (0,),
     seconds: float = 60.0,
     starts: int = 8,
@@ -56,16 +62,21 @@ def tracking(
         run: Folder of tracking.md, tracking.json and the pictures.
         reporter: Receives progress and the sections.
         presets: Presets to train and fly.
-        methods: How they fly.
+        methods: How they fly, and baselines that need none of the policies; these fly once, beside the first preset.
+        datt_steps: Steps of training DATT, if it is among the methods.
         seeds: Training seeds.
         seconds: Length of a flight [s].
         starts: Flights per disturbance, method and seed.
         plant: Where the policies fly.
     """
     loaded = table_presets(presets, "track", seeds=seeds, starts=starts, seconds=seconds)
-    sections = [section for preset in loaded for section in _sections(preset, plant, methods)]
+    sections = [
+        section
+        for preset in loaded
+        for section in _sections(preset, plant, methods if preset is loaded[0] else of_policies(methods))
+    ]
     document = Document(run, "tracking", "Tracking (Table II of the paper)", INTRO, seeds, reporter)
-    fly_levels(document, sections, starts=starts, seconds=seconds)
+    fly_levels(document, sections, starts=starts, seconds=seconds, datt_steps=datt_steps)
 
 
 def _sections(preset: Preset, plant: str, methods: Sequence[str]) -> list[Levels]:
@@ -80,7 +91,7 @@ def _sections(preset: Preset, plant: str, methods: Sequence[str]) -> list[Levels
         unseen = changed(preset, track={"reference": "circle+star"})
         return [
             *(section(f"{name}, seen ahead", preset, name, paper) for name, paper in PAPER.items()),
-            section("figure8, never seen in training", unseen, "figure8", ()),
+            section("figure8, never seen in training", unseen, "figure8", {}),
         ]
     return [
         section(f"{name}, not seen", changed(preset, track={"reference": name}), name, paper)
