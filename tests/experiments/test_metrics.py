@@ -1,5 +1,6 @@
 """Scores of flights: over which part, and what a terminated flight does to them."""
 
+import dataclasses
 import sys
 
 import numpy as np
@@ -8,7 +9,8 @@ import pytest
 from made_up import DT, flight, log
 from retrim import Scenario
 from retrim.experiments import FlightSpec, rows
-from retrim.experiments.metrics import cell
+from retrim.experiments.metrics import cell, interval
+from retrim.runtime.flight import States
 
 
 def test_the_error_is_over_the_last_seconds_and_no_others():
@@ -100,3 +102,41 @@ def test_rows_become_a_table_where_pandas_is_installed(monkeypatch):
     table = found.to_pandas()
     assert list(table["mean"]) == [pytest.approx(0.2)]
     assert list(table.columns) == list(found[0])
+
+
+def test_a_flight_that_is_late_is_found_to_be_late():
+    """A circle flown 0.1 s behind: the error is the chord, and nothing is left of it but for that."""
+    flown, t = log(10.0), DT * np.arange(501)
+    path = lambda t: np.stack([np.cos(t), np.sin(t), np.ones_like(t)], axis=1)  # noqa: E731
+    true = States(path(t - 0.1), *flown.true[1:])
+    late = flight(2.0 * np.sin(0.05), flown=flown._replace(true=true), cross=np.zeros(501))
+    late = dataclasses.replace(late, target=path(t))
+    behind, error = late.behind
+    assert behind == pytest.approx(0.1)
+    assert error == pytest.approx(0.0, abs=1e-12)
+    assert dataclasses.replace(late, cross=None).behind is None  # it follows nothing
+
+
+def test_effort_is_that_of_the_commands():
+    flown = log(10.0)
+    u = np.array(flown.u)
+    u[::2, 1], u[1::2, 1] = 0.3, -0.3
+    rates, change = flight(0.0, flown=flown._replace(u=u)).effort
+    assert (rates, change) == pytest.approx((0.3, 0.6))
+
+
+def test_an_interval_does_not_forget_that_flights_of_a_seed_are_alike():
+    """The same twelve errors: of twelve seeds, or of three seeds with four like flights each."""
+
+    def records(seeds):
+        return [
+            {"seed": seed, "error": error} for seed, error in zip(seeds, np.repeat([0.1, 0.2, 0.3], 4), strict=True)
+        ]
+
+    low, high = interval(records(range(12)))
+    wide_low, wide_high = interval(records(np.repeat([0, 1, 2], 4).tolist()))
+    assert 0.1 < low < 0.2 < high < 0.3
+    assert wide_low < low
+    assert high < wide_high
+    assert interval([{"seed": 0, "error": None}]) is None
+    assert interval([{"seed": 0, "error": 0.5}]) == [0.5, 0.5]

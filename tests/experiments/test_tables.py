@@ -18,11 +18,13 @@ from retrim.config.presets import Adapt
 from retrim.experiments import Run, rivals
 from retrim.experiments.reporter import Silent
 from retrim.experiments.tables.document import Document, TableSection
+from retrim.experiments.tables.levels import Levels, fly_levels
 from retrim.experiments.tables.reversing import METHODS, _errors, _moments, _section
-from retrim.experiments.tables.study import Levels, fly_levels, train_all
+from retrim.experiments.tables.study import train_all
 
 # The package has functions of some of these names.
-fast, kept, study = (importlib.import_module(f"retrim.experiments.tables.{name}") for name in ("fast", "kept", "study"))
+TABLES = "retrim.experiments.tables"
+fast, kept, levels = (importlib.import_module(f"{TABLES}.{name}") for name in ("fast", "kept", "levels"))
 
 pytestmark = pytest.mark.usefixtures("as_a_user")
 
@@ -68,7 +70,7 @@ def test_a_section_of_tracking_has_cross_track_and_the_papers_rows(tmp_path):
     )
     document = Document(Run("test", tmp_path), "table", "Title", "Intro.", [0], Silent())
     fly_levels(document, [circle], starts=1, seconds=1.0)
-    (section,), found = document.sections, results(tmp_path, "table.json")["rows"]
+    (section, figures), found = document.sections, results(tmp_path, "table.json")["rows"]
     assert [(row["disturbance"], row["method"], row["reference"]) for row in found] == [
         (level, method, "circle") for level in LEVELS for method in ("base", "lora")
     ]
@@ -79,6 +81,9 @@ def test_a_section_of_tracking_has_cross_track_and_the_papers_rows(tmp_path):
     assert section.rows[-1] == ("DATT, the paper's", "(4)", "(5)", "(6)")
     assert section.rows[1][1] == f"{found[0]['cross_track_m']:.3f}"
     assert section.picture == tmp_path / "x.png"
+    assert figures.title == "circle: large, 2 m/s² per axis"
+    assert [row[0] for row in figures.rows] == ["base policy", "**adapted, LoRA**"]
+    assert "behind [s]" in figures.columns
 
 
 def test_a_run_goes_on_where_it_was_killed(tmp_path, monkeypatch):
@@ -87,8 +92,8 @@ def test_a_run_goes_on_where_it_was_killed(tmp_path, monkeypatch):
     sections = [Levels(f"{n}", preset, Scenario(plant="simple"), f"x{n}", ("base", "indi")) for n in (1, 2)]
     monkeypatch.setattr(kept, "commit", lambda: "abc")
     flown = []
-    made = study._level_section
-    monkeypatch.setattr(study, "_level_section", lambda *a, **k: flown.append(a[1].title) or made(*a, **k))
+    made = levels._level_section
+    monkeypatch.setattr(levels, "_level_section", lambda *a, **k: flown.append(a[1].title) or made(*a, **k))
 
     def table(sections, starts=1):
         document = Document(Run("test", tmp_path), "table", "Title", "Intro.", [0], Silent())

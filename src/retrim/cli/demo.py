@@ -17,7 +17,8 @@ from ..experiments.metrics import rows
 from ..experiments.outputs import write_events, write_trained
 from ..experiments.run import INTERRUPTED, Run
 from ..experiments.tables.hover import PAPER
-from ..experiments.tables.study import LEVELS, Study, fly_all, level_table
+from ..experiments.tables.levels import LEVELS, level_table
+from ..experiments.tables.study import Study, fly_all
 from ..experiments.training import nominal_error, train
 from .console import RichReporter, console, show_paths, show_table, started
 

@@ -43,6 +43,8 @@ class Baseline:
     settings: Settings
     ranges: Mapping[str, tuple[float, float]]
     """Smallest and largest value that the search draws, evenly in the logarithm."""
+    cost: int = 1
+    """The search tries one candidate where it tries so many of a controller that is quick."""
 
     def controller(self, setup: "Setup", key: Key[Array, ""] | None = None) -> AbstractController[Any]:
         """Return the controller with its settings."""
@@ -124,12 +126,13 @@ BASELINES: dict[str, Baseline] = {
         {"position": 12.0, "velocity": 6.0, "attitude": 12.0, "filter": 0.08},
         {**_LOOPS, "filter": (0.02, 0.3)},
     ),
-    "mppi": Baseline("MPPI", _mppi, _RELEASED, _SAMPLING),
+    "mppi": Baseline("MPPI", _mppi, _RELEASED, _SAMPLING, cost=4),
     "l1-mpc": Baseline(
         "MPPI + L1",
         _mppi,
         {**_RELEASED, "estimator": 2.0},
         {**_SAMPLING, "estimator": (0.1, 2.0)},
+        cost=4,
     ),
 }
 """By name of the method. Positions [1/s^2], velocities and attitudes [1/s], integrals [1/s^3], time constants of filter

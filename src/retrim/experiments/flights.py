@@ -12,6 +12,7 @@ from ..runtime.events import Event
 from ..runtime.flight import Log
 
 SETTLED = 0.05  # [m]
+LONGEST_SHIFT = 0.5  # [s]
 LEARNER_TAG = 2**30 + 2  # folded into a seed: learners share no key with training, starts and disturbances
 
 
@@ -54,6 +55,8 @@ class Flight:
     """Distance from the nearest point of the reference in each row [m], if the task has one."""
     learnt: LearnerState | None = None
     """What a flight that adapted has learnt."""
+    target: np.ndarray | None = None
+    """Where the vehicle should have been in each row, world [m]."""
 
     @property
     def steady(self) -> float:
@@ -79,6 +82,36 @@ class Flight:
         return float(self.log.t[outside[-1] + 1]) if len(outside) else 0.0
 
     @property
+    def behind(self) -> tuple[float, float] | None:
+        """Return by how much the flight is behind its reference [s], and the mean error but for that [m].
+
+        It is the constant shift in time, of half a second at most, with the smallest mean error over the last seconds;
+        None for a flight that was terminated or follows nothing.
+        """
+        if self.cross is None or self.target is None or self.log.terminated:
+            return None
+        rows = np.flatnonzero(self._late_rows())
+        most = min(round(LONGEST_SHIFT / self.log.dt), int(rows[0]))
+        errors, last = list[float](), len(self.target) - 1
+        for k in range(-most, most + 1):
+            away = self.log.p[rows] - self.target[np.minimum(rows - k, last)]
+            errors.append(float(np.linalg.norm(away, axis=1).mean()))
+        best = int(np.argmin(errors))
+        return (best - most) * self.log.dt, errors[best]
+
+    @property
+    def effort(self) -> tuple[float, float]:
+        """Return the commanded body rates, and by how much they change in a tick, both root mean square [rad/s].
+
+        After the first 5 s; NaN for a flight that was terminated.
+        """
+        if self.log.terminated:
+            return float("nan"), float("nan")
+        rates = self.log.u[self._after_start(), 1:]
+        change = np.diff(rates, axis=0)
+        return float(np.sqrt(np.mean(np.sum(rates**2, axis=1)))), float(np.sqrt(np.mean(np.sum(change**2, axis=1))))
+
+    @property
     def cross_track(self) -> float | None:
         """Mean cross-track error over the last seconds [m]; None for a task without one."""
         return None if self.cross is None else self._last(self.cross)
@@ -98,6 +131,10 @@ class Flight:
         rows: np.ndarray = self.log.t >= min(5.0, self.log.t[-1] / 2)
         return rows
 
+    def _late_rows(self) -> np.ndarray:
+        """Rows of the last seconds, by time: a tick may be missed."""
+        rows: np.ndarray = self.log.t > self.log.t[-1] - self.steady_seconds + 0.5 * self.log.dt
+        return rows
+
     def _last(self, error: np.ndarray) -> float:
-        late = self.log.t > self.log.t[-1] - self.steady_seconds + 0.5 * self.log.dt  # by time: a tick may be missed
-        return float("nan") if self.log.terminated else float(error[late].mean())
+        return float("nan") if self.log.terminated else float(error[self._late_rows()].mean())

@@ -151,7 +151,7 @@ def learnt_by(pilot: Pilot) -> LearnerState | None:
 def scored(setup: Setup, spec: FlightSpec, log: Log, learnt: LearnerState | None = None) -> Flight:
     """Return a flight with its errors, and why it was terminated if it was."""
     task = setup.flown
-    error, cross = _errors(task, log.t, log.true.as_state())
+    error, cross, target = _errors(task, log.t, log.true.as_state())
     if log.terminated:
         why = Event(float(log.t[-1]), "terminated", _why(log, float(error[-1])))
         log = log._replace(events=(*log.events, why))
@@ -164,6 +164,7 @@ def scored(setup: Setup, spec: FlightSpec, log: Log, learnt: LearnerState | None
         task.steady_seconds,
         None if cross is None else np.asarray(cross),
         learnt,
+        np.asarray(target),
     )
 
 
@@ -190,8 +191,8 @@ def _all_terminated(task: AbstractTask, t: Any, x: State) -> Array:
 
 
 @eqx.filter_jit
-def _errors(task: AbstractTask, t: Any, x: State) -> tuple[Array, Array | None]:
+def _errors(task: AbstractTask, t: Any, x: State) -> tuple[Array, Array | None, Array]:
     times = jnp.asarray(t, dtype=x.p.dtype)
     error = jax.vmap(task.error)(times, x)
     first = jax.eval_shape(task.cross_track, jax.tree.map(lambda leaf: leaf[0], x))
-    return error, None if first is None else lax.map(task.cross_track, x)
+    return error, None if first is None else lax.map(task.cross_track, x), jax.vmap(task.target)(times)

@@ -21,6 +21,10 @@ class Rows(list[dict[str, Any]]):
 
 CONDITIONS = ("disturbance", "method", "plant", "vehicle", "sensors", "thrust_error", "delay", "reference")
 """What the flights of one row have in common."""
+EFFORT = ("rates_rms", "rates_change_rms")
+"""Commanded body rates, and their change in a tick [rad/s]."""
+BEHIND = ("behind_s", "unshifted_m")
+"""How far a flight is behind its reference [s], and its error but for that [m]."""
 
 
 def record(flight: Flight) -> dict[str, Any]:
@@ -43,6 +47,10 @@ def record(flight: Flight) -> dict[str, Any]:
         "peak_after_5s": _finite(flight.peak),
         "settle_s": _finite(flight.settle_s),
         "cross_track_m": None if crashed else flight.cross_track,
+        "behind_s": None if flight.behind is None else flight.behind[0],
+        "unshifted_m": None if flight.behind is None else flight.behind[1],
+        "rates_rms": _finite(flight.effort[0]),
+        "rates_change_rms": _finite(flight.effort[1]),
         "crashed": crashed,
     }
 
@@ -86,10 +94,42 @@ def summary(records: Sequence[Mapping[str, Any]], keys: Sequence[str] = CONDITIO
         "peak_after_5s": _finite(float(np.median(_column(records, "peak_after_5s")))),
         "settle_s": _finite(float(np.median(_column(records, "settle_s")))),
         **({"cross_track_m": float(np.mean(cross))} if cross else {}),
+        **{name: _mean(records, name) for name in EFFORT},
+        **({name: _mean(records, name) for name in BEHIND} if cross else {}),
+        "interval": interval(records),
         "n": len(records),
         "crashes": sum(each["crashed"] for each in records),
         "errors": [each["error"] for each in records],
     }
+
+
+def interval(records: Sequence[Mapping[str, Any]], draws: int = 2000) -> list[float] | None:
+    """Return the 95 % bootstrap interval of the mean error [m]; None if every flight was terminated.
+
+    Training seeds are drawn first, with replacement, and then the flights of each: what seeds have in common is no
+    reason for a narrower interval.
+
+    Args:
+        records: Of :func:`record`.
+        draws: Resampled means.
+    """
+    by_seed: dict[Any, list[float]] = {}
+    for each in records:
+        if each["error"] is not None:
+            by_seed.setdefault(each["seed"], []).append(each["error"])
+    if not by_seed:
+        return None
+    draw, groups, means = np.random.default_rng(0), [np.array(errors) for errors in by_seed.values()], []
+    for _ in range(draws):
+        chosen = (groups[i] for i in draw.integers(len(groups), size=len(groups)))
+        means.append(np.concatenate([draw.choice(group, len(group)) for group in chosen]).mean())
+    low, high = np.percentile(means, (2.5, 97.5))
+    return [float(low), float(high)]
+
+
+def _mean(records: Sequence[Mapping[str, Any]], name: str) -> float | None:
+    found = [each[name] for each in records if each.get(name) is not None]
+    return float(np.mean(found)) if found else None
 
 
 def _column(records: Sequence[Mapping[str, Any]], name: str) -> np.ndarray:

@@ -7,7 +7,8 @@ from ...config.scenario import Scenario
 from ..reporter import Reporter
 from ..run import Run
 from .document import Document
-from .study import Levels, fly_levels, table_presets
+from .levels import Levels, fly_levels
+from .study import table_presets
 
 INTRO = """\
 Made by `retrim reproduce fast`. Mean distance from where the reference is at the time [m], over the last 10 s: mean ±

@@ -5,7 +5,8 @@ from ..reporter import Reporter
 from ..rivals import DATT_STEPS
 from ..run import Run
 from .document import Document
-from .study import METHODS, Levels, PaperRows, fly_levels, of_policies, table_presets
+from .levels import METHODS, Levels, PaperRows, fly_levels, of_policies
+from .study import table_presets
 
 PAPER: PaperRows = {  # Table I [m]
     "base": ("0.128 ± 0.004", "0.328 ± 0.001", "1.228 ± 0.073"),

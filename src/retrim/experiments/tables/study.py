@@ -1,40 +1,21 @@
 """What every table does: train policies, fly them, lay methods and disturbances out as the paper does."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from jax import random
 
-from ...config.baselines import BASELINES
-from ...config.loading import dump, load_for
-from ...config.methods import find_method
+from ...config.loading import load_for
 from ...config.presets import Preset
 from ...config.scenario import Scenario
 from ...config.setup import Setup
 from ...control.policy import Policy
-from ..figures import picture
 from ..fleet import Fleet, Flights, told_by
 from ..limits import check_flights, check_seeds
-from ..metrics import cell, rows
 from ..reporter import Reporter
-from ..rivals import DATT_STEPS, RIVALS, check_steps
 from ..run import Run
 from ..training import nominal_error, train
-from .document import Document, TableSection
-from .kept import keep, kept, section_key
-
-LEVELS = {"none": "no disturbance", "small": "small, 0.5 m/s² per axis", "large": "large, 2 m/s² per axis"}
-"""The paper's disturbances, and what they are called."""
-PaperRows = Mapping[str, tuple[str, str, str]]
-"""Figures of the paper for the three levels [m], by method."""
-METHODS = ("base", "base-i", "base-do", "geometric", "geometric-i", "indi", "mppi", "l1-mpc", "full", "lora")
-"""Those of the tables of the paper, but for what takes minutes of training."""
-
-
-def of_policies(methods: Sequence[str]) -> tuple[str, ...]:
-    """Return those methods that fly a policy of the table's preset."""
-    return tuple(method for method in methods if method not in BASELINES and method not in RIVALS)
 
 
 @dataclass(frozen=True)
@@ -114,133 +95,3 @@ def fly_all(
         advance(0.0, "compiling the programs of a flight (kept in a cache for the next time)")
         return fleet.run(stop=run.stop, progress=told_by(advance))
     return Flights([], interrupted=True)
-
-
-@dataclass(frozen=True)
-class Levels:
-    """One section of a table as the paper's: methods down, levels of disturbance across."""
-
-    title: str
-    preset: Preset
-    scenario: Scenario
-    """Where it is flown, but for the disturbance."""
-    stem: str
-    """Name of the picture."""
-    methods: Sequence[str] = ("base", "full", "lora")
-    paper: PaperRows = field(default_factory=dict)
-    levels: Mapping[str, str] = field(default_factory=lambda: LEVELS)
-    """Disturbances, and what they are called."""
-
-    @property
-    def scenarios(self) -> list[Scenario]:
-        """One for each level."""
-        return [replace(self.scenario, disturbance=level) for level in self.levels]
-
-
-def fly_levels(
-    document: Document,
-    sections: Sequence[Levels],
-    *,
-    starts: int,
-    seconds: float | None,
-    datt_steps: int = DATT_STEPS,
-) -> None:
-    """Train, fly and lay out every section; the document is written after each, and when it is interrupted.
-
-    Args:
-        document: Receives the sections. Its seeds are those of training.
-        sections: What to fly; a preset is trained once.
-        starts: Flights per disturbance, method and seed.
-        seconds: Length of a flight; the task's own by default.
-        datt_steps: Steps of training DATT, where it is among the methods.
-
-    Raises:
-        ConfigError: Something does not exist, or does not fit together; nothing has been trained.
-    """
-    run, reporter, studies = document.run, document.reporter, dict[str, Study]()
-    check_steps(datt_steps)
-    for section in sections:
-        own = [method for method in section.methods if method not in RIVALS]
-        refuse_misfits(section.preset, section.scenarios, methods=own, starts=starts, seconds=seconds)
-    for section in sections:
-        name = section_key(
-            preset=dump(section.preset), scenarios=[repr(each) for each in section.scenarios], title=section.title,
-            methods=list(section.methods), seeds=list(document.seeds), starts=starts, seconds=seconds,
-            datt_steps=datt_steps if "datt" in section.methods else 0,
-        )  # fmt: skip
-        if (made := kept(run, name)) is not None:
-            reporter.say(f"{section.title}: as an earlier run of this folder has made it")
-            document.add(*made)
-            continue
-        key = dump(section.preset)
-        if key not in studies:
-            studies[key] = train_all(section.preset, document.seeds, run, reporter)
-        made = _level_section(
-            studies[key], section, run, reporter, starts=starts, seconds=seconds, datt_steps=datt_steps
-        )
-        if made is not None:
-            document.add(*made)
-        if run.interrupted:
-            break
-        if made is not None:
-            keep(run, name, *made)
-    document.write()
-
-
-def _level_section(
-    study: Study,
-    section: Levels,
-    run: Run,
-    reporter: Reporter,
-    *,
-    starts: int,
-    seconds: float | None,
-    datt_steps: int,
-) -> tuple[TableSection, list[dict[str, Any]]] | None:
-    """The section and its rows of results; None if nothing was flown."""
-    methods, title = section.methods, section.title
-    own = [method for method in methods if method not in RIVALS]
-    flown = fly_all(study, section.scenarios, run, reporter, methods=own, starts=starts, seconds=seconds).flown
-    for rival in (method for method in methods if method in RIVALS):
-        nets = RIVALS[rival](study.preset, tuple(study.policies), run, reporter, steps=datt_steps)
-        trained = Study(study.preset, nets, ())
-        flown += fly_all(
-            trained, section.scenarios, run, reporter, methods=[rival], starts=starts, seconds=seconds
-        ).flown
-    if not flown:
-        return None
-    found = [{**row, "preset": study.preset.name, "section": title} for row in rows(flown)]
-    kinds = [event.kind for flight in flown for event in flight.events]
-    crashed = sum(flight.log.terminated for flight in flown)
-    about = (
-        f"{study.about()} The gate admitted {kinds.count('policy')} policies and refused {kinds.count('rejected')}. "
-        f"{crashed} of {len(flown)} flights crashed."
-    )
-    setup = Setup.of(study.preset, section.scenario.reference)
-    first = [f for f in flown if f.spec.seed == flown[0].spec.seed and f.spec.method in ("base", "full")]
-    drawn = picture(first, setup, section.scenarios[-1], run.folder, stem=section.stem)
-    table = level_table(found, methods, section.paper, title, section.levels)
-    return replace(table, about=about, picture=drawn[0] if drawn else None), found
-
-
-def level_table(
-    found: Sequence[dict[str, Any]],
-    methods: Sequence[str],
-    paper: PaperRows,
-    title: str,
-    levels: Mapping[str, str] = LEVELS,
-) -> TableSection:
-    """Lay rows of results out as the paper does: methods down, disturbances across, its figures in brackets."""
-    by = {(row["method"], row["disturbance"]): row for row in found}
-    cells = list[tuple[str, ...]]()
-    for method in methods:
-        ours = [by.get((method, level)) for level in levels]
-        theirs = [f" ({figure})" for figure in paper[method]] if method in paper else [""] * len(levels)
-        figures = ("-" if row is None else cell(row) + they for row, they in zip(ours, theirs, strict=True))
-        cells.append((find_method(method).label, *figures))
-        cross = ["-" if row is None or "cross_track_m" not in row else f"{row['cross_track_m']:.3f}" for row in ours]
-        if set(cross) != {"-"}:
-            cells.append(("... cross-track", *cross))
-    absent = [method for method in paper if method not in methods]
-    cells += [(f"{find_method(m).label}, the paper's", *(f"({figure})" for figure in paper[m])) for m in absent]
-    return TableSection(("error [m]", *levels.values()), tuple(cells), title)

@@ -9,7 +9,8 @@ from ..reporter import Reporter
 from ..rivals import DATT_STEPS
 from ..run import Run
 from .document import Document
-from .study import METHODS, Levels, PaperRows, fly_levels, of_policies, table_presets
+from .levels import METHODS, Levels, PaperRows, fly_levels, of_policies
+from .study import table_presets
 
 PAPER: dict[str, PaperRows] = {  # Table II [m]
     "circle": {

@@ -36,9 +36,9 @@ def tuning(
     reporter: Reporter,
     *,
     methods: tuple[str, ...] = tuple(BASELINES),
-    candidates: int = 48,
+    candidates: int = 96,
     starts: int = 2,
-    seconds: float = 12.0,
+    seconds: float = 10.0,
     seed: int = 100,
     plant: str = "bem",
 ) -> None:
@@ -48,7 +48,7 @@ def tuning(
         run: Folder of tuning.md and tuning.json.
         reporter: Receives progress and the sections.
         methods: Which baselines.
-        candidates: Settings that are tried for each, beside the present ones.
+        candidates: Settings that are tried for each, beside the present ones; a quarter of them for MPPI.
         starts: Flights of a candidate under each condition.
         seconds: Length of a flight [s]; the first 3 s do not count.
         seed: Seed of candidates, starts and gusts.
@@ -63,16 +63,16 @@ def tuning(
         for preset, disturbed, sensors, reference in CONDITIONS
     )
     intro = (
-        f"Made by `retrim reproduce tuning`. {candidates} candidates for each method, drawn evenly in the logarithm "
-        f"of each range, and the present settings, fly the small quadrotor on plant `{plant}` from {starts} starts "
-        f"(seed {seed}) under: {conditions}. The score is the mean error after {SETTLING:g} s [m], a crash "
-        f"counting {CRASH:g} m. No table flies these conditions, starts or seeds."
+        f"Made by `retrim reproduce tuning`. {candidates} candidates for each method (a quarter for MPPI), drawn "
+        "evenly in the logarithm of each range, and the present settings, fly the small quadrotor on plant "
+        f"`{plant}` from {starts} starts (seed {seed}) under: {conditions}. The score is the mean error after "
+        f"{SETTLING:g} s [m], a crash counting {CRASH:g} m. No table flies these conditions, starts or seeds."
     )
     document = Document(run, "tuning", "Settings of the baselines", intro, [], reporter)
     for name in methods:
         if run.interrupted:
             break
-        tried = [dict(BASELINES[name].settings), *_drawn(BASELINES[name], candidates, seed)]
+        tried = [dict(BASELINES[name].settings), *_drawn(BASELINES[name], -(-candidates // BASELINES[name].cost), seed)]
         with run.interruptible(), reporter.progress(name) as advance:
             scores = np.zeros(len(tried))
             for i, (preset, disturbed, sensors, reference) in enumerate(CONDITIONS):

@@ -5,7 +5,8 @@ from ...config.scenario import Scenario
 from ..reporter import Reporter
 from ..run import Run
 from .document import Document
-from .study import Levels, PaperRows, fly_levels, table_presets
+from .levels import Levels, PaperRows, fly_levels
+from .study import table_presets
 
 PAPER: PaperRows = {  # Table III [m]
     "base": ("0.133 ± 0.009", "0.404 ± 0.039", "1.383 ± 0.176"),

@@ -1,0 +1,51 @@
+"""What a table of errors leaves out: intervals, recovery, worst error, phase and effort."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from ...config.methods import find_method
+from .document import TableSection
+
+
+def figures_table(found: Sequence[dict[str, Any]], title: str, levels: Mapping[str, str]) -> TableSection:
+    """Lay the other figures of a section out, at its last level: methods down.
+
+    Args:
+        found: Rows of results.
+        title: Of the section.
+        levels: Disturbances, and what they are called.
+    """
+    level = list(levels)[-1]
+    tracks = any(row.get("behind_s") is not None for row in found)
+    columns: dict[str, Callable[[dict[str, Any]], str]] = {
+        "95 % interval [m]": lambda row: _interval(row["interval"]),
+        "to 5 cm [s]": lambda row: _figure(row["settle_s"], 1),
+        "worst after 5 s [m]": lambda row: _figure(row["peak_after_5s"], 3),
+        **(BEHIND_COLUMNS if tracks else {}),
+        "body rates [rad/s]": lambda row: _figure(row["rates_rms"], 2),
+        "their change in a tick [rad/s]": lambda row: _figure(row["rates_change_rms"], 3),
+    }
+    lines = tuple(
+        (find_method(row["method"]).label, *(show(row) for show in columns.values()))
+        for row in found
+        if row["disturbance"] == level
+    )
+    about = (
+        "The interval is a bootstrap's over seeds and flights; medians are over flights, a crash counting as infinite; "
+        "rates are root mean squares of what is commanded after 5 s."
+    )
+    return TableSection(("method", *columns), lines, f"{title}: {levels[level]}", about)
+
+
+BEHIND_COLUMNS: dict[str, Callable[[dict[str, Any]], str]] = {
+    "behind [s]": lambda row: _figure(row.get("behind_s"), 3),
+    "error but for that [m]": lambda row: _figure(row.get("unshifted_m"), 3),
+}
+
+
+def _interval(ends: Sequence[float] | None) -> str:
+    return "-" if ends is None else f"{ends[0]:.4f} to {ends[1]:.4f}"
+
+
+def _figure(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
