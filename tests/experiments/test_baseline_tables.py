@@ -1,6 +1,7 @@
 """The tables of the baselines' settings and of the design study, at reduced size."""
 
 import importlib
+import inspect
 import json
 
 import jax
@@ -12,11 +13,14 @@ from jax import random
 from commands import retrim
 from helpers import random_command, random_state, tiny_preset
 from retrim import Setup
+from retrim.cli.reproduce import COMMANDS
 from retrim.config import named_presets
 from retrim.config.baselines import BASELINES
-from retrim.experiments import design
+from retrim.experiments import Run, design
+from retrim.experiments.reporter import Silent
 
-design_table = importlib.import_module("retrim.experiments.tables.design")  # the package has a function of that name
+# The package has functions of these names.
+design_table, everything = (importlib.import_module(f"retrim.experiments.tables.{n}") for n in ("design", "everything"))
 
 pytestmark = pytest.mark.usefixtures("as_a_user")
 
@@ -77,3 +81,38 @@ def test_a_policy_is_retrained_from_where_it_was():
                             fit_epochs=20, epochs=10, envs=4)  # fmt: skip
     assert made.residual_rms < 3.0
     assert any(np.any(a.weight != b.weight) for a, b in zip(made.policy.layers, policy.layers, strict=True))
+
+
+def test_all_tables_go_on_where_they_were_killed(tmp_path, monkeypatch):
+    """A table that is done is not made again; one that was interrupted is; with --quick all are."""
+    made, dying = [], [True]
+
+    def one(run, reporter, *, size=0):
+        made.append(("one", size))
+
+    def two(run, reporter, *, size=0):
+        made.append(("two", size))
+        if dying.pop():
+            raise RuntimeError("killed")
+        dying.append(False)
+
+    plan = tuple((make, "Table", {"size": 9}, {"size": 1}) for make in (one, two))
+    monkeypatch.setattr(everything, "PLAN", plan)
+    for module in (everything, importlib.import_module("retrim.experiments.tables.kept")):
+        monkeypatch.setattr(module, "commit", lambda: "abc")
+    dying.insert(0, False)
+    table = lambda quick: everything.everything(Run("test", tmp_path), Silent(), quick=quick)  # noqa: E731
+    with pytest.raises(RuntimeError, match="killed"):
+        table(False)
+    table(False)
+    assert made == [("one", 9), ("two", 9), ("two", 9)]
+    assert "[two](two/two.md)" in (tmp_path / "everything.md").read_text()
+    table(True)
+    assert made[3:] == [("one", 1), ("two", 1)]
+
+
+def test_every_table_of_the_plan_has_the_options_that_are_planned():
+    for make, _, full, quick in everything.PLAN:
+        known = set(inspect.signature(make).parameters)
+        assert {*full, *quick} <= known, make.__name__
+    assert "all" in COMMANDS

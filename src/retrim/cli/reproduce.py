@@ -42,4 +42,6 @@ def command_of(make: Callable[..., None], called: str = "reproduce") -> Callable
     return command
 
 
-COMMANDS: dict[str, Callable[..., Ordered]] = {make.__name__: command_of(make) for make in tables.MADE}
+COMMANDS: dict[str, Callable[..., Ordered]] = {make.__name__: command_of(make) for make in tables.MADE} | {
+    "all": command_of(tables.everything)
+}

@@ -3,6 +3,7 @@
 from .ablation import ablation as ablation
 from .buses import buses as buses
 from .design import design as design
+from .everything import everything as everything
 from .fast import fast as fast
 from .gauntlet import gauntlet as gauntlet
 from .hover import hover as hover
@@ -10,8 +11,9 @@ from .model import model as model
 from .plants import plants as plants
 from .reversing import reversing as reversing
 from .tracking import tracking as tracking
+from .transfer import transfer as transfer
 from .tuning import tuning as tuning
 from .vision import vision as vision
 
-MADE = (hover, reversing, tracking, vision, plants, model, fast, ablation, design, buses, tuning)
+MADE = (hover, reversing, tracking, vision, plants, model, fast, ablation, design, transfer, buses, tuning)
 """Those of ``retrim reproduce``; the gauntlet is a command of its own."""

@@ -1,0 +1,85 @@
+"""All tables of the paper, one after another."""
+
+from collections.abc import Callable
+from typing import Any
+
+from ..provenance import commit
+from ..reporter import Reporter
+from ..run import Run
+from .design import design
+from .document import Document, TableSection
+from .hover import hover
+from .kept import FOLDER, section_key
+from .levels import METHODS
+from .model import model
+from .plants import plants
+from .reversing import reversing
+from .tracking import tracking
+from .transfer import transfer
+from .vision import vision
+
+Options = dict[str, Any]
+WITH_DATT = (*METHODS[:-2], "datt", *METHODS[-2:])
+FEW: Options = {"seeds": (0,), "starts": 2}
+PLAN: tuple[tuple[Callable[..., None], str, Options, Options], ...] = (
+    (
+        hover,
+        "Table I",
+        {"presets": ("hover/retrim", "hover/paper"), "seeds": (0, 1, 2), "methods": WITH_DATT},
+        {**FEW, "presets": ("hover/retrim",), "methods": WITH_DATT, "seconds": 12.0, "datt_steps": 1_000_000},
+    ),
+    (
+        tracking,
+        "Table II",
+        {"presets": ("track/retrim",), "seeds": (0, 1, 2), "methods": WITH_DATT, "seconds": 30.0},
+        {**FEW, "presets": ("track/retrim",), "methods": WITH_DATT, "seconds": 12.0, "datt_steps": 1_000_000},
+    ),
+    (
+        vision,
+        "Table III",
+        {"presets": ("vision/retrim",), "seeds": (0, 1, 2)},
+        {**FEW, "presets": ("vision/retrim",), "seconds": 12.0},
+    ),
+    (reversing, "Sec. IV-B.3", {"seeds": (0, 1, 2)}, {**FEW, "seconds": 35.0}),
+    (design, "Sec. IV-C", {}, {**FEW, "epochs": 20}),
+    (transfer, "Sec. IV-D", {}, {**FEW, "seconds": 12.0, "methods": ("base", "geometric-i", "indi", "full")}),
+    (model, "the plant", {}, {}),
+    (plants, "other plants", {}, {}),
+)
+"""Table, what of the paper it is, its options, and those of a quick look."""
+QUICK_LEAVES_OUT = (plants,)
+
+
+def everything(run: Run, reporter: Reporter, *, quick: bool = False) -> None:
+    """All tables of the paper: an overview, and a folder for each. The same command goes on where it was killed.
+
+    Args:
+        run: Folder of everything.md and of a folder for each table.
+        reporter: Receives progress and the sections.
+        quick: One seed, two starts and short flights: every table, within half an hour on two cores.
+    """
+    intro = "Made by `retrim reproduce all`" + (
+        " `--quick`: one training seed, two starts, short flights; figures to look at, not to quote." if quick else "."
+    )
+    document = Document(run, "everything", "The tables of the paper", intro, [], reporter)
+    rows: list[dict[str, Any]] = []
+    for make, what, full, small in PLAN:
+        if run.interrupted:
+            break
+        if quick and make in QUICK_LEAVES_OUT:
+            continue
+        name, options = make.__name__, small if quick else full
+        row: dict[str, Any] = {"table": name, "what": what, "page": f"{name}/{name}.md"}
+        part = Run("reproduce", run.folder / name, stop=run.stop)
+        done = run.folder / FOLDER / f"{section_key(table=name, options=options)}.done"
+        if done.is_file() and not commit().endswith("-dirty"):
+            reporter.say(f"{name}: as an earlier run of this folder has made it")
+            row["s"] = float(done.read_text())
+        else:
+            make(part, reporter, **options)
+            row["s"] = part.watch.total_s
+            if not run.interrupted:
+                run.write_text(str(done.relative_to(run.folder)), f"{part.watch.total_s:.1f}\n")
+        rows.append(row)
+    lines = tuple((row["what"], f"[{row['table']}]({row['page']})", f"{row['s'] / 60:.1f}") for row in rows)
+    document.add(TableSection(("of the paper", "table", "minutes"), lines), rows)
