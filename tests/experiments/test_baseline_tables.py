@@ -12,11 +12,11 @@ from jax import random
 
 from commands import retrim
 from helpers import random_command, random_state, tiny_preset
-from retrim import Setup
+from retrim import Setup, changed
 from retrim.cli.reproduce import COMMANDS
 from retrim.config import named_presets
 from retrim.config.baselines import BASELINES
-from retrim.experiments import Run, design
+from retrim.experiments import Run, design, effort
 from retrim.experiments.reporter import Silent
 
 # The package has functions of these names.
@@ -116,3 +116,17 @@ def test_every_table_of_the_plan_has_the_options_that_are_planned():
         known = set(inspect.signature(make).parameters)
         assert {*full, *quick} <= known, make.__name__
     assert "all" in COMMANDS
+
+
+def test_what_each_method_costs_by_its_command(tmp_path, monkeypatch):
+    small = changed(tiny_preset(), pretrain={"hidden_sizes": (16, 16), "num_updates": 10, "horizon": 20})
+    monkeypatch.setitem(named_presets.PRESETS, "hover/fast", small)
+    monkeypatch.setattr(effort, "DECISIONS", 3)
+    monkeypatch.setattr(effort, "RUNS", 2)
+    words = "--presets", "hover/fast", "--datt-steps", "1"
+    out = retrim("reproduce", "efficiency", *words, "--out", "e", cwd=tmp_path)
+    rows = {row["method"]: row for row in json.loads((tmp_path / "e" / "efficiency.json").read_text())["rows"]}
+    assert {"hover/fast", "hover/fast, LoRA", "datt", *BASELINES} == set(rows)
+    assert rows["hover/fast"]["steps"] == 10 * small.pretrain.num_envs * 20
+    assert all(row["decision_s"] > 0 for name, row in rows.items() if "LoRA" not in name)
+    assert "DATT, the paper's" in out

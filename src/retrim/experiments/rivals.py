@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -20,6 +21,7 @@ from .reporter import Reporter
 from .run import Run
 
 DATT_STEPS = 20_000_000  # the paper's
+DATT_PPO: dict[str, Any] = {"envs": 64, "steps": 256, "minibatches": 8, "epochs": 6, "learning_rate": 2e-3}
 DATT_TAG = 2**30 + 5  # folded into a seed: DATT shares no key with the policies
 
 
@@ -63,7 +65,7 @@ def trained_datt(
                 reporter.say(f"{error}; trained again")
         low, high = setup.vehicle.command_min, setup.vehicle.command_max
         problem = DattProblem(jnp.asarray(reference_bank(seed, dt=preset.dt), low.c.dtype), tau, low, high, preset.dt)
-        settings = PpoSettings(discount=DISCOUNT)
+        settings = PpoSettings(discount=DISCOUNT, **DATT_PPO)
         with run.interruptible(), reporter.progress(f"DATT, seed {seed}, {steps:,} steps") as advance:
             for i, (after, told) in enumerate(ppo(problem, net, k_learn, settings, steps=steps)):
                 advance((i + 1) / settings.updates(steps), f"reward {told['reward']:.3f}")

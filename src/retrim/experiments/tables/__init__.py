@@ -3,6 +3,7 @@
 from .ablation import ablation as ablation
 from .buses import buses as buses
 from .design import design as design
+from .efficiency import efficiency as efficiency
 from .everything import everything as everything
 from .fast import fast as fast
 from .gauntlet import gauntlet as gauntlet
@@ -15,5 +16,5 @@ from .transfer import transfer as transfer
 from .tuning import tuning as tuning
 from .vision import vision as vision
 
-MADE = (hover, reversing, tracking, vision, plants, model, fast, ablation, design, transfer, buses, tuning)
+MADE = (hover, reversing, tracking, vision, plants, model, fast, ablation, design, efficiency, transfer, buses, tuning)
 """Those of ``retrim reproduce``; the gauntlet is a command of its own."""

@@ -8,6 +8,7 @@ from ..reporter import Reporter
 from ..run import Run
 from .design import design
 from .document import Document, TableSection
+from .efficiency import efficiency
 from .hover import hover
 from .kept import FOLDER, section_key
 from .levels import METHODS
@@ -42,6 +43,7 @@ PLAN: tuple[tuple[Callable[..., None], str, Options, Options], ...] = (
     ),
     (reversing, "Sec. IV-B.3", {"seeds": (0, 1, 2)}, {**FEW, "seconds": 35.0}),
     (design, "Sec. IV-C", {}, {**FEW, "epochs": 20}),
+    (efficiency, "compute and samples", {}, {"presets": ("hover/retrim",), "datt_steps": 1_000_000}),
     (transfer, "Sec. IV-D", {}, {**FEW, "seconds": 12.0, "methods": ("base", "geometric-i", "indi", "full")}),
     (model, "the plant", {}, {}),
     (plants, "other plants", {}, {}),
