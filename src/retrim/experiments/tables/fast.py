@@ -25,7 +25,7 @@ def fast(
     *,
     preset: str = "track/fast",
     references: tuple[str, ...] = ("circle=8", "figure8=8", "star=1.5"),
-    methods: tuple[str, ...] = ("base", "base-i", "base-do", "full", "lora"),
+    methods: tuple[str, ...] = ("base", "base-i", "base-do", "geometric-i", "indi", "full", "lora"),
     seeds: tuple[int, ...] = (0,),
     seconds: float = 60.0,
     starts: int = 8,

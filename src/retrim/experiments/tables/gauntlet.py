@@ -20,9 +20,9 @@ from .document import Document, TableSection
 from .study import fly_all, refuse_misfits, table_presets, train_all
 
 METHODS: dict[str, tuple[str, ...]] = {
-    "hover": ("base", "base-i", "base-do", "full"),
-    "track": ("base", "base-i", "base-do", "full"),
-    "vision": ("base", "base-do", "full"),  # integral action shifts a measured position, which it is not shown
+    "hover": ("base", "base-i", "base-do", "geometric-i", "indi", "full"),
+    "track": ("base", "base-i", "base-do", "geometric-i", "indi", "full"),
+    "vision": ("base", "base-do", "full"),  # the others need a measured position, which it is not shown
 }
 METRICS = {"steady": "[m]", "late": "[m]", "peak": "[m]", "recovery_5cm": "[s]", "recovery_2cm": "[s]"}
 INTRO = """\
@@ -51,7 +51,8 @@ def gauntlet(
         reporter: Receives progress and the table.
         preset: A preset for hover, tracking or vision, to train with.
         only: Conditions to fly; all by default. One whose plant is not installed is left out, with a line.
-        methods: How the policies fly; by default base, base-i, base-do and full, for vision without base-i.
+        methods: How the policies fly; by default base, base-i, base-do and full, and beside them geometric-i and indi; for
+            vision base, base-do and full.
         seeds: Training seeds; each also seeds the starts, the gusts and the learners of its flights.
         seconds: Length of a flight [s].
         starts: Flights per condition, method and seed.

@@ -11,8 +11,11 @@ from ..run import Run
 from .document import Document, TableSection
 from .study import fly_all, table_presets, train_all
 
-METHODS = ("base", "base-i", "base-do", "full")
-COLUMNS = ("disturbance", "base", "integral action", "disturbance observer", "adapted", "its peak after 5 s", "crashed")
+METHODS = ("base", "base-i", "base-do", "indi", "full")
+COLUMNS = (
+    "disturbance", "base", "integral action", "disturbance observer", "INDI", "adapted", "its peak after 5 s",
+    "crashed",
+)  # fmt: skip
 Group = tuple[str, Scenario, tuple[str, ...]]
 """Title, scenario, and the disturbances that are flown in it."""
 

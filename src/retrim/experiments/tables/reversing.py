@@ -22,6 +22,8 @@ METHODS: dict[str, str] = {
     "base": "base policy",
     "base-i": "integral action",
     "base-do": "disturbance observer",
+    "geometric-i": "geometric controller, integral action",
+    "indi": "INDI",
     "full": "**adapted**",
 }
 INTRO = """\
