@@ -103,38 +103,43 @@ _SAMPLING = {
     "thrust": (0.5, 5.0), "rates": (0.3, 3.0), "temperature": (0.005, 0.5), "position": (2.0, 50.0),
     "velocity": (0.01, 3.0), "attitude": (0.1, 10.0),
 }  # fmt: skip
-_RELEASED = {  # with DATT; a cost of the velocity it has none
-    "thrust": 2.45, "rates": 0.7, "temperature": 0.05, "position": 5.0, "velocity": 0.0, "attitude": 3.0,
-}  # fmt: skip
-
 BASELINES: dict[str, Baseline] = {
     "geometric": Baseline(
         "geometric controller",
         _geometric,
-        {"position": 12.0, "velocity": 6.0, "attitude": 12.0},
+        {"position": 56.3, "velocity": 12.6, "attitude": 23.9},
         _LOOPS,
     ),
     "geometric-i": Baseline(
         "geometric controller + integral action",
         _geometric,
-        {"position": 12.0, "velocity": 6.0, "attitude": 12.0, "integral": 12.0},
+        {"position": 26.8, "velocity": 6.1, "attitude": 17.4, "integral": 42.8},
         {**_LOOPS, "integral": (2.0, 60.0)},
     ),
     "indi": Baseline(
         "INDI",
         _indi,
-        {"position": 12.0, "velocity": 6.0, "attitude": 12.0, "filter": 0.08},
+        {"position": 46.7, "velocity": 7.55, "attitude": 22.0, "filter": 0.0335},
         {**_LOOPS, "filter": (0.02, 0.3)},
     ),
-    "mppi": Baseline("MPPI", _mppi, _RELEASED, _SAMPLING, cost=4),
+    "mppi": Baseline(
+        "MPPI",
+        _mppi,
+        {"thrust": 3.07, "rates": 2.69, "temperature": 0.127, "position": 8.27, "velocity": 0.529, "attitude": 6.33},
+        _SAMPLING,
+        cost=4,
+    ),
     "l1-mpc": Baseline(
         "MPPI + L1",
         _mppi,
-        {**_RELEASED, "estimator": 2.0},
+        {
+            "thrust": 2.43, "rates": 2.54, "temperature": 0.0755, "position": 12.1, "velocity": 0.0784,
+            "attitude": 0.18, "estimator": 0.51,
+        },
         {**_SAMPLING, "estimator": (0.1, 2.0)},
         cost=4,
     ),
-}
+}  # fmt: skip
 """By name of the method. Positions [1/s^2], velocities and attitudes [1/s], integrals [1/s^3], time constants of filter
 and estimator [s]; of MPPI the noise of thrust [m/s^2] and rates [rad/s], the temperature, and costs per second of
 position [1/m], velocity [s/m] and attitude."""

@@ -51,8 +51,8 @@ def gauntlet(
         reporter: Receives progress and the table.
         preset: A preset for hover, tracking or vision, to train with.
         only: Conditions to fly; all by default. One whose plant is not installed is left out, with a line.
-        methods: How the policies fly; by default base, base-i, base-do and full, and beside them geometric-i and indi; for
-            vision base, base-do and full.
+        methods: How the policies fly; by default base, base-i, base-do and full, and beside them geometric-i and indi;
+            for vision base, base-do and full.
         seeds: Training seeds; each also seeds the starts, the gusts and the learners of its flights.
         seconds: Length of a flight [s].
         starts: Flights per condition, method and seed.
