@@ -78,7 +78,7 @@ def test_indi_believes_the_accelerometer():
     """A measured acceleration beyond that of the velocities is a disturbance to it."""
     task, x = hover_task(), State.at(jnp.array(GOAL))
     plain = made("indi", task)
-    memory = plain.init(x)
+    _, memory = plain(plain.init(x), jnp.array(0.0), x)  # before the first tick there is nothing to compare
     level, _ = plain(memory, jnp.array(0.0), x)
     pulled, _ = plain.sensing(jnp.zeros(3), jnp.array([0.0, 0.0, -1.0]))(memory, jnp.array(0.0), x)
     share = 1.0 - np.exp(-DT / 0.08)  # of 1 m/s^2; and the vehicle will have fallen a little until it is answered

@@ -17,7 +17,7 @@ from retrim import Setup, changed
 from retrim.cli.reproduce import COMMANDS
 from retrim.config import named_presets
 from retrim.config.baselines import BASELINES
-from retrim.experiments import Run, design, effort
+from retrim.experiments import Run, design, effort, provenance
 from retrim.experiments.reporter import Silent
 
 # The package has functions of these names.
@@ -106,9 +106,12 @@ def test_all_tables_go_on_where_they_were_killed(tmp_path, monkeypatch):
 
     plan = tuple((make, "Table", {"size": 9}, {"size": 1}) for make in (one, two))
     monkeypatch.setattr(everything, "PLAN", plan)
-    for module in (everything, importlib.import_module("retrim.experiments.tables.kept")):
+    for module in (everything, provenance):
         monkeypatch.setattr(module, "commit", lambda: "abc")
     dying.insert(0, False)
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / f"{name}.md").touch()
     table = lambda quick: everything.everything(Run("test", tmp_path), Silent(), quick=quick)  # noqa: E731
     with pytest.raises(RuntimeError, match="killed"):
         table(False)
@@ -117,6 +120,11 @@ def test_all_tables_go_on_where_they_were_killed(tmp_path, monkeypatch):
     assert "[two](two/two.md)" in (tmp_path / "everything.md").read_text()
     table(True)
     assert made[3:] == [("one", 1), ("two", 1)]
+    table(False)  # what a quick look made is no page of the whole
+    assert made[5:] == []
+    (tmp_path / "one" / "one.md").unlink()
+    table(False)
+    assert made[5:] == [("one", 9)]
 
 
 def test_every_table_of_the_plan_has_the_options_that_are_planned():

@@ -12,10 +12,10 @@ import pytest
 from commands import results, retrim
 from helpers import tiny_preset
 from made_up import DT, flight, log
-from retrim import Scenario, Setup, changed, load
+from retrim import ConfigError, Scenario, Setup, changed, load
 from retrim.config import named_presets as presets
 from retrim.config.presets import Adapt
-from retrim.experiments import Run, rivals
+from retrim.experiments import Run, provenance, rivals
 from retrim.experiments.reporter import Silent
 from retrim.experiments.tables.document import Document, TableSection
 from retrim.experiments.tables.levels import Levels, fly_levels
@@ -91,6 +91,7 @@ def test_a_run_goes_on_where_it_was_killed(tmp_path, monkeypatch):
     preset = changed(tiny_preset(), pretrain=TINY)
     sections = [Levels(f"{n}", preset, Scenario(plant="simple"), f"x{n}", ("base", "indi")) for n in (1, 2)]
     monkeypatch.setattr(kept, "commit", lambda: "abc")
+    monkeypatch.setattr(provenance, "commit", lambda: "abc")
     flown = []
     made = levels._level_section
     monkeypatch.setattr(levels, "_level_section", lambda *a, **k: flown.append(a[1].title) or made(*a, **k))
@@ -112,8 +113,10 @@ def test_a_run_goes_on_where_it_was_killed(tmp_path, monkeypatch):
     assert flown[4:] == ["1"]
 
 
-def test_datt_is_trained_once_for_a_folder(tmp_path):
-    """Of a seed and a vehicle; a file that is damaged is made again."""
+def test_datt_is_trained_once_for_a_folder(tmp_path, monkeypatch):
+    """Of a seed and a vehicle; a file that is damaged, or made by code that has changed, is made again."""
+    monkeypatch.setattr(provenance, "commit", lambda: "abc")
+    monkeypatch.setattr(rivals, "commit", lambda: "abc")
     said = []
     reporter = Silent()
     reporter.say = said.append
@@ -127,6 +130,24 @@ def test_datt_is_trained_once_for_a_folder(tmp_path):
     other = rivals.trained_datt(preset, [0], run, reporter, steps=20_000)
     assert "trained again" in said[0]
     jax.tree.map(np.testing.assert_array_equal, first[0], other[0])
+    monkeypatch.setattr(provenance, "commit", lambda: "abd")
+    rivals.trained_datt(preset, [0], run, reporter, steps=20_000)
+    assert len(list(tmp_path.glob("datt_*_seed0.safetensors"))) == 2
+    with pytest.raises(ConfigError, match=r"DATT looks ahead in steps of 0\.06 s, which must be whole control periods"):
+        rivals.check_rival(changed(preset, dt=0.025))
+
+
+def test_baselines_fly_without_a_trained_policy(tmp_path, monkeypatch):
+    """One flight of each, DATT too, and nothing is trained for policies that nobody flies."""
+    monkeypatch.setattr(levels, "train_all", lambda *_: pytest.fail("a policy is trained"))
+    section = Levels(
+        "x", load("hover/retrim"), Scenario(plant="simple"), "x", ("indi", "datt"), levels={"none": "calm"}
+    )
+    document = Document(Run("test", tmp_path), "table", "Title", "Intro.", [0], Silent())
+    fly_levels(document, [section, dataclasses.replace(section, methods=())], starts=1, seconds=1.0, datt_steps=1)
+    rows = results(tmp_path, "table.json")["rows"]
+    assert [(row["method"], row["n"]) for row in rows] == [("indi", 1), ("datt", 1)]
+    assert [row[0] for row in document.sections[0].rows] == ["INDI", "DATT"]
 
 
 def test_a_table_of_fast_flight_flies_a_file_too(tmp_path):

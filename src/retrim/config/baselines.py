@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 ACTUATOR_TAU = 0.033  # [s], where a preset declares no lag: what quadrotors of this size have
 INTEGRAL_LIMIT = 6.0  # [m/s^2], as the largest disturbance that the policies' observer answers
+HORIZON = 0.8  # [s], of MPPI
 L1_POLE = -0.2  # [1/s], as flown on hardware with DATT; its size hardly matters while it is small beside 1 / dt
 
 DATT_ESTIMATOR = 0.5  # [s], time constant of the filter; DATT's own is 2 s
@@ -86,6 +87,7 @@ def _mppi(setup: "Setup", s: Settings, key: Key[Array, ""]) -> Mppi:
         jnp.array(s["position"]),
         jnp.array(s["velocity"]),
         jnp.array(s["attitude"]),
+        horizon=round(HORIZON / dt),
     )
 
 

@@ -93,13 +93,20 @@ def _gravity_frame(request: MethodRequest) -> Pilot:
     return ControllerPilot(felt_frame(request.controller(), request.setup.preset))
 
 
+def _check_state(request: MethodRequest, name: str) -> None:
+    if isinstance(request.setup.env.task.observation, Keypoints):
+        raise ConfigError(f"method {name!r} needs the measured state; a policy that sees keypoints is shown none")
+
+
 def _without_policy(baseline: Baseline, request: MethodRequest) -> Pilot:
+    _check_state(request, baseline.label)
     return ControllerPilot(baseline.controller(request.setup, request.key))
 
 
 def _datt(request: MethodRequest) -> Pilot:
     if not isinstance(request.policy, DattNet):
         raise ConfigError("method 'datt' flies a network of its own: `retrim reproduce hover --methods datt` trains it")
+    _check_state(request, "datt")
     return ControllerPilot(datt_of(request.setup, request.policy))
 
 

@@ -153,7 +153,7 @@ class Setup:
 
     def pilot(
         self,
-        policy: Policy | LoraPolicy,
+        policy: Any,
         method: str = "base",
         key: Key[Array, ""] | None = None,
         *,
@@ -163,7 +163,7 @@ class Setup:
         """Return a pilot for ``policy``.
 
         Args:
-            policy: A policy of this preset.
+            policy: A policy of this preset; for a method with a network of its own, that network.
             method: ``base`` flies it as it is, ``full`` and ``lora`` re-train it in flight; or another registered name.
             key: Seed of the learners; consumed. A method that does not learn needs none.
             latency: What learning costs in flight time.

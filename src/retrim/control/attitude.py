@@ -9,11 +9,11 @@ from ..tasks.flatness import flat_command
 from ..tasks.reference import Point
 
 LEAST_LIFT = 2.0  # [m/s^2], upward part of the thrust that is asked for: an attitude needs some
-STEEPEST = 1.4  # tangent of the largest tilt that is asked for, 54 degrees
+STEEPEST = 4.0  # tangent of the largest tilt that is asked for, 76 degrees
 
 
 def flyable(thrust: Float[Array, "3"]) -> Float[Array, "3"]:
-    """Return a thrust that a quadrotor can turn to: upward, and tilted by 54 degrees at most.
+    """Return a thrust that a quadrotor can turn to: upward, and tilted by 76 degrees at most.
 
     Args:
         thrust: Mass-normalised thrust that is wanted, world [m/s^2].

@@ -1,7 +1,7 @@
 """DATT (Huang et al. 2023): a policy that looks ahead along its reference, and is told the disturbance.
 
-Written from the paper's description, with what makes it stronger here: all that it sees is relative to the reference
-and in the body frame, and it sees the state in which its command begins to act, and what acts until then.
+Written from the paper's description, with what makes it stronger here: positions are relative to the reference, vectors
+in the body frame, and it sees the state in which its command begins to act, and what acts until then.
 """
 
 import dataclasses

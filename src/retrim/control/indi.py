@@ -9,9 +9,10 @@ import dataclasses
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from ..estimation.prediction import Prediction, Underway
+from ..physics import so3
 from ..physics.state import Command, State
 from ..tasks.task import AbstractTask
 from .attitude import command_for, thrust_of
@@ -27,6 +28,8 @@ class IncrementalState(eqx.Module):
     """State measured one tick ago."""
     excess: Float[Array, "3"]
     """What the thrust that acts has beyond the measured acceleration and gravity, filtered, world [m/s^2]."""
+    ticks: Int[Array, ""]
+    """Ticks flown: before the first there is nothing to compare."""
 
 
 class Incremental(AbstractController[IncrementalState]):
@@ -53,21 +56,24 @@ class Incremental(AbstractController[IncrementalState]):
 
     def init(self, x: State) -> IncrementalState:
         """Return the memory at the start of a flight."""
-        return IncrementalState(self.prediction.init(x), x, jnp.zeros_like(x.p))
+        return IncrementalState(self.prediction.init(x), x, jnp.zeros_like(x.p), jnp.array(0))
 
     def __call__(self, memory: IncrementalState, t: Float[Array, ""], x: State) -> tuple[Command, IncrementalState]:
         """Decide for the state in which the command begins to act."""
         dt, last = self.prediction.dt, memory.last
         acted, _ = self.prediction.acted(memory.underway)
         a = (x.v - last.v) / dt if self.a is None else self.a
-        thrust = acted.c * 0.5 * (last.R[:, 2] + x.R[:, 2])
-        share = 1.0 - jnp.exp(-dt / self.tau.astype(a.dtype))
+        # An accelerometer is not late where the attitude is.
+        late = self.prediction.age if self.a is not None else jnp.zeros_like(self.prediction.age)
+        turned = so3.exp(late.astype(a.dtype) * (acted.omega if self.omega is None else self.omega))
+        thrust = acted.c * 0.5 * so3.mul(last.R, turned)[:, 2] + acted.c * 0.5 * so3.mul(x.R, turned)[:, 2]
+        share = jnp.where(memory.ticks > 0, 1.0 - jnp.exp(-dt / self.tau.astype(a.dtype)), 0.0)
         excess = memory.excess + share * (thrust - thrust_of(a) - memory.excess)
         soon, _ = self.prediction(memory.underway, x, -excess, self.omega)
         wanted = self.task.wanted(t + self.prediction.delay_ticks * dt)
         acceleration = self.gains.acceleration(soon, wanted, jnp.zeros_like(x.p))
         u = command_for(soon, thrust_of(acceleration) + excess, wanted, self.gains.turning())
-        return u, IncrementalState(self.prediction.issued(memory.underway, u), x, excess)
+        return u, IncrementalState(self.prediction.issued(memory.underway, u), x, excess, memory.ticks + 1)
 
     def accepted(self, memory: IncrementalState, u: Command) -> IncrementalState:
         """Remember the accepted command."""

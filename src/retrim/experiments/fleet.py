@@ -1,6 +1,5 @@
 """Many flights of one preset: scenarios x methods x seeds x starts, on any executor."""
 
-import dataclasses
 import secrets
 import threading
 from collections.abc import Callable, Hashable, Mapping, Sequence
@@ -16,7 +15,6 @@ from ..config.loading import dump
 from ..config.presets import Preset
 from ..config.scenario import Scenario
 from ..config.setup import Latency, Setup
-from ..control.policy import Policy
 from ..errors import ConfigError
 from ..plants.plant import Measurement
 from ..runtime.flight import FlightStopped
@@ -58,7 +56,7 @@ class Fleet:
     def __init__(
         self,
         preset: Preset,
-        policies: Policy | Mapping[int, Policy],
+        policies: Any,
         scenarios: Sequence[Scenario],
         *,
         methods: Sequence[str] = ("base", "full"),
@@ -71,7 +69,7 @@ class Fleet:
 
         Args:
             preset: Preset of the policies.
-            policies: By seed; a single one has the seed 0.
+            policies: By seed; a single one has the seed 0. Policies, or what a method flies in their place.
             scenarios: Where they fly.
             methods: How they fly.
             starts: Flights per scenario, method and seed, each from another start.
@@ -87,7 +85,7 @@ class Fleet:
             raise ConfigError(f"{len(scenarios)} scenarios by {len(methods)} methods: there is nothing to fly")
         check_flights(starts, seconds)
         self.preset = preset
-        self.policies = dict(policies) if isinstance(policies, Mapping) else {0: policies}
+        self.policies: dict[int, Any] = dict(policies) if isinstance(policies, Mapping) else {0: policies}
         check_seeds(tuple(self.policies))
         self.setups = {name: Setup.of(preset, name) for name in {s.reference for s in scenarios}}
         for method in methods:
@@ -137,8 +135,7 @@ class Fleet:
                 pilot.warm_up(Measurement(0.0, x0))
             if scenario not in plants:
                 plants.add(scenario)
-                short = dataclasses.replace(spec, method="base")
-                fly_one(setup, self.policies[spec.seed], short, x0, 2 * self.preset.dt)
+                fly_one(setup, self.policies[spec.seed], spec, x0, 2 * self.preset.dt, state=self._state)
 
     def run(
         self,

@@ -12,8 +12,6 @@ from jaxtyping import Array
 
 from ..adapt.learner import LearnerState
 from ..config.setup import Latency, Setup
-from ..control.lora import LoraPolicy
-from ..control.policy import Policy
 from ..physics.state import State
 from ..plants.sim import SimPlant
 from ..runtime.adaptive import AdaptivePilot
@@ -29,7 +27,7 @@ FLOOR = -0.5  # [m]: a vehicle below this is terminated; starts may lie at z = 0
 
 def fly_one(
     setup: Setup,
-    policy: Policy | LoraPolicy,
+    policy: Any,
     spec: FlightSpec,
     x0: State,
     seconds: float,
@@ -43,7 +41,7 @@ def fly_one(
 
     Args:
         setup: Preset of the policy, on the scenario's reference.
-        policy: What flies.
+        policy: What flies: a policy, or the network of a method that has its own.
         spec: Scenario, method and seeds.
         x0: State at the start.
         seconds: Length of the flight.
@@ -67,7 +65,7 @@ def fly_one(
     return scored(setup, spec, log, learnt_by(pilot))
 
 
-def program_of(setup: Setup, policy: Policy | LoraPolicy, specs: Sequence[FlightSpec]) -> Hashable:
+def program_of(setup: Setup, policy: Any, specs: Sequence[FlightSpec]) -> Hashable:
     """Return what tells the program of a batch apart, for flights that differ in start and seed only.
 
     It is judged by the first two of them.
@@ -89,7 +87,7 @@ def program_of(setup: Setup, policy: Policy | LoraPolicy, specs: Sequence[Flight
 
 def fly_lot(
     setup: Setup,
-    policies: Sequence[Policy | LoraPolicy],
+    policies: Sequence[Any],
     specs: Sequence[FlightSpec],
     starts: Sequence[State],
     seconds: float,

@@ -2,12 +2,11 @@
 
 import functools
 from dataclasses import dataclass
+from typing import Any
 
 from ..adapt.learner import LearnerState
 from ..config.loading import parse
 from ..config.setup import Latency, Setup
-from ..control.lora import LoraPolicy
-from ..control.policy import Policy
 from ..physics.state import State
 from .flights import Flight, FlightSpec
 from .flying import fly_one
@@ -20,7 +19,7 @@ class Job:
     fleet: str
     """Which fleet it belongs to."""
     preset: str
-    policy: Policy | LoraPolicy
+    policy: Any
     spec: FlightSpec
     x0: State
     seconds: float

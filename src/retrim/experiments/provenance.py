@@ -1,12 +1,15 @@
 """Where results come from: commit, versions, hardware and command line."""
 
 import functools
+import hashlib
+import json
 import os
 import platform
 import subprocess
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import jax
 
@@ -34,6 +37,16 @@ def commit() -> str:
 def versions() -> dict[str, str]:
     """Return the versions of Python and of the packages that compute."""
     return {name: version(name) for name in PACKAGES} | {"python": platform.python_version()}
+
+
+def section_key(**what: Any) -> str:
+    """Return what tells a section apart: everything that it follows from, and the code that makes it.
+
+    Args:
+        **what: Numbers, texts, and lists and dictionaries of them.
+    """
+    text = json.dumps({"commit": commit(), "versions": versions(), **what}, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def describe_hardware() -> str:

@@ -1,6 +1,5 @@
 """Baselines that are trained before they fly: DATT, by reinforcement learning."""
 
-import hashlib
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,12 +10,13 @@ from jax import random
 from ..config.baselines import prediction_of
 from ..config.presets import Preset
 from ..config.setup import Setup
-from ..control.datt import DattNet
+from ..control.datt import APART, DattNet
 from ..errors import ConfigError, MessageError
 from ..io.files import write_whole
 from ..learn.datt import DISCOUNT, DattProblem, reference_bank
 from ..learn.ppo import PpoSettings, ppo
 from ..transport import wire
+from .provenance import commit, section_key
 from .reporter import Reporter
 from .run import Run
 
@@ -35,6 +35,26 @@ def check_steps(steps: int) -> None:
         raise ConfigError(f"--datt-steps {steps} must be between 1 and 10,000,000,000")
 
 
+def check_rival(preset: Preset) -> None:
+    """Refuse a control period that does not fit the look-ahead.
+
+    Raises:
+        ConfigError: It names the preset.
+    """
+    apart = APART / preset.dt
+    if abs(apart - round(apart)) > 1e-6 or preset.dt > 0.02:
+        raise ConfigError(
+            f"preset {preset.name!r}: DATT looks ahead in steps of {APART} s, which must be whole control periods of "
+            f"20 ms or less, not of {1000 * preset.dt:g} ms"
+        )
+
+
+def steps_made(steps: int) -> int:
+    """Return the steps that are made where ``steps`` are asked for: whole updates."""
+    settings = PpoSettings(**DATT_PPO)
+    return settings.updates(steps) * settings.envs * settings.steps
+
+
 def trained_datt(
     preset: Preset, seeds: Sequence[int], run: Run, reporter: Reporter, *, steps: int = DATT_STEPS
 ) -> dict[int, DattNet]:
@@ -50,14 +70,16 @@ def trained_datt(
     setup, nets = Setup.of(preset), dict[int, DattNet]()
     tau = prediction_of(setup).tau
     about = {"steps": str(steps), "dt": str(preset.dt), "tau": f"{float(tau):.4f}", "vehicle": str(preset.vehicle)}
-    digest = hashlib.sha256(repr(sorted(about.items())).encode()).hexdigest()[:8]
+    name = section_key(datt=about, precision=str(setup.vehicle.mass.dtype))
     for seed in seeds:
-        path = run.folder / f"datt_{digest}_seed{seed}.safetensors"
+        if run.interrupted:
+            break
+        path = run.folder / f"datt_{name}_seed{seed}.safetensors"
         key = random.fold_in(random.key(seed), DATT_TAG)
         k_net, k_learn = random.split(key)
         net: DattNet = eqx.filter_jit(DattNet.of)(key=k_net)
         arrays, fixed = eqx.partition(net, eqx.is_array)
-        if path.is_file():
+        if path.is_file() and not commit().endswith("-dirty"):
             try:
                 nets[seed] = eqx.combine(wire.unpack(path.read_bytes(), arrays, kind="datt", source=str(path)), fixed)
                 continue

@@ -31,7 +31,8 @@ def figures_table(found: Sequence[dict[str, Any]], title: str, levels: Mapping[s
         if row["disturbance"] == level
     )
     about = (
-        "The interval is a bootstrap's over seeds and flights; medians are over flights, a crash counting as infinite; "
+        "The interval is a bootstrap's over seeds and flights that did not crash; medians are over all flights, a "
+        "crash counting as infinite; "
         "rates are root mean squares of what is commanded after 5 s."
     )
     return TableSection(("method", *columns), lines, f"{title}: {levels[level]}", about)

@@ -1,16 +1,18 @@
 """What each method costs: the paper's figures of compute and of samples, beside ours."""
 
+import tempfile
+from pathlib import Path
 from typing import Any
 
 from jax import random
 
 from ...config.baselines import BASELINES, datt_of
 from ...config.setup import Setup
-from ...control.controller import PolicyController
 from ...control.datt import DattNet
+from ...errors import ConfigError
 from ..effort import decision_s, updates
 from ..reporter import Reporter
-from ..rivals import DATT_STEPS, check_steps, trained_datt
+from ..rivals import DATT_STEPS, check_rival, check_steps, steps_made, trained_datt
 from ..run import Run
 from ..stopwatch import Stopwatch
 from ..training import train
@@ -49,7 +51,10 @@ def efficiency(
         datt_steps: Steps of training DATT.
     """
     loaded = table_presets(presets, "hover", seeds=(0,), starts=1, seconds=1.0)
+    if not loaded:
+        raise ConfigError("--presets: name at least one preset for hover")
     check_steps(datt_steps)
+    check_rival(loaded[0])
     document = Document(run, "efficiency", "What each method costs", INTRO, [0], reporter)
     rows: list[dict[str, Any]] = []
     for preset in loaded:
@@ -65,21 +70,25 @@ def efficiency(
         if run.interrupted:
             break
         reporter.say(f"{preset.name}: timing updates")
-        controller = PolicyController(setup.flown.observation_in_flight, policy)
-        rows.append({**trained, **updates(setup), "decision_s": decision_s(setup, controller)})
-        rows.append({"method": f"{preset.name}, LoRA", **updates(setup, lora=True)})
+        with run.interruptible():
+            flies = setup.controller(setup.learner.init(policy, random.key(0)))
+            rows.append({**trained, **updates(setup), "decision_s": decision_s(setup, flies)})
+            rows.append({"method": f"{preset.name}, LoRA", **updates(setup, lora=True)})
     setup = Setup.of(loaded[0])
     for name, baseline in BASELINES.items():
         if run.interrupted:
             break
-        rows.append({"method": name, "decision_s": decision_s(setup, baseline.controller(setup, random.key(0)))})
+        with run.interruptible():
+            rows.append({"method": name, "decision_s": decision_s(setup, baseline.controller(setup, random.key(0)))})
     if not run.interrupted:
         watch = Stopwatch()
-        nets: dict[int, DattNet] = trained_datt(loaded[0], [0], run, reporter, steps=datt_steps)
+        with tempfile.TemporaryDirectory() as folder:  # trained afresh, whatever the run's folder has
+            afresh = Run("efficiency", Path(folder), stop=run.stop)
+            nets: dict[int, DattNet] = trained_datt(loaded[0], [0], afresh, reporter, steps=datt_steps)
         compiling = watch.compile_s
         if nets:
             rows.append({
-                "method": "datt", "steps": datt_steps, "training_s": watch.total_s - compiling,
+                "method": "datt", "steps": steps_made(datt_steps), "training_s": watch.total_s - compiling,
                 "training_compile_s": compiling, "decision_s": decision_s(setup, datt_of(setup, nets[0])),
             })  # fmt: skip
     if rows:

@@ -3,14 +3,14 @@
 from collections.abc import Callable
 from typing import Any
 
-from ..provenance import commit
+from ..provenance import commit, section_key
 from ..reporter import Reporter
 from ..run import Run
 from .design import design
 from .document import Document, TableSection
 from .efficiency import efficiency
 from .hover import hover
-from .kept import FOLDER, section_key
+from .kept import FOLDER
 from .levels import METHODS
 from .model import model
 from .plants import plants
@@ -58,7 +58,7 @@ def everything(run: Run, reporter: Reporter, *, quick: bool = False) -> None:
     Args:
         run: Folder of everything.md and of a folder for each table.
         reporter: Receives progress and the sections.
-        quick: One seed, two starts and short flights: every table, within half an hour on two cores.
+        quick: One seed, two starts and short flights, in a folder quick/; other plants are left out.
     """
     intro = "Made by `retrim reproduce all`" + (
         " `--quick`: one training seed, two starts, short flights; figures to look at, not to quote." if quick else "."
@@ -71,10 +71,11 @@ def everything(run: Run, reporter: Reporter, *, quick: bool = False) -> None:
         if quick and make in QUICK_LEAVES_OUT:
             continue
         name, options = make.__name__, small if quick else full
-        row: dict[str, Any] = {"table": name, "what": what, "page": f"{name}/{name}.md"}
-        part = Run("reproduce", run.folder / name, stop=run.stop)
+        folder = f"quick/{name}" if quick else name
+        row: dict[str, Any] = {"table": name, "what": what, "page": f"{folder}/{name}.md"}
+        part = Run("reproduce", run.folder / folder, stop=run.stop)
         done = run.folder / FOLDER / f"{section_key(table=name, options=options)}.done"
-        if done.is_file() and not commit().endswith("-dirty"):
+        if done.is_file() and (run.folder / row["page"]).is_file() and not commit().endswith("-dirty"):
             reporter.say(f"{name}: as an earlier run of this folder has made it")
             row["s"] = float(done.read_text())
         else:

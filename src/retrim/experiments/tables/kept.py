@@ -1,25 +1,14 @@
 """Sections that a run has finished are kept in its folder: the same command goes on where it was killed."""
 
 import dataclasses
-import hashlib
 import json
 from typing import Any
 
-from ..provenance import commit, versions
+from ..provenance import commit
 from ..run import Run
 from .document import TableSection
 
 FOLDER = "sections"
-
-
-def section_key(**what: Any) -> str:
-    """Return what tells a section apart: everything that it follows from, and the code that makes it.
-
-    Args:
-        **what: Numbers, texts, and lists and dictionaries of them.
-    """
-    text = json.dumps({"commit": commit(), "versions": versions(), **what}, sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def keep(run: Run, key: str, section: TableSection, rows: list[dict[str, Any]]) -> None:

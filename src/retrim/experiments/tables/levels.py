@@ -4,6 +4,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from jax import random
+
 from ...config.baselines import BASELINES
 from ...config.loading import dump
 from ...config.methods import find_method
@@ -12,12 +14,13 @@ from ...config.scenario import Scenario
 from ...config.setup import Setup
 from ..figures import picture
 from ..metrics import cell, rows
+from ..provenance import section_key
 from ..reporter import Reporter
-from ..rivals import DATT_STEPS, RIVALS, check_steps
+from ..rivals import DATT_STEPS, RIVALS, check_rival, check_steps
 from ..run import Run
 from .beside import figures_table
 from .document import Document, TableSection
-from .kept import keep, kept, section_key
+from .kept import keep, kept
 from .study import Study, fly_all, refuse_misfits, train_all
 
 LEVELS = {"none": "no disturbance", "small": "small, 0.5 m/s² per axis", "large": "large, 2 m/s² per axis"}
@@ -76,8 +79,11 @@ def fly_levels(
     """
     run, reporter, studies = document.run, document.reporter, dict[str, Study]()
     check_steps(datt_steps)
+    sections = [section for section in sections if section.methods]
     for section in sections:
-        own = [method for method in section.methods if method not in RIVALS]
+        if any(method in RIVALS for method in section.methods):
+            check_rival(section.preset)
+        own = [method for method in section.methods if method not in RIVALS] or ["base"]
         refuse_misfits(section.preset, section.scenarios, methods=own, starts=starts, seconds=seconds)
     for section in sections:
         name = section_key(
@@ -90,8 +96,11 @@ def fly_levels(
             document.add(*made)
             document.add(figures_table(made[1], section.title, section.levels))
             continue
-        key = dump(section.preset)
-        if key not in studies:
+        key, trains = dump(section.preset), bool(of_policies(section.methods))
+        if not trains:  # nobody flies a policy: seeds are all that is asked of it
+            untrained = Setup.of(section.preset).new_policy(random.key(0))
+            studies.setdefault(key, Study(section.preset, dict.fromkeys(document.seeds, untrained), ()))
+        elif key not in studies or not studies[key].errors:
             studies[key] = train_all(section.preset, document.seeds, run, reporter)
         made = _level_section(
             studies[key], section, run, reporter, starts=starts, seconds=seconds, datt_steps=datt_steps
@@ -119,7 +128,9 @@ def _level_section(
     """The section and its rows of results; None if nothing was flown."""
     methods, title = section.methods, section.title
     own = [method for method in methods if method not in RIVALS]
-    flown = fly_all(study, section.scenarios, run, reporter, methods=own, starts=starts, seconds=seconds).flown
+    flown = []
+    if own:
+        flown = fly_all(study, section.scenarios, run, reporter, methods=own, starts=starts, seconds=seconds).flown
     for rival in (method for method in methods if method in RIVALS):
         nets = RIVALS[rival](study.preset, tuple(study.policies), run, reporter, steps=datt_steps)
         trained = Study(study.preset, nets, ())

@@ -68,7 +68,10 @@ def refuse_misfits(
 
     Raises:
         ConfigError: Something does not exist, or does not fit together.
+        PlantError: The package of a plant is not installed.
     """
+    for scenario in scenarios:
+        scenario.make(preset.vehicle, dt=preset.dt)
     untrained = Setup.of(preset).new_policy(random.key(0))
     Fleet(preset, untrained, scenarios, methods=methods, starts=starts, seconds=seconds)
 

@@ -83,7 +83,9 @@ def tracking(
 def _sections(preset: Preset, plant: str, methods: Sequence[str]) -> list[Levels]:
     """A section for each reference; a policy that sees it ahead is trained once for all, another for each."""
 
-    def section(title: str, preset: Preset, reference: str, paper: PaperRows) -> Levels:
+    def section(
+        title: str, preset: Preset, reference: str, paper: PaperRows, methods: Sequence[str] = methods
+    ) -> Levels:
         trained_on = preset.track.reference.replace("+", "-") if preset.track else ""
         stem = "_".join(["tracking", preset.name.rpartition("/")[2], reference, trained_on])
         return Levels(title, preset, Scenario(plant=plant, reference=reference), stem, methods, paper)
@@ -92,7 +94,7 @@ def _sections(preset: Preset, plant: str, methods: Sequence[str]) -> list[Levels
         unseen = changed(preset, track={"reference": "circle+star"})
         return [
             *(section(f"{name}, seen ahead", preset, name, paper) for name, paper in PAPER.items()),
-            section("figure8, never seen in training", unseen, "figure8", {}),
+            section("figure8, never seen in training", unseen, "figure8", {}, of_policies(methods)),
         ]
     return [
         section(f"{name}, not seen", changed(preset, track={"reference": name}), name, paper)

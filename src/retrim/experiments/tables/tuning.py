@@ -1,5 +1,6 @@
 """Settings of the classical baselines, by random search on flights that no table flies."""
 
+import contextlib
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,6 +13,7 @@ from ...config.scenario import Scenario
 from ...config.setup import Setup
 from ...errors import ConfigError
 from ...plants.sim import SimPlant
+from ...runtime.flight import FlightStopped
 from ...runtime.pilot import ControllerPilot
 from ...runtime.together import fly_together
 from ..flights import FlightSpec
@@ -56,6 +58,12 @@ def tuning(
     """
     check_seeds([seed])
     check_flights(starts, seconds)
+    if seconds < SETTLING + 1.0:
+        raise ConfigError(
+            f"--seconds {seconds:g} must be at least {SETTLING + 1.0:g}: the first {SETTLING:g} do not count"
+        )
+    if not 0 <= candidates <= 10_000:
+        raise ConfigError(f"--candidates {candidates} must be between 0 and 10000")
     if unknown := [name for name in methods if name not in BASELINES]:
         raise ConfigError(f"{', '.join(unknown)}: no baseline with settings; there are {', '.join(BASELINES)}")
     conditions = "; ".join(
@@ -73,7 +81,7 @@ def tuning(
         if run.interrupted:
             break
         tried = [dict(BASELINES[name].settings), *_drawn(BASELINES[name], -(-candidates // BASELINES[name].cost), seed)]
-        with run.interruptible(), reporter.progress(name) as advance:
+        with contextlib.suppress(FlightStopped), run.interruptible(), reporter.progress(name) as advance:
             scores = np.zeros(len(tried))
             for i, (preset, disturbed, sensors, reference) in enumerate(CONDITIONS):
                 scenario = Scenario(disturbed, plant, sensors=sensors, reference=reference)
