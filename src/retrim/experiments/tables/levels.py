@@ -139,6 +139,8 @@ def _level_section(
         ).flown
     if not flown:
         return None
+    place = {scenario: i for i, scenario in enumerate(section.scenarios)}
+    flown.sort(key=lambda flight: (place[flight.spec.scenario], methods.index(flight.spec.method)))
     found = [{**row, "preset": study.preset.name, "section": title} for row in rows(flown)]
     kinds = [event.kind for flight in flown for event in flight.events]
     crashed = sum(flight.log.terminated for flight in flown)
