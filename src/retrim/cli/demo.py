@@ -79,7 +79,7 @@ def _demo(
     with interrupts_only_set(stop):
         run.write_results(found, seeds=[seed], preset=preset.name, losses=losses)
         write_events(flights, run.folder)
-    title = f"steady-state hover error [m]: mean ± std over {starts} starts, last 2 s of {seconds:g} s (in brackets the paper's)"
+    title = f"hover error [m]: mean ± std over {starts} starts, last 2 s of {seconds:g} s; in brackets the paper's"
     show_table(level_table(found, SHOWN, {method: PAPER[method] for method in SHOWN}, title))
     console.print(run.watch.sentence())
     pictures = [path for each in scenarios for path in picture(flights, setup, each, run.folder)]
