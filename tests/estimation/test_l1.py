@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jax import lax, random
 
-from retrim.estimation.l1 import L1Estimator
+from retrim.estimation.l1 import L1Estimator, L1State
 from retrim.physics import State, so3
 
 DT = 0.02
@@ -25,7 +25,7 @@ def estimates(estimator, d, key, ticks=400):
         return (x, memory), memory.d_hat
 
     x = State.at(jnp.zeros(3))
-    return lax.scan(tick, (x, estimator.init(x)), random.split(key, ticks))[1]
+    return lax.scan(tick, (x, L1State.start(x)), random.split(key, ticks))[1]
 
 
 @pytest.mark.parametrize("pole", [-0.01, -0.2, -2.0])

@@ -106,8 +106,7 @@ def test_all_tables_go_on_where_they_were_killed(tmp_path, monkeypatch):
 
     plan = tuple((make, "Table", {"size": 9}, {"size": 1}) for make in (one, two))
     monkeypatch.setattr(everything, "PLAN", plan)
-    for module in (everything, provenance):
-        monkeypatch.setattr(module, "commit", lambda: "abc")
+    monkeypatch.setattr(provenance, "commit", lambda: "abc")
     dying.insert(0, False)
     for name in ("one", "two"):
         (tmp_path / name).mkdir()

@@ -24,7 +24,7 @@ from retrim.experiments.tables.study import train_all
 
 # The package has functions of some of these names.
 TABLES = "retrim.experiments.tables"
-fast, kept, levels = (importlib.import_module(f"{TABLES}.{name}") for name in ("fast", "kept", "levels"))
+fast, levels = (importlib.import_module(f"{TABLES}.{name}") for name in ("fast", "levels"))
 
 pytestmark = pytest.mark.usefixtures("as_a_user")
 
@@ -90,7 +90,6 @@ def test_a_run_goes_on_where_it_was_killed(tmp_path, monkeypatch):
     """What is finished is not flown again, and the table is the same; another size, or other code, is flown."""
     preset = changed(tiny_preset(), pretrain=TINY)
     sections = [Levels(f"{n}", preset, Scenario(plant="simple"), f"x{n}", ("base", "indi")) for n in (1, 2)]
-    monkeypatch.setattr(kept, "commit", lambda: "abc")
     monkeypatch.setattr(provenance, "commit", lambda: "abc")
     flown = []
     made = levels._level_section
@@ -108,7 +107,7 @@ def test_a_run_goes_on_where_it_was_killed(tmp_path, monkeypatch):
     assert whole == again
     table(sections, starts=2)
     assert flown == ["1", "2"] * 2
-    monkeypatch.setattr(kept, "commit", lambda: "abc-dirty")
+    monkeypatch.setattr(provenance, "commit", lambda: "abc-dirty")
     table(sections[:1])
     assert flown[4:] == ["1"]
 
@@ -116,7 +115,6 @@ def test_a_run_goes_on_where_it_was_killed(tmp_path, monkeypatch):
 def test_datt_is_trained_once_for_a_folder(tmp_path, monkeypatch):
     """Of a seed and a vehicle; a file that is damaged, or made by code that has changed, is made again."""
     monkeypatch.setattr(provenance, "commit", lambda: "abc")
-    monkeypatch.setattr(rivals, "commit", lambda: "abc")
     said = []
     reporter = Silent()
     reporter.say = said.append

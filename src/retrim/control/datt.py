@@ -121,12 +121,12 @@ class Datt(AbstractController[DattState]):
 
     def init(self, x: State) -> DattState:
         """Return the memory at the start of a flight."""
-        return DattState(self.prediction.init(x), self.estimator.init(x), x)
+        return DattState(self.prediction.init(x), L1State.start(x), x)
 
     def __call__(self, memory: DattState, t: Float[Array, ""], x: State) -> tuple[Command, DattState]:
         """Evaluate the network once, for the state in which the command begins to act."""
-        acted, _ = self.prediction.acted(memory.underway)
-        estimate = self.estimator(memory.estimate, x, acted.c * 0.5 * (memory.last.R[:, 2] + x.R[:, 2]))
+        thrust = self.prediction.thrust(memory.underway, memory.last.R, x.R)
+        estimate = self.estimator(memory.estimate, x, thrust)
         d = jnp.clip(estimate.d_hat, -self.known, self.known)
         soon, acting = self.prediction(memory.underway, x, estimate.d_hat)
         times = t + self.prediction.delay_ticks * self.prediction.dt + APART * jnp.arange(AHEAD, dtype=t.dtype)

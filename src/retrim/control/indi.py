@@ -66,7 +66,7 @@ class Incremental(AbstractController[IncrementalState]):
         # An accelerometer is not late where the attitude is.
         late = self.prediction.age if self.a is not None else jnp.zeros_like(self.prediction.age)
         turned = so3.exp(late.astype(a.dtype) * (acted.omega if self.omega is None else self.omega))
-        thrust = acted.c * 0.5 * so3.mul(last.R, turned)[:, 2] + acted.c * 0.5 * so3.mul(x.R, turned)[:, 2]
+        thrust = self.prediction.thrust(memory.underway, so3.mul(last.R, turned), so3.mul(x.R, turned))
         share = jnp.where(memory.ticks > 0, 1.0 - jnp.exp(-dt / self.tau.astype(a.dtype)), 0.0)
         excess = memory.excess + share * (thrust - thrust_of(a) - memory.excess)
         soon, _ = self.prediction(memory.underway, x, -excess, self.omega)

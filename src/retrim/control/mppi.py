@@ -70,16 +70,13 @@ class Mppi(AbstractController[MppiState]):
     def init(self, x: State) -> MppiState:
         """Return the memory at the start of a flight: hover is planned."""
         mean = jnp.tile(Command.hover(x.p.dtype).vector(), (self.horizon, 1))
-        nothing = L1State(x.v, jnp.zeros_like(x.v), jnp.zeros_like(x.v))
-        return MppiState(self.prediction.init(x), mean, nothing, x, jnp.array(0))
+        return MppiState(self.prediction.init(x), mean, L1State.start(x), x, jnp.array(0))
 
     def __call__(self, memory: MppiState, t: Float[Array, ""], x: State) -> tuple[Command, MppiState]:
         """Plan from the state in which the command begins to act, and return the first command of the plan."""
         dtype, underway, estimate = x.p.dtype, memory.underway, memory.estimate
         if self.estimator is not None:
-            acted, _ = self.prediction.acted(underway)
-            thrust = acted.c * 0.5 * (memory.last.R[:, 2] + x.R[:, 2])
-            estimate = self.estimator(estimate, x, thrust)
+            estimate = self.estimator(estimate, x, self.prediction.thrust(underway, memory.last.R, x.R))
         soon, acting = self.prediction(underway, x, estimate.d_hat)
         dt = self.prediction.dt
         times = t + dt * (self.prediction.delay_ticks + 1 + jnp.arange(self.horizon, dtype=dtype))

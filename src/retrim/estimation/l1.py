@@ -29,6 +29,11 @@ class L1State(eqx.Module):
     d_hat: Float[Array, "3"]
     """Estimated disturbance [m/s^2]."""
 
+    @classmethod
+    def start(cls, x: State) -> "L1State":
+        """Return the memory at the start of a flight in the state ``x``."""
+        return cls(x.v, jnp.zeros_like(x.v), jnp.zeros_like(x.v))
+
 
 class L1Estimator(eqx.Module):
     """Estimates the disturbance that acts, from velocities and commanded thrust."""
@@ -39,10 +44,6 @@ class L1Estimator(eqx.Module):
     """Share of the old estimate that stays in a tick, 0 to 1."""
     dt: float = eqx.field(static=True)
     """Control tick [s]."""
-
-    def init(self, x: State) -> L1State:
-        """Return the memory at the start of a flight."""
-        return L1State(x.v, jnp.zeros_like(x.v), jnp.zeros_like(x.v))
 
     def __call__(self, s: L1State, x: State, thrust: Float[Array, "3"]) -> L1State:
         """Return the memory after a tick.

@@ -46,6 +46,16 @@ class Prediction(eqx.Module):
         """Return what acted over the tick that has just ended, in the mean, and what acts at its end."""
         return lagged(s.before, s.commands[0], self.dt, self.tau.astype(s.before.c.dtype))
 
+    def thrust(self, s: Underway, before: Float[Array, "3 3"], after: Float[Array, "3 3"]) -> Float[Array, "3"]:
+        """Return the mass-normalised thrust over the tick that has just ended, world [m/s^2].
+
+        Args:
+            s: Memory.
+            before: Attitude at the beginning of the tick, body to world.
+            after: Attitude at its end.
+        """
+        return self.acted(s)[0].c * 0.5 * (before[:, 2] + after[:, 2])
+
     def __call__(
         self, s: Underway, x: State, d: Float[Array, "3"], omega: Float[Array, "3"] | None = None
     ) -> tuple[State, Command]:

@@ -1,5 +1,6 @@
 """The paper's design study (Sec. IV-C): which model is simulated, and through what the gradient flows."""
 
+import functools
 import time
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -103,13 +104,14 @@ def retrained(setup: Setup, policy: Policy, logs: Sequence[Log], key: Key[Array,
     """
     k_fit, k_train = random.split(key)
     nominal: AbstractDynamics[Any] = _rotors(setup) if rotors else PointMass(setup.preset.dt)
-    rows = _rows([log.window(len(log.t) - 1) for log in logs], nominal, setup.preset.plant_delay_ticks)
-    adam = optax.adam(setup.preset.adapt.fit_learning_rate)
+    windows = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *(log.window(len(log.t) - 1) for log in logs))
+    rows = _rows(windows, nominal, setup.preset.plant_delay_ticks)
+    adam = _adam(setup.preset.adapt.fit_learning_rate)
     residual = EnsembleResidual.of(setup.flown.home(), setup.vehicle.omega_max, key=k_fit, members=1)
     fitted, errors = _fitted(EnsembleState.of(residual, adam), rows, adam, fit_epochs)
     dynamics = design_dynamics(setup, fitted.residual, rotors=rotors, backprop=backprop)
     env = Env(dynamics, setup.env.task, setup.env.delay_ticks)
-    optimiser = optax.adam(setup.preset.adapt.learning_rate)
+    optimiser = _adam(setup.preset.adapt.learning_rate)
     state = PolicyState(policy, optimiser.init(policy.params))
     times = list[float]()
     for k in random.split(k_train, 1 + epochs // CHUNK):  # the first one compiles, and is not kept
@@ -125,11 +127,16 @@ def _rotors(setup: Setup) -> LinearDragQuadrotor:
     return LinearDragQuadrotor.of(setup.vehicle, setup.preset.dt, thrust_error=0.0)
 
 
-def _rows(windows: Sequence[Window], nominal: AbstractDynamics[Any], delay_ticks: int) -> Targets:
-    together = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *windows)
-    many: Targets = eqx.filter_jit(
-        lambda nominal, windows: jax.vmap(lambda w: residual_targets(w, nominal, delay_ticks=delay_ticks))(windows)
-    )(nominal, together)
+@functools.cache
+def _adam(learning_rate: float) -> optax.GradientTransformation:
+    """The same object for the same rate, so that what it takes part in is compiled once."""
+    return optax.adam(learning_rate)
+
+
+@eqx.filter_jit
+def _rows(windows: Window, nominal: AbstractDynamics[Any], delay_ticks: int) -> Targets:
+    """Targets of many windows (leading axis), one after another."""
+    many = jax.vmap(lambda window: residual_targets(window, nominal, delay_ticks=delay_ticks))(windows)
     return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), many)  # type: ignore[no-any-return]
 
 

@@ -23,7 +23,7 @@ RUNS = 9  # of a program that is timed
 DECISIONS = 200
 
 
-def timed(work: Callable[[], Any], runs: int = RUNS) -> tuple[float, float]:
+def timed(work: Callable[[], Any], runs: int) -> tuple[float, float]:
     """Return the time that compiling took, and the median of a run [s]."""
     watch = Stopwatch()
     jax.block_until_ready(work())
@@ -47,10 +47,10 @@ def updates(setup: Setup, *, lora: bool = False) -> dict[str, Any]:
         policy = setup.low_rank(policy, random.key(2))
     learner, window = setup.learner, full_window(setup)
     state = learner.init(policy, random.key(1))
-    fit_compile, fit_s = timed(lambda: OnlineLearner.fit_residual(learner, state.residual, window))
+    fit_compile, fit_s = timed(lambda: OnlineLearner.fit_residual(learner, state.residual, window), RUNS)
     fitted, _ = learner.fit_residual(state.residual, window)
     key = random.key(0)
-    compile_s, run_s = timed(lambda: OnlineLearner.update_policy(learner, state.policy, fitted, window, key))
+    compile_s, run_s = timed(lambda: OnlineLearner.update_policy(learner, state.policy, fitted, window, key), RUNS)
     a = setup.preset.adapt
     return {
         "fit_s": fit_s,

@@ -34,6 +34,11 @@ def commit() -> str:
         return "unknown"
 
 
+def is_committed() -> bool:
+    """Return whether the commit says all of the code: with local changes nothing that was made before is used again."""
+    return not commit().endswith("-dirty")
+
+
 def versions() -> dict[str, str]:
     """Return the versions of Python and of the packages that compute."""
     return {name: version(name) for name in PACKAGES} | {"python": platform.python_version()}

@@ -61,7 +61,7 @@ def design(
         f"{FIT_EPOCHS} epochs; {epochs} epochs of the policy, {ENVS} roll-outs each; then {starts} flights of "
         f"{SCORED_S:g} s without further learning, scored over their last 2 s. Times are medians over seeds and "
         f"programs of {CHUNK} epochs, with their range; the four ways take turns. Compiling: as the "
-        "machine's compile cache had it, the median over seeds. High fidelity: rotors, thrust map, "
+        "machine's compile cache had it, for the first seed. High fidelity: rotors, thrust map, "
         "drag and rate controller at 1 kHz."
     )
     document = Document(run, "design", "Design study (Sec. IV-C of the paper)", intro, seeds, reporter)
@@ -103,7 +103,7 @@ def _section(rows: list[dict[str, Any]]) -> TableSection:
             name,
             f"{np.median(times):.1f} ({times.min():.1f} to {times.max():.1f})",
             f"{np.median(times) / (1e3 * first):.2f}",
-            f"{np.median([row['compile_s'] for row in mine]):.1f}",
+            f"{max(row['compile_s'] for row in mine):.1f}",
             f"{np.mean([row['residual_rms'] for row in mine]):.3f}",
             f"{whole.mean():.3f} ± {whole.std(ddof=len(whole) > 1):.3f}{crashed}" if len(whole) else "all crashed",
         ))  # fmt: skip

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
-from ..provenance import commit, section_key
+from ..provenance import is_committed, section_key
 from ..reporter import Reporter
 from ..run import Run
 from .design import design
@@ -75,7 +75,7 @@ def everything(run: Run, reporter: Reporter, *, quick: bool = False) -> None:
         row: dict[str, Any] = {"table": name, "what": what, "page": f"{folder}/{name}.md"}
         part = Run("reproduce", run.folder / folder, stop=run.stop)
         done = run.folder / FOLDER / f"{section_key(table=name, options=options)}.done"
-        if done.is_file() and (run.folder / row["page"]).is_file() and not commit().endswith("-dirty"):
+        if done.is_file() and (run.folder / row["page"]).is_file() and is_committed():
             reporter.say(f"{name}: as an earlier run of this folder has made it")
             row["s"] = float(done.read_text())
         else:

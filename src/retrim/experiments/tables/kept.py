@@ -4,7 +4,7 @@ import dataclasses
 import json
 from typing import Any
 
-from ..provenance import commit
+from ..provenance import is_committed
 from ..run import Run
 from .document import TableSection
 
@@ -23,7 +23,7 @@ def kept(run: Run, key: str) -> tuple[TableSection, list[dict[str, Any]]] | None
     Local changes to the code are told by nothing but ``-dirty``, so that with them nothing counts as finished.
     """
     path = run.folder / FOLDER / f"{key}.json"
-    if commit().endswith("-dirty") or not path.is_file():
+    if not (is_committed() and path.is_file()):
         return None
     try:
         found = json.loads(path.read_text())

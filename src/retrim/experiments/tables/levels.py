@@ -77,7 +77,7 @@ def fly_levels(
     Raises:
         ConfigError: Something does not exist, or does not fit together; nothing has been trained.
     """
-    run, reporter, studies = document.run, document.reporter, dict[str, Study]()
+    run, reporter, studies = document.run, document.reporter, dict[tuple[str, bool], Study]()
     check_steps(datt_steps)
     sections = [section for section in sections if section.methods]
     for section in sections:
@@ -96,12 +96,13 @@ def fly_levels(
             document.add(*made)
             document.add(figures_table(made[1], section.title, section.levels))
             continue
-        key, trains = dump(section.preset), bool(of_policies(section.methods))
-        if not trains:  # nobody flies a policy: seeds are all that is asked of it
-            untrained = Setup.of(section.preset).new_policy(random.key(0))
-            studies.setdefault(key, Study(section.preset, dict.fromkeys(document.seeds, untrained), ()))
-        elif key not in studies or not studies[key].errors:
+        trains = bool(of_policies(section.methods))
+        key = dump(section.preset), trains
+        if key not in studies and trains:
             studies[key] = train_all(section.preset, document.seeds, run, reporter)
+        elif key not in studies:  # nobody flies a policy: seeds are all that is asked of it
+            untrained = Setup.of(section.preset).new_policy(random.key(0))
+            studies[key] = Study(section.preset, dict.fromkeys(document.seeds, untrained), ())
         made = _level_section(
             studies[key], section, run, reporter, starts=starts, seconds=seconds, datt_steps=datt_steps
         )
