@@ -20,7 +20,7 @@ L1 = L1Estimator(jnp.array(-0.2), jnp.exp(jnp.array(-DT / 0.3)), DT)
 
 
 def mppi(estimator=None, samples=256, seed=0):
-    numbers = (jnp.array(v) for v in (0.05, 10.0, 1.0, 1.0))
+    numbers = (jnp.array(v) for v in (0.1, 0.05, 10.0, 1.0, 1.0))
     return Mppi(
         hover_task(),
         Prediction(jnp.array(TAU), DT, 1),
@@ -40,6 +40,14 @@ def test_attitudes_turn_as_one_by_one(key):
     w = jnp.concatenate([random.normal(key, (4, 3)), jnp.zeros((1, 3))])
     found = _turned(jnp.moveaxis(R, 0, -1), w.T)
     np.testing.assert_allclose(jnp.moveaxis(found, -1, 0), jax.vmap(lambda R, w: R @ so3.exp(w))(R, w), atol=1e-9)
+
+
+def test_noise_is_as_correlated_as_it_is_told():
+    """Of variance one at every tick, and exp(-difference / time constant) between ticks."""
+    for tau in (1e-3, 0.1, 0.5):
+        colour = dataclasses.replace(mppi(), correlation=jnp.array(tau))._colour(jnp.zeros(()).dtype)
+        t = DT * np.arange(30)
+        np.testing.assert_allclose(colour @ colour.T, np.exp(-np.abs(t[:, None] - t[None]) / tau), atol=1e-6)
 
 
 def test_a_plan_costs_what_it_does(key):

@@ -83,6 +83,7 @@ def _mppi(setup: "Setup", s: Settings, key: Key[Array, ""]) -> Mppi:
         key,
         estimator,
         jnp.array([s["thrust"], s["rates"], s["rates"], s["rates"]]),
+        jnp.array(s["correlation"]),
         jnp.array(s["temperature"]),
         jnp.array(s["position"]),
         jnp.array(s["velocity"]),
@@ -102,8 +103,8 @@ def datt_of(setup: "Setup", net: DattNet) -> Datt:
 
 _LOOPS = {"position": (4.0, 60.0), "velocity": (3.0, 15.0), "attitude": (5.0, 30.0)}
 _SAMPLING = {
-    "thrust": (0.5, 5.0), "rates": (0.3, 3.0), "temperature": (0.005, 0.5), "position": (2.0, 50.0),
-    "velocity": (0.01, 3.0), "attitude": (0.1, 10.0),
+    "thrust": (0.3, 3.0), "rates": (0.2, 2.0), "correlation": (0.02, 0.5), "temperature": (0.01, 0.5),
+    "position": (3.0, 30.0), "velocity": (0.03, 2.0), "attitude": (0.3, 10.0),
 }  # fmt: skip
 BASELINES: dict[str, Baseline] = {
     "geometric": Baseline(
@@ -127,21 +128,24 @@ BASELINES: dict[str, Baseline] = {
     "mppi": Baseline(
         "MPPI",
         _mppi,
-        {"thrust": 3.07, "rates": 2.69, "temperature": 0.127, "position": 8.27, "velocity": 0.529, "attitude": 6.33},
+        {
+            "thrust": 0.8, "rates": 0.5, "correlation": 0.1, "temperature": 0.0755, "position": 12.1, "velocity": 0.078,
+            "attitude": 3.0,
+        },
         _SAMPLING,
-        cost=4,
+        cost=3,
     ),
     "l1-mpc": Baseline(
         "MPPI + L1",
         _mppi,
         {
-            "thrust": 2.43, "rates": 2.54, "temperature": 0.0755, "position": 12.1, "velocity": 0.0784,
-            "attitude": 0.18, "estimator": 0.51,
+            "thrust": 0.8, "rates": 0.5, "correlation": 0.1, "temperature": 0.0755, "position": 12.1, "velocity": 0.078,
+            "attitude": 3.0, "estimator": 0.51,
         },
         {**_SAMPLING, "estimator": (0.1, 2.0)},
-        cost=4,
+        cost=3,
     ),
 }  # fmt: skip
 """By name of the method. Positions [1/s^2], velocities and attitudes [1/s], integrals [1/s^3], time constants of filter
-and estimator [s]; of MPPI the noise of thrust [m/s^2] and rates [rad/s], the temperature, and costs per second of
-position [1/m], velocity [s/m] and attitude."""
+and estimator [s]; of MPPI the noise of thrust [m/s^2] and rates [rad/s], its correlation [s], the temperature, and
+costs per second of position [1/m], velocity [s/m] and attitude."""

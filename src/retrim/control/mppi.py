@@ -2,7 +2,8 @@
 
 Each tick the mean of the last tick, shifted, is perturbed by noise; every sequence is rolled out in the nominal model,
 with the disturbance that an estimator sees, if there is one; and the new mean is that of all, each with the weight
-exp(-cost / temperature) (Williams et al. 2017; costs and noise as flown beside DATT, Huang et al. 2023).
+exp(-cost / temperature) (Williams et al. 2017; costs as flown beside DATT, Huang et al. 2023). The noise is correlated
+in time (Vlahov et al. 2024): what is drawn afresh for each tick cancels out before it has moved the vehicle.
 """
 
 import dataclasses
@@ -17,6 +18,7 @@ from jaxtyping import Array, Float, Int, Key
 from ..estimation.l1 import L1Estimator, L1State
 from ..estimation.prediction import Prediction, Underway
 from ..physics import so3
+from ..physics.actuators import lagged
 from ..physics.state import STANDARD_GRAVITY, Command, State
 from ..tasks.reference import Point
 from ..tasks.task import AbstractTask
@@ -50,6 +52,8 @@ class Mppi(AbstractController[MppiState]):
     """It corrects the model; None: the model stays nominal."""
     spread: Float[Array, "4"]
     """Standard deviation of the noise: thrust [m/s^2], body rates [rad/s]."""
+    correlation: Float[Array, ""]
+    """Time constant over which the noise forgets itself [s]."""
     temperature: Float[Array, ""]
     """Of the weights; in the unit of the cost."""
     position_cost: Float[Array, ""]
@@ -82,7 +86,8 @@ class Mppi(AbstractController[MppiState]):
         times = t + dt * (self.prediction.delay_ticks + 1 + jnp.arange(self.horizon, dtype=dtype))
         wanted = jax.vmap(self.task.wanted)(times)
         low, high = self.low.vector().astype(dtype), self.high.vector().astype(dtype)
-        noise = random.normal(random.fold_in(self.key, memory.tick), (self.horizon, 4, self.samples), dtype)
+        drawn = random.normal(random.fold_in(self.key, memory.tick), (self.horizon, 4, self.samples), dtype)
+        noise = jnp.tensordot(self._colour(dtype), drawn, 1)
         plans = memory.mean[:, :, None] + self.spread.astype(dtype)[None, :, None] * noise
         plans = jnp.clip(plans, low[None, :, None], high[None, :, None])
         cost = self._costs(plans, soon, acting, wanted, estimate.d_hat)
@@ -96,6 +101,14 @@ class Mppi(AbstractController[MppiState]):
         """Remember the accepted command."""
         return dataclasses.replace(memory, underway=self.prediction.accepted(memory.underway, u))
 
+    def _colour(self, dtype: jnp.dtype) -> Float[Array, "horizon horizon"]:
+        """Return what turns independent numbers into ones with the correlation exp(-|difference| / time constant)."""
+        ticks = jnp.arange(self.horizon, dtype=dtype)
+        kept = jnp.exp(-self.prediction.dt / self.correlation.astype(dtype))
+        since = ticks[:, None] - ticks[None, :]
+        first = jnp.where(ticks == 0.0, jnp.ones((), dtype), jnp.sqrt(1.0 - kept**2))
+        return jnp.where(since >= 0.0, kept ** jnp.abs(since) * first[None, :], 0.0)
+
     def _costs(
         self,
         plans: Float[Array, "horizon 4 samples"],
@@ -106,7 +119,7 @@ class Mppi(AbstractController[MppiState]):
     ) -> Float[Array, " samples"]:
         """Return what each plan costs. Samples lie along the last axis, so that every operation is a long row."""
         dt, dtype = self.prediction.dt, x.p.dtype
-        decay = jnp.exp(-dt / self.prediction.tau.astype(dtype))
+        tau = self.prediction.tau.astype(dtype)
         pull = d + jnp.array([0.0, 0.0, -STANDARD_GRAVITY], dtype=dtype)
 
         def rows(a: Array) -> Array:
@@ -115,9 +128,9 @@ class Mppi(AbstractController[MppiState]):
         def tick(carry: Any, plan: tuple[Array, Point]) -> tuple[Any, None]:
             p, R, v, u, cost = carry
             commanded, goal = plan
-            u = commanded + decay * (u - commanded)
-            R = _turned(R, dt * u[1:])
-            a = R[:, 2] * u[:1] + pull[:, None]
+            mean, u = lagged(u, commanded, dt, tau)
+            before, R = R, _turned(R, dt * mean[1:])
+            a = 0.5 * (before[:, 2] + R[:, 2]) * mean[:1] + pull[:, None]
             p, v = p + dt * v + 0.5 * dt**2 * a, v + dt * a
             away = jnp.sqrt(jnp.sum((p - goal.p[:, None]) ** 2, axis=0) + 1e-12)
             apart = jnp.sqrt(jnp.sum((v - goal.v[:, None]) ** 2, axis=0) + 1e-12)

@@ -11,6 +11,7 @@ from .dynamics import AbstractDynamics, AbstractWrapper
 from .state import Command, State
 
 X = TypeVar("X")
+U = TypeVar("U")
 
 
 class LagState(eqx.Module, Generic[X]):
@@ -20,12 +21,12 @@ class LagState(eqx.Module, Generic[X]):
     acting: Command
 
 
-def lagged(acting: Command, u: Command, dt: float, tau: Float[Array, ""]) -> tuple[Command, Command]:
+def lagged(acting: U, u: U, dt: float, tau: Float[Array, ""]) -> tuple[U, U]:
     """Return what a first-order lag makes of a command over a tick.
 
     Args:
-        acting: Command at the actuators at the beginning of the tick.
-        u: Command that reaches them.
+        acting: Command at the actuators at the beginning of the tick; or arrays of commands.
+        u: Command that reaches them, of the same kind.
         dt: Length of the tick [s].
         tau: Time constant [s].
 

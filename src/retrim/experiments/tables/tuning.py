@@ -40,7 +40,7 @@ def tuning(
     methods: tuple[str, ...] = tuple(BASELINES),
     candidates: int = 96,
     starts: int = 2,
-    seconds: float = 10.0,
+    seconds: float = 12.0,
     seed: int = 100,
     plant: str = "bem",
 ) -> None:
@@ -50,7 +50,7 @@ def tuning(
         run: Folder of tuning.md and tuning.json.
         reporter: Receives progress and the sections.
         methods: Which baselines.
-        candidates: Settings that are tried for each, beside the present ones; a quarter of them for MPPI.
+        candidates: Settings that are tried for each, beside the present ones; a third of them for MPPI.
         starts: Flights of a candidate under each condition.
         seconds: Length of a flight [s]; the first 3 s do not count.
         seed: Seed of candidates, starts and gusts.
@@ -71,10 +71,11 @@ def tuning(
         for preset, disturbed, sensors, reference in CONDITIONS
     )
     intro = (
-        f"Made by `retrim reproduce tuning`. {candidates} candidates for each method (a quarter for MPPI), drawn "
+        f"Made by `retrim reproduce tuning`. {candidates} candidates for each method (a third for MPPI), drawn "
         "evenly in the logarithm of each range, and the present settings, fly the small quadrotor on plant "
-        f"`{plant}` from {starts} starts (seed {seed}) under: {conditions}. The score is the mean error after "
-        f"{SETTLING:g} s [m], a crash counting {CRASH:g} m. No table flies these conditions, starts or seeds."
+        f"`{plant}` from {starts} starts (seed {seed}) under: {conditions}. The score is the root mean square of the "
+        f"error after {SETTLING:g} s, the mean over flights [m], a crash counting {CRASH:g} m. No table flies "
+        "these conditions, starts or seeds."
     )
     document = Document(run, "tuning", "Settings of the baselines", intro, [], reporter)
     for name in methods:
@@ -112,7 +113,7 @@ def _flown(
     seed: int,
     stop: Any,
 ) -> list[float]:
-    """Mean error of each candidate, all flown as one batch."""
+    """Score of each candidate, all flown as one batch."""
     specs = [FlightSpec(scenario, "base", start, seed) for start in range(starts)]
     begun, dt = setup.flight_starts(starts, seed), setup.preset.dt
     made = [scenario.make("small", dt=dt, seed=spec.plant_seed) for _ in tried for spec in specs]
@@ -123,7 +124,8 @@ def _flown(
     logs = fly_together(plants, pilots, begun * len(tried), ticks=round(seconds / dt), stop=stop)
     flights = [scored(setup, specs[0], until_terminated(setup.flown, log)) for log in logs]
     errors = [
-        CRASH if flight.log.terminated else float(np.mean(flight.error[flight.log.t > SETTLING])) for flight in flights
+        CRASH if flight.log.terminated else float(np.sqrt(np.mean(flight.error[flight.log.t > SETTLING] ** 2)))
+        for flight in flights
     ]
     means: list[float] = np.reshape(errors, (len(tried), starts)).mean(axis=1).tolist()
     return means
