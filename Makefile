@@ -83,7 +83,7 @@ $(STAMP): pyproject.toml constraints.txt | $(UV)
 
 # The developers' tools, the site's tools, and the independent plants that the tests fly.
 $(DEV): $(STAMP)
-	$(UV) pip install --quiet --python $(VENV) --constraints constraints.txt --group dev --group docs --editable '.[plants,page,zenoh,mcap]'
+	$(UV) pip install --quiet --python $(VENV) --constraints constraints.txt --group dev --group docs --editable '.[plants,raptor,page,zenoh,mcap]'
 	@touch $@
 
 # After a change of dependencies in pyproject.toml: names, versions and markers only. Versions that still fit stay;

@@ -52,7 +52,8 @@ def fly(
         plant: bem: blade-element rotors; simple: rotors with linear drag; rotorpy, mujoco, crazyflow: independent
             simulators, each an extra to install; or module:name.
         adapt: full: re-train all weights in flight; lora: a low-rank delta (ranks 4, 10, 1); base-i: integral action;
-            base-do: a disturbance observer; none: fly as it is; or module:name. The policy flies as it is, too.
+            base-do: a disturbance observer; none: fly as it is; geometric, geometric-i, indi, mppi, l1-mpc, raptor:
+            controllers beside it; or module:name. The policy flies as it is, too.
         reference: What a tracking policy follows: circle, figure8, star, module:name or a CSV file of t, x, y, z[,
             yaw]; what it was trained on by default. A closed file repeats as laps, another is flown once;
             my.csv:laps and my.csv:once insist. Another reference than that of training needs a policy that sees it.

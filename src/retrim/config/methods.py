@@ -12,11 +12,14 @@ from ..adapt.learner import LearnerState
 from ..control.controller import PolicyController
 from ..control.datt import DattNet
 from ..control.integral import IntegralAction
+from ..control.passive import Passive
 from ..errors import ConfigError
+from ..plants.plant import Plant
 from ..runtime.pilot import ControllerPilot, Pilot
 from ..tasks.keypoints import Keypoints
 from .baselines import BASELINES, Baseline, datt_of
 from .learners import check_frame, felt_frame
+from .on_board import raptor
 from .registry import Registry
 
 if TYPE_CHECKING:
@@ -58,6 +61,17 @@ class MethodEntry:
     make: Callable[[MethodRequest], Pilot]
     label: str
     """Name in tables."""
+    on_board: Callable[["Setup", Plant], Plant] | None = None
+    """Builds what commands the motors into a plant; None for a method that commands thrust and body rates."""
+
+    def fitted(self, setup: "Setup", plant: Plant) -> Plant:
+        """Return the plant that the method flies.
+
+        Raises:
+            ConfigError: It cannot fly this one.
+            PlantError: A package is not installed.
+        """
+        return plant if self.on_board is None else self.on_board(setup, plant)
 
 
 METHODS: Registry[MethodEntry] = Registry("method", example="module:name of a MethodEntry")
@@ -110,6 +124,11 @@ def _datt(request: MethodRequest) -> Pilot:
     return ControllerPilot(datt_of(request.setup, request.policy))
 
 
+def _raptor(request: MethodRequest) -> Pilot:
+    _check_state(request, "raptor")
+    return ControllerPilot(Passive())
+
+
 def _full(request: MethodRequest) -> Pilot:
     return request.setup.adaptive_pilot(request.policy, request.needed_key(), request.latency, request.state)
 
@@ -126,5 +145,6 @@ register_method("base-do", MethodEntry(_gravity_frame, "base policy + disturbanc
 for _name, _baseline in BASELINES.items():
     register_method(_name, MethodEntry(partial(_without_policy, _baseline), _baseline.label))
 register_method("datt", MethodEntry(_datt, "DATT"))
+register_method("raptor", MethodEntry(_raptor, "RAPTOR", on_board=raptor))
 register_method("full", MethodEntry(_full, "**adapted, all weights**"))
 register_method("lora", MethodEntry(_lora, "**adapted, LoRA**"))

@@ -12,6 +12,7 @@ from jax import random
 
 from ..adapt.learner import LearnerState
 from ..config.loading import dump
+from ..config.methods import find_method
 from ..config.presets import Preset
 from ..config.scenario import Scenario
 from ..config.setup import Latency, Setup
@@ -20,7 +21,7 @@ from ..plants.plant import Measurement
 from ..runtime.flight import FlightStopped
 from .compile_cache import release_programs
 from .flights import Flight, FlightSpec
-from .flying import fly_lot, fly_one, program_of
+from .flying import fly_lot, fly_one, plant_of, program_of
 from .interrupts import interrupts_only_set
 from .jobs import Job, fly_job
 from .limits import check_flights, check_seeds
@@ -88,9 +89,12 @@ class Fleet:
         self.policies: dict[int, Any] = dict(policies) if isinstance(policies, Mapping) else {0: policies}
         check_seeds(tuple(self.policies))
         self.setups = {name: Setup.of(preset, name) for name in {s.reference for s in scenarios}}
-        for method in methods:
-            for setup in self.setups.values():  # some do not fit every task or network
+        for method in methods:  # some do not fit every task, network or plant
+            for setup in self.setups.values():
                 setup.pilot(next(iter(self.policies.values())), method, random.key(0))
+            if find_method(method).on_board is not None:
+                for scenario in scenarios:
+                    plant_of(self.setups[scenario.reference], FlightSpec(scenario, method, 0))
         first = next(iter(self.setups.values()))
         self.seconds = first.flown.flight_seconds if seconds is None else seconds
         self._latency, self._state, self._id = latency, state, secrets.token_hex(8)

@@ -11,8 +11,10 @@ from jax import lax
 from jaxtyping import Array
 
 from ..adapt.learner import LearnerState
+from ..config.methods import find_method
 from ..config.setup import Latency, Setup
 from ..physics.state import State
+from ..plants.plant import Plant
 from ..plants.sim import SimPlant
 from ..runtime.adaptive import AdaptivePilot
 from ..runtime.events import Event, Observer
@@ -23,6 +25,18 @@ from ..tasks.task import AbstractTask
 from .flights import Flight, FlightSpec
 
 FLOOR = -0.5  # [m]: a vehicle below this is terminated; starts may lie at z = 0, and a transient dips below them
+
+
+def plant_of(setup: Setup, spec: FlightSpec) -> Plant:
+    """Return the plant of a flight, with what its method has on board.
+
+    Raises:
+        ConfigError: The method cannot fly it.
+        PlantError: A package is not installed.
+    """
+    preset = setup.preset
+    plant = spec.scenario.make(preset.vehicle, dt=preset.dt, seed=spec.plant_seed)
+    return find_method(spec.method).fitted(setup, plant)
 
 
 def fly_one(
@@ -56,7 +70,7 @@ def fly_one(
     """
     preset, task = setup.preset, setup.flown
     pilot = setup.pilot(policy, spec.method, spec.key(), latency=latency, state=state)
-    plant = spec.scenario.make(preset.vehicle, dt=preset.dt, seed=spec.plant_seed)
+    plant = plant_of(setup, spec)
 
     def terminated(t: float, x: State) -> bool:
         return bool(_terminated(task, np.float64(t), x))
@@ -78,8 +92,7 @@ def program_of(setup: Setup, policy: Any, specs: Sequence[FlightSpec]) -> Hashab
     """
     if len(specs) < 2:
         return None
-    preset = setup.preset
-    plants = [spec.scenario.make(preset.vehicle, dt=preset.dt, seed=spec.plant_seed) for spec in specs[:2]]
+    plants = [plant_of(setup, spec) for spec in specs[:2]]
     if not can_fly_together(plants, [setup.pilot(policy, spec.method, spec.key()) for spec in specs[:2]]):
         return None
     return specs[0].method, jax.tree.structure([plant.simulation for plant in plants if isinstance(plant, SimPlant)])
@@ -115,7 +128,7 @@ def fly_lot(
     """
     preset = setup.preset
     pilots = [setup.pilot(p, s.method, s.key(), state=state) for p, s in zip(policies, specs, strict=True)]
-    plants = [spec.scenario.make(preset.vehicle, dt=preset.dt, seed=spec.plant_seed) for spec in specs]
+    plants = [plant_of(setup, spec) for spec in specs]
     if not can_fly_together(plants, pilots):  # the first two were alike, another one is not
         each = zip(policies, specs, starts, strict=True)
         return [fly_one(setup, policy, spec, x0, seconds, state=state, stop=stop) for policy, spec, x0 in each]

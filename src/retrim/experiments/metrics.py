@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from ..config.methods import find_method
 from ..config.presets import Preset
 from .flights import Flight
 
@@ -30,6 +31,7 @@ BEHIND = ("behind_s", "unshifted_m")
 def record(flight: Flight) -> dict[str, Any]:
     """Return the figures of one flight; errors of a flight that was terminated are None."""
     spec, crashed = flight.spec, flight.log.terminated
+    effort = flight.effort if find_method(spec.method).on_board is None else (np.nan, np.nan)  # no rates are commanded
     scenario = spec.scenario
     return {
         "disturbance": scenario.disturbance,
@@ -49,8 +51,8 @@ def record(flight: Flight) -> dict[str, Any]:
         "cross_track_m": None if crashed else flight.cross_track,
         "behind_s": None if flight.behind is None else flight.behind[0],
         "unshifted_m": None if flight.behind is None else flight.behind[1],
-        "rates_rms": _finite(flight.effort[0]),
-        "rates_change_rms": _finite(flight.effort[1]),
+        "rates_rms": _finite(effort[0]),
+        "rates_change_rms": _finite(effort[1]),
         "crashed": crashed,
     }
 

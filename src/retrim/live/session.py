@@ -14,6 +14,7 @@ from jax import random
 
 from ..adapt.learner import LearnerState
 from ..adapt.updates import Layer
+from ..config.methods import find_method
 from ..config.scenario import Scenario
 from ..config.setup import Setup
 from ..control.policy import Policy
@@ -102,6 +103,10 @@ def live_spec(request: LiveRequest) -> LiveSpec:
     if window > MOST_TICKS:
         raise ConfigError(f"adapt.window = {window} ticks: a live flight reports at most {MOST_TICKS}")
     start = request.folder / "start.safetensors"
+    if find_method(request.method).on_board is not None:
+        raise ConfigError(
+            f"method {request.method!r} commands the motors from on board; a live flight commands thrust and body rates"
+        )
     if request.method in LEARNING:
         state = request.state or learner_state(request, request.policy, request.method)
         controller = adaptive_source(setup, state)

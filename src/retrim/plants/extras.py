@@ -1,4 +1,4 @@
-"""Packages that only one plant needs: imported when such a plant is made, never with ``retrim``."""
+"""Packages that only one plant or method needs: imported when such a one is made, never with ``retrim``."""
 
 import contextlib
 import importlib
@@ -8,8 +8,14 @@ from types import ModuleType
 from ..errors import PlantError
 
 
-def import_extra(module: str, name: str) -> ModuleType:
+def import_extra(module: str, name: str, *, package: str | None = None, kind: str = "plant") -> ModuleType:
     """Import ``module``, which the extra ``name`` installs.
+
+    Args:
+        module: What is imported.
+        name: The extra.
+        package: Its name in the registry of packages; that of the extra by default.
+        kind: What has the extra's name, for the message.
 
     Raises:
         PlantError: The extra is not installed, with the command that installs it; or SciPy was imported before
@@ -20,8 +26,8 @@ def import_extra(module: str, name: str) -> ModuleType:
             return importlib.import_module(module)
     except ImportError as error:
         raise PlantError(
-            f"plant {name!r} needs the package {name!r} ({error}); in a checkout: `make dev`, or "
-            f"`uv pip install -e '.[{name}]'`; elsewhere: `pip install {name}`"
+            f"{kind} {name!r} needs the package {package or name!r} ({error}); in a checkout: `make dev`, or "
+            f"`uv pip install -e '.[{name}]'`; elsewhere: `pip install {package or name}`"
         ) from error
     except RuntimeError as error:
         raise PlantError(f"plant {name}: {' '.join(str(error).split())}") from error

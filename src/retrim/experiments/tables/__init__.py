@@ -10,11 +10,27 @@ from .gauntlet import gauntlet as gauntlet
 from .hover import hover as hover
 from .model import model as model
 from .plants import plants as plants
+from .raptor import raptor as raptor
 from .reversing import reversing as reversing
 from .tracking import tracking as tracking
 from .transfer import transfer as transfer
 from .tuning import tuning as tuning
 from .vision import vision as vision
 
-MADE = (hover, reversing, tracking, vision, plants, model, fast, ablation, design, efficiency, transfer, buses, tuning)
+MADE = (
+    hover,
+    reversing,
+    tracking,
+    vision,
+    plants,
+    model,
+    fast,
+    ablation,
+    design,
+    efficiency,
+    transfer,
+    raptor,
+    buses,
+    tuning,
+)
 """Those of ``retrim reproduce``; the gauntlet is a command of its own."""

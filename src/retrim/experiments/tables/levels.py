@@ -33,7 +33,8 @@ METHODS = ("base", "base-i", "base-do", "geometric", "geometric-i", "indi", "mpp
 
 def of_policies(methods: Sequence[str]) -> tuple[str, ...]:
     """Return those methods that fly a policy of the table's preset."""
-    return tuple(method for method in methods if method not in BASELINES and method not in RIVALS)
+    others = {*BASELINES, *RIVALS}
+    return tuple(method for method in methods if method not in others and find_method(method).on_board is None)
 
 
 @dataclass(frozen=True)

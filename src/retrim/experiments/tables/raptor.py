@@ -1,0 +1,60 @@
+"""RAPTOR, the foundation policy, beside ours: hover and a figure-8, undisturbed and disturbed."""
+
+from ...config.loading import changed
+from ...config.scenario import Scenario
+from ..reporter import Reporter
+from ..run import Run
+from .document import Document
+from .levels import Levels, fly_levels
+from .study import table_presets
+
+INTRO = """\
+Made by `retrim reproduce raptor`. RAPTOR is one network for quadrotors of 32 g to 2.4 kg that lift 1.5 to 5 times their
+weight; it commands the four motors at 100 Hz and adapts in its hidden state, without any training. Here it is on board
+of the blade-element plant in the place of the rate controller: it reads the state itself, without delay, and its
+commands act at once, where all others command body rates at 50 Hz over 20 ms of delay. Error over the last 2 s of hover
+and the last 10 s of tracking [m]: mean ± standard deviation over flights. Policies that are trained know the vehicle's
+mass and limits; RAPTOR knows nothing of it. Learning is charged to flight time by the preset's fixed latencies."""
+DISTURBED = {
+    "none": "no disturbance",
+    "large": "large, 2 m/s² per axis",
+    "wind=6": "wind of 6 m/s",
+    "payload": "payload of 70 g",
+    "weak-rotor": "weak rotor",
+}
+METHODS = ("raptor", "base", "base-i", "geometric-i", "indi", "full", "lora")
+
+
+def raptor(
+    run: Run,
+    reporter: Reporter,
+    *,
+    presets: tuple[str, str] = ("hover/retrim", "track/retrim"),
+    vehicles: tuple[str, ...] = ("kingfisher", "small"),
+    methods: tuple[str, ...] = METHODS,
+    seeds: tuple[int, ...] = (0, 1, 2),
+    seconds: float = 30.0,
+    starts: int = 8,
+) -> None:
+    """RAPTOR, a policy of motor commands that needs no re-training, beside ours.
+
+    Args:
+        run: Folder of raptor.md, raptor.json and the pictures.
+        reporter: Receives progress and the sections.
+        presets: One for hover and one for tracking.
+        vehicles: They fly, and policies are trained for each; the small one lifts more than RAPTOR was made for.
+        methods: How they fly.
+        seeds: Training seeds.
+        seconds: Length of a flight [s].
+        starts: Flights per condition, method and seed.
+    """
+    (hover,) = table_presets(presets[:1], "hover", seeds=seeds, starts=starts, seconds=seconds)
+    (track,) = table_presets(presets[1:], "track", seeds=seeds, starts=starts, seconds=seconds)
+    sections = list[Levels]()
+    for vehicle in vehicles:
+        for what, preset, reference in (("Hover", hover, None), ("Figure-8", track, "figure8")):
+            own = changed(preset, vehicle=vehicle)
+            title, stem = f"{what}, {vehicle}", f"raptor_{what.lower().replace('-', '')}_{vehicle}"
+            sections.append(Levels(title, own, Scenario(reference=reference), stem, methods, levels=DISTURBED))
+    document = Document(run, "raptor", "RAPTOR, without re-training", INTRO, seeds, reporter)
+    fly_levels(document, sections, starts=starts, seconds=seconds)

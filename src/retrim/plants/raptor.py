@@ -1,0 +1,152 @@
+"""A vehicle whose motors RAPTOR commands: the foundation policy, 2,084 weights, without a rate controller.
+
+It was distilled from a thousand teachers, each for a vehicle of its own, and adapts in its hidden state (Eschmann,
+Albani and Loianno 2025). It runs on board, at 100 Hz, on what it observes of its vehicle without delay; the reference
+is what it is given from outside. Differences from the reference are clipped as in the flight firmware that has it.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from ..physics import so3
+from ..physics.bem import BemQuadrotor, BemState
+from ..physics.effects import ExternalEffects
+from ..physics.state import Command, State
+from ..physics.substep import SUBSTEP, AbstractSubstepDynamics, RotorState
+from ..physics.vehicle import Vehicle
+from .extras import import_extra
+
+PERIOD = 10  # [ms]
+FARTHEST, FASTEST = 0.5, 1.0  # [m], [m/s]: differences that it is shown, at most
+ORDER = (0, 2, 1, 3)  # its rotors are front-right, back-right, back-left, front-left; ours, of those
+
+
+class RaptorNet(eqx.Module):
+    """The network: a layer, a gated recurrent unit, a layer."""
+
+    first: tuple[Float[Array, "hidden 22"], Float[Array, " hidden"]]
+    inner: tuple[Float[Array, "gates hidden"], Float[Array, " gates"]]
+    """From the first layer to the gates: reset, update, candidate."""
+    recurrent: tuple[Float[Array, "gates hidden"], Float[Array, " gates"]]
+    """From the hidden state to the gates."""
+    last: tuple[Float[Array, "4 hidden"], Float[Array, "4"]]
+    start: Float[Array, " hidden"]
+    """Hidden state at the start of a flight."""
+
+    @classmethod
+    def load(cls) -> "RaptorNet":
+        """Return the network that the package ``foundation-policy`` brings.
+
+        Raises:
+            PlantError: It is not installed.
+        """
+        theirs = import_extra("foundation_policy", "raptor", package="foundation-policy", kind="method")
+        first, unit, last = theirs.Raptor().layers
+
+        def pair(weights: Any, biases: Any) -> tuple[Array, Array]:
+            return jnp.asarray(weights, dtype=float), jnp.asarray(biases, dtype=float).reshape(-1)
+
+        return cls(
+            pair(first.weights, first.biases),
+            pair(unit.weights_input, unit.biases_input),
+            pair(unit.weights_hidden, unit.biases_hidden),
+            pair(last.weights, last.biases),
+            jnp.asarray(unit.initial_hidden_state, dtype=float),
+        )
+
+    def __call__(
+        self, hidden: Float[Array, " hidden"], o: Float[Array, "22"]
+    ) -> tuple[Float[Array, "4"], Float[Array, " hidden"]]:
+        """Return four motor commands, and the hidden state after them.
+
+        Args:
+            hidden: Hidden state.
+            o: Differences of position [m] and velocity [m/s] from the reference around the attitude, row by row (12 and
+                3 numbers), body rates [rad/s], and the last commands.
+        """
+
+        def affine(layer: tuple[Array, Array], x: Array) -> Array:
+            return layer[0] @ x + layer[1]
+
+        inner = affine(self.inner, jnp.maximum(affine(self.first, o), 0.0))
+        recurrent = affine(self.recurrent, hidden)
+        (r_in, z_in, n_in), (r_rec, z_rec, n_rec) = jnp.split(inner, 3), jnp.split(recurrent, 3)
+        reset, update = 1.0 / (1.0 + jnp.exp(-(r_in + r_rec))), 1.0 / (1.0 + jnp.exp(-(z_in + z_rec)))
+        hidden = update * hidden + (1.0 - update) * jnp.tanh(n_in + reset * n_rec)
+        return affine(self.last, hidden), hidden
+
+
+class RaptorState(eqx.Module):
+    """State of a vehicle that RAPTOR flies."""
+
+    body: BemState
+    hidden: Float[Array, " hidden"]
+    action: Float[Array, "4"]
+    """Last commands, -1 to 1."""
+    ms: Int[Array, ""]
+    """Milliseconds flown."""
+
+
+class _Motors(eqx.Module):
+    """What stands in the place of a rate controller: it commands speeds, whatever the command says."""
+
+    speeds: Float[Array, "4"]
+    thrust_map: Float[Array, ""]
+
+    def __call__(
+        self, vehicle: Vehicle, s: RotorState, u: Command
+    ) -> tuple[Float[Array, "4"], Float[Array, "3"], Float[Array, "3"]]:
+        return self.speeds, s.integral, s.wanted_slow
+
+
+class RaptorQuadrotor(AbstractSubstepDynamics[RaptorState]):
+    """A blade-element vehicle with RAPTOR on board; commands from outside are not listened to."""
+
+    base: BemQuadrotor
+    net: RaptorNet
+    wanted: Any
+    """The reference: a function of the time since the start of the flight [s], whose values have p, v and heading."""
+
+    @property
+    def dt(self) -> float:
+        """Control tick of the loop outside [s]."""
+        return self.base.dt
+
+    def init(self, x: State) -> RaptorState:
+        """Return the state of a vehicle that hovers, with RAPTOR switched on."""
+        zero = jnp.zeros(4, dtype=x.p.dtype)
+        return RaptorState(self.base.init(x), self.net.start.astype(x.p.dtype), zero, jnp.array(0))
+
+    def state(self, s: RaptorState) -> State:
+        """Return (p, R, v)."""
+        return self.base.state(s.body)
+
+    def with_state(self, s: RaptorState, x: State) -> RaptorState:
+        """Replace (p, R, v)."""
+        return RaptorState(self.base.with_state(s.body, x), s.hidden, s.action, s.ms)
+
+    def rotor_state(self, s: RaptorState) -> RotorState:
+        """Return body rates and rotor speeds."""
+        return self.base.rotor_state(s.body)
+
+    def substep(self, s: RaptorState, u: Command, effects: ExternalEffects) -> RaptorState:
+        """Advance one millisecond; every tenth begins with a decision."""
+        action, hidden = lax.cond(s.ms % PERIOD == 0, lambda: self._decided(s), lambda: (s.action, s.hidden))
+        vehicle = self.base.vehicle
+        throttle = 0.5 * (jnp.clip(action, -1.0, 1.0) + 1.0)[jnp.array(ORDER)]
+        speeds = vehicle.motor_min + throttle * (vehicle.motor_max - vehicle.motor_min)
+        flown = BemQuadrotor(vehicle, _Motors(speeds, self.base.loop.thrust_map), self.base.dt)
+        return RaptorState(flown.substep(s.body, u, effects), hidden, action, s.ms + 1)
+
+    def _decided(self, s: RaptorState) -> tuple[Float[Array, "4"], Float[Array, " hidden"]]:
+        body, x = s.body.body, self.state(s)
+        goal = self.wanted(SUBSTEP * s.ms.astype(x.p.dtype))
+        facing = so3.rotz(goal.heading).T
+        p = jnp.clip(so3.act(facing, x.p - goal.p), -FARTHEST, FARTHEST)
+        v = jnp.clip(so3.act(facing, x.v - goal.v), -FASTEST, FASTEST)
+        o = jnp.concatenate([p, so3.mul(facing, x.R).reshape(9), v, body.omega, s.action])
+        return self.net(s.hidden, o)
