@@ -116,7 +116,7 @@ BASELINES: dict[str, Baseline] = {
     "geometric-i": Baseline(
         "geometric controller + integral action",
         _geometric,
-        {"position": 26.8, "velocity": 6.1, "attitude": 17.4, "integral": 42.8},
+        {"position": 40.2, "velocity": 6.85, "attitude": 21.4, "integral": 20.6},
         {**_LOOPS, "integral": (2.0, 60.0)},
     ),
     "indi": Baseline(
@@ -129,8 +129,8 @@ BASELINES: dict[str, Baseline] = {
         "MPPI",
         _mppi,
         {
-            "thrust": 0.8, "rates": 0.5, "correlation": 0.1, "temperature": 0.0755, "position": 12.1, "velocity": 0.078,
-            "attitude": 3.0,
+            "thrust": 1.46, "rates": 1.69, "correlation": 0.133, "temperature": 0.0896, "position": 6.89,
+            "velocity": 0.0514, "attitude": 2.02,
         },
         _SAMPLING,
         cost=3,
@@ -139,8 +139,8 @@ BASELINES: dict[str, Baseline] = {
         "MPPI + L1",
         _mppi,
         {
-            "thrust": 0.8, "rates": 0.5, "correlation": 0.1, "temperature": 0.0755, "position": 12.1, "velocity": 0.078,
-            "attitude": 3.0, "estimator": 0.51,
+            "thrust": 1.05, "rates": 1.47, "correlation": 0.0762, "temperature": 0.133, "position": 14.1,
+            "velocity": 0.0528, "attitude": 0.694, "estimator": 0.126,
         },
         {**_SAMPLING, "estimator": (0.1, 2.0)},
         cost=3,
