@@ -104,16 +104,24 @@ def test_rows_become_a_table_where_pandas_is_installed(monkeypatch):
     assert list(table.columns) == list(found[0])
 
 
-def test_a_flight_that_is_late_is_found_to_be_late():
-    """A circle flown 0.1 s behind: the error is the chord, and nothing is left of it but for that."""
-    flown, t = log(10.0), DT * np.arange(501)
-    path = lambda t: np.stack([np.cos(t), np.sin(t), np.ones_like(t)], axis=1)  # noqa: E731
-    true = States(path(t - 0.1), *flown.true[1:])
-    late = flight(2.0 * np.sin(0.05), flown=flown._replace(true=true), cross=np.zeros(501))
+@pytest.mark.parametrize(
+    ("late_s", "lap", "found"), [(0.1, 6.0, 0.1), (2.2, 6.0, 2.2), (-0.4, 6.0, -0.4), (1.9, 2.0, -0.1)]
+)
+def test_a_flight_that_is_late_is_found_to_be_late(late_s, lap, found):
+    """A circle flown late: nothing is left of the error but for that; of shifts a lap apart the smallest is told."""
+    t = DT * np.arange(1001)
+
+    def path(t):
+        angle = 2.0 * np.pi * t / lap
+        return np.stack([np.cos(angle), np.sin(angle), np.ones_like(t)], axis=1)
+
+    flown = log(20.0)
+    true = States(path(t - late_s), *flown.true[1:])
+    late = flight(1.0, flown=flown._replace(true=true), cross=np.zeros(1001), steady_seconds=10.0)
     late = dataclasses.replace(late, target=path(t))
     behind, error = late.behind
-    assert behind == pytest.approx(0.1)
-    assert error == pytest.approx(0.0, abs=1e-12)
+    assert behind == pytest.approx(found)
+    assert error == pytest.approx(0.0, abs=1e-9)
     assert dataclasses.replace(late, cross=None).behind is None  # it follows nothing
 
 
