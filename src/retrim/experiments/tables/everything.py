@@ -51,7 +51,7 @@ PLAN: tuple[tuple[Callable[..., None], str, Options, Options], ...] = (
         raptor,
         "beside RAPTOR",
         {},
-        {**FEW, "seconds": 12.0, "vehicles": ("kingfisher",), "methods": ("raptor", "indi", "full")},
+        {**FEW, "seconds": 12.0, "methods": ("raptor", "indi", "full")},
     ),
     (model, "the plant", {}, {}),
     (plants, "other plants", {}, {}),

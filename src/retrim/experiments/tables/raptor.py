@@ -30,7 +30,7 @@ def raptor(
     reporter: Reporter,
     *,
     presets: tuple[str, str] = ("hover/retrim", "track/retrim"),
-    vehicles: tuple[str, ...] = ("kingfisher", "small"),
+    vehicles: tuple[str, ...] = ("kingfisher",),
     methods: tuple[str, ...] = METHODS,
     seeds: tuple[int, ...] = (0, 1, 2),
     seconds: float = 30.0,
@@ -42,7 +42,7 @@ def raptor(
         run: Folder of raptor.md, raptor.json and the pictures.
         reporter: Receives progress and the sections.
         presets: One for hover and one for tracking.
-        vehicles: They fly, and policies are trained for each; the small one lifts more than RAPTOR was made for.
+        vehicles: They fly, and policies are trained for each; small and large lift more than RAPTOR was made for.
         methods: How they fly.
         seeds: Training seeds.
         seconds: Length of a flight [s].
