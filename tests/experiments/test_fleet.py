@@ -15,8 +15,7 @@ import pytest
 from helpers import tiny_preset
 from retrim import ConfigError, Fleet, Scenario, Setup, enable_compile_cache, load
 from retrim.config.loading import dump
-from retrim.experiments import fleet as module
-from retrim.experiments import flying, lots
+from retrim.experiments import flying, gathering, lots
 from retrim.experiments.jobs import setup_for
 from retrim.physics import State
 
@@ -151,7 +150,7 @@ def test_progress_counts_the_flights_that_are_over(fleet):
 
 
 def test_progress_of_a_lot_is_told_before_it_lands(fleet, monkeypatch):
-    monkeypatch.setattr(module, "OFTEN", 0.001)
+    monkeypatch.setattr(gathering, "OFTEN", 0.001)
     monkeypatch.setattr(lots, "lanes", lambda: 1)
     told = []
     part = [spec for spec in fleet.specs if spec.method == "full"][:2]

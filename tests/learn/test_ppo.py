@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from jax import random
 
-from retrim.learn.ppo import Outcome, PpoSettings, Seen, advantages, log_prob, ppo
+from retrim.learn.ppo import PpoSettings, Seen, advantages, log_prob, ppo
+from retrim.learn.problem import Outcome
 
 pytestmark = pytest.mark.usefixtures("optax_promotion")
 

@@ -10,7 +10,8 @@ from ..config.setup import Latency, Setup
 from ..errors import ConfigError
 from ..experiments.asked import flown_reference, loaded, same_policy
 from ..experiments.figures import picture
-from ..experiments.fleet import Fleet, told_by
+from ..experiments.fleet import Fleet
+from ..experiments.gathering import told_by
 from ..experiments.interrupts import interrupts_only_set
 from ..experiments.metrics import cell, notes, rows
 from ..experiments.outputs import clear_outputs, write_events, write_learnt, write_logs
@@ -51,9 +52,8 @@ def fly(
             wind+payload=0.1, or module:name.
         plant: bem: blade-element rotors; simple: rotors with linear drag; rotorpy, mujoco, crazyflow: independent
             simulators, each an extra to install; or module:name.
-        adapt: full: re-train all weights in flight; lora: a low-rank delta (ranks 4, 10, 1); base-i: integral action;
-            base-do: a disturbance observer; none: fly as it is; geometric, geometric-i, indi, mppi, l1-mpc, raptor:
-            controllers beside it; or module:name. The policy flies as it is, too.
+        adapt: full, lora: re-train in flight, all weights or a few; base-i: integral action; base-do: observer; none: as
+            it is; geometric, geometric-i, indi, mppi, l1-mpc, raptor: another controller; or module:name.
         reference: What a tracking policy follows: circle, figure8, star, module:name or a CSV file of t, x, y, z[,
             yaw]; what it was trained on by default. A closed file repeats as laps, another is flown once;
             my.csv:laps and my.csv:once insist. Another reference than that of training needs a policy that sees it.

@@ -5,8 +5,8 @@ from jaxtyping import Array, Float
 
 from ..physics import so3
 from ..physics.state import STANDARD_GRAVITY, Command, State
+from ..tasks.abstract_reference import Point
 from ..tasks.flatness import flat_command
-from ..tasks.reference import Point
 
 LEAST_LIFT = 2.0  # [m/s^2], upward part of the thrust that is asked for: an attitude needs some
 STEEPEST = 4.0  # tangent of the largest tilt that is asked for, 76 degrees

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from ..estimation.prediction import Prediction, Underway
 from ..physics.state import Command, State
-from ..tasks.reference import Point
+from ..tasks.abstract_reference import Point
 from ..tasks.task import AbstractTask
 from .attitude import command_for, thrust_of
 from .controller import AbstractController

@@ -20,7 +20,7 @@ from ..estimation.prediction import Prediction, Underway
 from ..physics import so3
 from ..physics.actuators import lagged
 from ..physics.state import STANDARD_GRAVITY, Command, State
-from ..tasks.reference import Point
+from ..tasks.abstract_reference import Point
 from ..tasks.task import AbstractTask
 from .controller import AbstractController
 

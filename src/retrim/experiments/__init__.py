@@ -2,10 +2,10 @@
 
 from .compile_cache import enable_compile_cache as enable_compile_cache
 from .fleet import Fleet as Fleet
-from .fleet import Flights as Flights
 from .flights import Flight as Flight
 from .flights import FlightSpec as FlightSpec
 from .flying import fly_one as fly_one
+from .gathering import Flights as Flights
 from .metrics import rows as rows
 from .run import Run as Run
 from .training import nominal_error as nominal_error

@@ -3,9 +3,7 @@
 import secrets
 import threading
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass
-from functools import partial
+from concurrent.futures import Executor, ThreadPoolExecutor
 from typing import Any
 
 from jax import random
@@ -18,37 +16,13 @@ from ..config.scenario import Scenario
 from ..config.setup import Latency, Setup
 from ..errors import ConfigError
 from ..plants.plant import Measurement
-from ..runtime.flight import FlightStopped
 from .compile_cache import release_programs
 from .flights import Flight, FlightSpec
 from .flying import fly_lot, fly_one, plant_of, program_of
-from .interrupts import interrupts_only_set
+from .gathering import Flights, Progress, Submit, gathered
 from .jobs import Job, fly_job
 from .limits import check_flights, check_seeds
 from .lots import Lot, in_lots, lanes
-from .metrics import Rows, rows
-
-OFTEN = 1.0  # [s]: progress is told so often while flights are in the air
-Progress = Callable[[float, int], None]
-"""Called with the number of flights that are over, one in the air by the share that was flown, and of all flights."""
-
-
-def told_by(advance: Callable[[float, str], None]) -> Progress:
-    """Return the progress of a fleet for a bar: ``advance`` takes a share and a text."""
-    return lambda done, n: advance(done / n, f"{done:.0f} of {n} flights")
-
-
-@dataclass(frozen=True)
-class Flights:
-    """The flights of a fleet that were flown to their end."""
-
-    flown: list[Flight]
-    interrupted: bool
-    """Some flights are missing: the fleet was stopped."""
-
-    def rows(self) -> Rows:
-        """Return one row of results per scenario, method and seed."""
-        return rows(self.flown)
 
 
 class Fleet:
@@ -170,69 +144,21 @@ class Fleet:
         stop = stop or threading.Event()
         specs = self.specs if only is None else list(only)
         if executor is not None:
-            local = isinstance(executor, ThreadPoolExecutor)
             lots = [Lot([spec], None) for spec in specs]
-            return self._run(executor, specs, lots, progress, landed, stop, local=local)
+            submit = self._here(executor, stop) if isinstance(executor, ThreadPoolExecutor) else self._away(executor)
+            return gathered(specs, lots, submit, progress=progress, landed=landed, stop=stop)
         lots = self.lots(specs)
         self.warm_up([lot.specs[0] for lot in lots if lot.compiled is None])
         with ThreadPoolExecutor(1 if self._latency == "measured" else lanes()) as pool:
-            return self._run(pool, specs, lots, progress, landed, stop, local=True)
+            return gathered(specs, lots, self._here(pool, stop), progress=progress, landed=landed, stop=stop)
 
-    def _run(
-        self,
-        executor: Executor,
-        specs: Sequence[FlightSpec],
-        lots: Sequence[Lot],
-        progress: Progress | None,
-        landed: Callable[[Sequence[Flight]], None] | None,
-        stop: threading.Event,
-        *,
-        local: bool,
-    ) -> Flights:
-        futures: list[Future[list[Flight]]] = []
-        aloft, flown = dict[int, float](), dict[FlightSpec, Flight]()
-        try:
-            for i, lot in enumerate(lots):
-                futures.append(
-                    executor.submit(self._fly, lot, partial(aloft.__setitem__, i), stop)
-                    if local
-                    else executor.submit(fly_job, self._job(lot.specs[0]))
-                )
-            waiting = {future: i for i, future in enumerate(futures)}
+    def _here(self, pool: Executor, stop: threading.Event) -> Submit:
+        """Lots are flown in this process."""
+        return lambda lot, aloft: pool.submit(self._fly, lot, aloft, stop)
 
-            def told() -> None:
-                in_air = sum(len(lots[i].specs) * aloft.get(i, 0.0) for i in waiting.values())
-                if progress is not None:
-                    progress(len(flown) + in_air, len(specs))
-
-            while waiting:
-                over = wait(waiting, OFTEN, FIRST_COMPLETED).done
-                for future in over:
-                    flights = future.result()
-                    flown |= {flight.spec: flight for flight in flights}
-                    if landed is not None:
-                        with interrupts_only_set(stop):
-                            landed(flights)
-                    del waiting[future]
-                    told()
-                if not over and aloft:
-                    told()
-        except (KeyboardInterrupt, FlightStopped):
-            stop.set()
-        except BaseException:
-            stop.set()
-            raise
-        finally:
-            with interrupts_only_set(stop):  # a further Ctrl-C must not lose what is done
-                for future in futures:
-                    future.cancel()
-                late = [future for future in futures if stop.is_set() and not future.cancelled()]
-                kept = [flight for each in late if each.exception() is None for flight in each.result()]
-                new = [flight for flight in kept if flight.spec not in flown]
-                flown |= {flight.spec: flight for flight in new}
-                if landed is not None and new:
-                    landed(new)
-        return Flights([flown[spec] for spec in specs if spec in flown], interrupted=len(flown) < len(specs))
+    def _away(self, executor: Executor) -> Submit:
+        """Lots are one flight each, and flown by whoever gets the job."""
+        return lambda lot, aloft: executor.submit(fly_job, self._job(lot.specs[0]))
 
     def _fly(self, lot: Lot, aloft: Callable[[float], None], stop: threading.Event) -> list[Flight]:
         """Fly a lot in this process; ``aloft`` is told the share that was flown."""

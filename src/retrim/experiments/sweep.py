@@ -21,8 +21,9 @@ from ..io.files import write_whole
 from ..io.trained import load_policy, save_policy
 from ..viz.panels import bars
 from ..viz.plots import save
-from .fleet import Fleet, told_by
+from .fleet import Fleet
 from .flights import Flight, FlightSpec
+from .gathering import told_by
 from .limits import check_seeds
 from .metrics import Rows, cell, record, summary
 from .reporter import Reporter

@@ -13,7 +13,7 @@ from ..physics import so3
 from ..physics.actuators import lagged
 from ..physics.dynamics import PointMass
 from ..physics.state import Command, State
-from .ppo import Outcome
+from .problem import Outcome
 
 EPISODE = 500  # ticks
 WALK = 0.02  # [m/s^2], standard deviation of a step of the disturbance, per axis
@@ -35,7 +35,7 @@ class DattEnv(NamedTuple):
 
 
 class DattProblem(eqx.Module):
-    """The environment; see :class:`retrim.learn.ppo.Problem`."""
+    """The environment; see :class:`retrim.learn.problem.Problem`."""
 
     bank: Float[Array, "n ticks 3"]
     """References, around the origin [m]."""

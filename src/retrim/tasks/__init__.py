@@ -1,5 +1,7 @@
 """Tasks: starts, rewards, observations, termination and errors."""
 
+from .abstract_reference import AbstractReference as AbstractReference
+from .abstract_reference import TurnedReference as TurnedReference
 from .hover import AbstractHover as AbstractHover
 from .hover import Hover as Hover
 from .hover import L2Hover as L2Hover
@@ -8,9 +10,7 @@ from .observation import AbstractObservation as AbstractObservation
 from .observation import StateObs as StateObs
 from .occluded import OccludedKeypoints as OccludedKeypoints
 from .preview import Preview as Preview
-from .reference import AbstractReference as AbstractReference
 from .reference import Reference as Reference
-from .reference import TurnedReference as TurnedReference
 from .reference import joined as joined
 from .shapes import REFERENCES as REFERENCES
 from .shapes import smooth_start as smooth_start

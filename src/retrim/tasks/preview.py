@@ -7,8 +7,8 @@ from jaxtyping import Array, Float
 
 from ..physics.felt_frame import FeltFrame
 from ..physics.state import STANDARD_GRAVITY, Command, State
+from .abstract_reference import AbstractReference
 from .observation import VELOCITY_SCALE, AbstractObservation
-from .reference import AbstractReference
 
 POSITIONS = (0.0, 0.08, 0.16, 0.28, 0.4)  # [s] ahead
 VELOCITIES = (0.0, 0.2)

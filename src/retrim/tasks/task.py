@@ -11,8 +11,8 @@ from jaxtyping import Array, Bool, Float, Key
 from ..errors import FrameError
 from ..physics.felt_frame import FeltFrame
 from ..physics.state import STANDARD_GRAVITY, Command, State
+from .abstract_reference import Point
 from .observation import AbstractObservation
-from .reference import Point
 
 
 class Start(eqx.Module):

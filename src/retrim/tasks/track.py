@@ -12,8 +12,8 @@ from jaxtyping import Array, Bool, Float, Key
 from ..physics import so3
 from ..physics.felt_frame import FeltFrame
 from ..physics.state import Command, State
+from .abstract_reference import AbstractReference, Point
 from .observation import AbstractObservation
-from .reference import AbstractReference, Point
 from .task import AbstractTask, Start, huber, within
 
 NOISE = 0.1 * math.pi  # [rad]

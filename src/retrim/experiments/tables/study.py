@@ -11,7 +11,8 @@ from ...config.presets import Preset
 from ...config.scenario import Scenario
 from ...config.setup import Setup
 from ...control.policy import Policy
-from ..fleet import Fleet, Flights, told_by
+from ..fleet import Fleet
+from ..gathering import Flights, told_by
 from ..limits import check_flights, check_seeds
 from ..reporter import Reporter
 from ..run import Run
