@@ -52,8 +52,8 @@ def fly(
             wind+payload=0.1, or module:name.
         plant: bem: blade-element rotors; simple: rotors with linear drag; rotorpy, mujoco, crazyflow: independent
             simulators, each an extra to install; or module:name.
-        adapt: full, lora: re-train in flight, all weights or a few; base-i: integral action; base-do: observer; none: as
-            it is; geometric, geometric-i, indi, mppi, l1-mpc, raptor: another controller; or module:name.
+        adapt: full, lora: re-train in flight, all weights or a few; base-i: integral action; base-do: observer; none:
+            as it is; geometric, geometric-i, indi, mppi, l1-mpc, raptor: another controller; or module:name.
         reference: What a tracking policy follows: circle, figure8, star, module:name or a CSV file of t, x, y, z[,
             yaw]; what it was trained on by default. A closed file repeats as laps, another is flown once;
             my.csv:laps and my.csv:once insist. Another reference than that of training needs a policy that sees it.
