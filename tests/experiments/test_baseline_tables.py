@@ -13,7 +13,7 @@ from jax import random
 
 from commands import retrim
 from helpers import random_command, random_state, tiny_preset
-from retrim import Setup, changed
+from retrim import ConfigError, Setup, changed
 from retrim.cli.reproduce import COMMANDS
 from retrim.config import named_presets
 from retrim.config.baselines import BASELINES
@@ -21,7 +21,8 @@ from retrim.experiments import Run, design, effort, provenance
 from retrim.experiments.reporter import Silent
 
 # The package has functions of these names.
-design_table, everything = (importlib.import_module(f"retrim.experiments.tables.{n}") for n in ("design", "everything"))
+NAMES = ("design", "everything", "phase")
+design_table, everything, phase_table = (importlib.import_module(f"retrim.experiments.tables.{n}") for n in NAMES)
 
 pytestmark = pytest.mark.usefixtures("as_a_user")
 
@@ -124,6 +125,20 @@ def test_all_tables_go_on_where_they_were_killed(tmp_path, monkeypatch):
     (tmp_path / "one" / "one.md").unlink()
     table(False)
     assert made[5:] == [("one", 9)]
+
+
+def test_readings_of_the_papers_formulation_differ_as_they_say(tmp_path, monkeypatch):
+    sections = []
+    monkeypatch.setattr(phase_table, "fly_levels", lambda document, found, **_: sections.extend(found))
+    phase_table.phase(Run("test", tmp_path), Silent(), references=("circle",))
+    printed, released, flown = (section.preset for section in sections)
+    assert {section.scenario.reference for section in sections} == {printed.track.reference} == {"circle"}
+    assert (printed.delay_ticks, printed.command_history, printed.track.start_spread) == (0, 0, 0.3)
+    assert (released.delay_ticks, released.command_history, released.track.start_spread) == (2, 3, 0.1)
+    assert flown == changed(released, adapt={"task_starts": 0, "start_noise": 0.05})
+    for wrong in ({"readings": ("printd",)}, {"references": ("line",)}):
+        with pytest.raises(ConfigError, match="there are"):
+            phase_table.phase(Run("test", tmp_path), Silent(), **wrong)
 
 
 def test_every_table_of_the_plan_has_the_options_that_are_planned():

@@ -75,11 +75,12 @@ def test_a_section_of_tracking_has_cross_track_and_the_papers_rows(tmp_path):
         (level, method, "circle") for level in LEVELS for method in ("base", "lora")
     ]
     assert [row[0] for row in section.rows] == [
-        "base policy", "... cross-track", "**adapted, LoRA**", "... cross-track", "DATT, the paper's"
+        "base policy", "... in step; cross-track", "**adapted, LoRA**", "... in step; cross-track", "DATT, the paper's"
     ]  # fmt: skip
     assert section.rows[0][1].endswith(" (1)")
     assert section.rows[-1] == ("DATT, the paper's", "(4)", "(5)", "(6)")
-    assert section.rows[1][1] == f"{found[0]['cross_track_m']:.3f}"
+    assert section.rows[1][1] == f"{found[0]['unshifted_m']:.3f}; {found[0]['cross_track_m']:.3f}"
+    assert found[0]["unshifted_m"] <= found[0]["mean"] + 1e-9
     assert section.picture == tmp_path / "x.png"
     assert figures.title == "circle: large, 2 m/s² per axis"
     assert [row[0] for row in figures.rows] == ["base policy", "**adapted, LoRA**"]

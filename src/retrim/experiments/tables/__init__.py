@@ -9,6 +9,7 @@ from .fast import fast as fast
 from .gauntlet import gauntlet as gauntlet
 from .hover import hover as hover
 from .model import model as model
+from .phase import phase as phase
 from .plants import plants as plants
 from .raptor import raptor as raptor
 from .reversing import reversing as reversing
@@ -18,19 +19,7 @@ from .tuning import tuning as tuning
 from .vision import vision as vision
 
 MADE = (
-    hover,
-    reversing,
-    tracking,
-    vision,
-    plants,
-    model,
-    fast,
-    ablation,
-    design,
-    efficiency,
-    transfer,
-    raptor,
-    buses,
-    tuning,
-)
+    hover, reversing, tracking, phase, vision, plants, model, fast, ablation, design, efficiency, transfer, raptor,
+    buses, tuning,
+)  # fmt: skip
 """Those of ``retrim reproduce``; the gauntlet is a command of its own."""

@@ -14,6 +14,7 @@ from .hover import hover
 from .kept import FOLDER
 from .levels import METHODS
 from .model import model
+from .phase import phase
 from .plants import plants
 from .raptor import raptor
 from .reversing import reversing
@@ -37,6 +38,7 @@ PLAN: tuple[tuple[Callable[..., None], str, Options, Options], ...] = (
         {"presets": ("track/retrim",), "seeds": (0, 1, 2), "methods": WITH_DATT, "seconds": 30.0},
         {**FEW, "presets": ("track/retrim",), "methods": WITH_DATT, "seconds": 12.0, "datt_steps": 1_000_000},
     ),
+    (phase, "Table II, the paper's formulation", {}, {}),
     (
         vision,
         "Table III",
@@ -57,7 +59,7 @@ PLAN: tuple[tuple[Callable[..., None], str, Options, Options], ...] = (
     (plants, "other plants", {}, {}),
 )
 """Table, what of the paper it is, its options, and those of a quick look."""
-QUICK_LEAVES_OUT = (plants,)
+QUICK_LEAVES_OUT = (phase, plants)
 
 
 def everything(run: Run, reporter: Reporter, *, quick: bool = False) -> None:
@@ -66,7 +68,8 @@ def everything(run: Run, reporter: Reporter, *, quick: bool = False) -> None:
     Args:
         run: Folder of everything.md and of a folder for each table.
         reporter: Receives progress and the sections.
-        quick: One seed, two starts and short flights, in a folder quick/; other plants are left out.
+        quick: One seed, two starts and short flights, in a folder quick/; other plants and the paper's
+            formulation of tracking are left out.
     """
     intro = "Made by `retrim reproduce all`" + (
         " `--quick`: one training seed, two starts, short flights; figures to look at, not to quote." if quick else "."

@@ -172,9 +172,15 @@ def level_table(
         theirs = [f" ({figure})" for figure in paper[method]] if method in paper else [""] * len(levels)
         figures = ("-" if row is None else cell(row) + they for row, they in zip(ours, theirs, strict=True))
         cells.append((find_method(method).label, *figures))
-        cross = ["-" if row is None or "cross_track_m" not in row else f"{row['cross_track_m']:.3f}" for row in ours]
-        if set(cross) != {"-"}:
-            cells.append(("... cross-track", *cross))
+        if any(row is not None and "cross_track_m" in row for row in ours):
+            cells.append(("... in step; cross-track", *map(_in_step, ours)))
     absent = [method for method in paper if method not in methods]
     cells += [(f"{find_method(m).label}, the paper's", *(f"({figure})" for figure in paper[m])) for m in absent]
     return TableSection(("error [m]", *levels.values()), tuple(cells), title)
+
+
+def _in_step(row: dict[str, Any] | None) -> str:
+    """Error but for the best constant shift in time, and distance from the nearest point of the reference [m]."""
+    if row is None or row.get("unshifted_m") is None or "cross_track_m" not in row:
+        return "-"
+    return f"{row['unshifted_m']:.3f}; {row['cross_track_m']:.3f}"

@@ -37,12 +37,12 @@ PAPER: dict[str, PaperRows] = {  # Table II [m]
 }
 INTRO = """\
 Made by `retrim reproduce tracking`. Mean distance from where the reference is at the time [m], over the last 10
-s: mean ± standard deviation over flights. Cross-track: distance from the nearest point of the lap. Small
-quadrotor. Presets `track/retrim` and `track/preview`: one policy, trained on all three references, sees them
-ahead; `track/retrim` is flown and adapted in the frame of the gravity that it feels. `track/paper`: the paper's
-observation o = [p, R, v] and reward, one policy per reference. Learning is charged to flight time by the
-preset's fixed latencies. In brackets the paper's figures, which are from its own plant; its circle and ours
-take 3 s."""
+s: mean ± standard deviation over flights. In step: but for the best constant shift in time. Cross-track:
+distance from the nearest point of the lap. Small quadrotor. Presets `track/retrim` and `track/preview`: one
+policy, trained on all three references, sees them ahead; `track/retrim` is flown and adapted in the frame of the
+gravity that it feels. `track/paper`: the paper's observation o = [p, R, v] and reward, one policy per reference.
+Learning is charged to flight time by the preset's fixed latencies. In brackets the paper's figures, which are
+from its own plant; its circle and ours take 3 s."""
 
 
 def tracking(
