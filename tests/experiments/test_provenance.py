@@ -1,5 +1,6 @@
 """What a results file says of the command that made it, and of its time."""
 
+import importlib.metadata
 import json
 import signal
 import sys
@@ -10,7 +11,7 @@ import pytest
 from retrim.errors import ConfigError
 from retrim.experiments import Run
 from retrim.experiments.interrupts import interrupts_only_set
-from retrim.experiments.provenance import command_line
+from retrim.experiments.provenance import command_line, versions
 from retrim.experiments.stopwatch import Stopwatch
 
 
@@ -26,6 +27,13 @@ from retrim.experiments.stopwatch import Stopwatch
 )
 def test_no_place_on_this_machine_is_recorded(words, kept, tmp_path):
     assert command_line(words.format(here=tmp_path).split()) == f"retrim {kept}"
+
+
+def test_versions_are_those_of_what_is_installed():
+    found = versions()
+    assert {"retrim", "jax", "jaxlib", "equinox", "optax", "numpy", "python"} <= found.keys()
+    for name in found.keys() - {"python"}:
+        assert importlib.metadata.version(name) == found[name]
 
 
 def test_programs_traced_inside_others_count_once():

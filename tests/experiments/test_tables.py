@@ -14,10 +14,12 @@ from helpers import tiny_preset
 from made_up import DT, flight, log
 from retrim import ConfigError, Scenario, Setup, changed, load
 from retrim.config import named_presets as presets
+from retrim.config.disturbances import DISTURBANCES
 from retrim.config.presets import Adapt
 from retrim.experiments import Run, provenance, rivals
 from retrim.experiments.reporter import Silent
 from retrim.experiments.tables.document import Document, TableSection
+from retrim.experiments.tables.kept import files_behind
 from retrim.experiments.tables.levels import Levels, fly_levels
 from retrim.experiments.tables.reversing import METHODS, _errors, _moments, _section
 from retrim.experiments.tables.study import train_all
@@ -106,11 +108,25 @@ def test_a_run_goes_on_where_it_was_killed(tmp_path, monkeypatch):
     again = table(sections)
     assert flown == ["1", "2"]
     assert whole == again
+    assert "An earlier run had made 2 of the sections" in (tmp_path / "table.md").read_text()
     table(sections, starts=2)
     assert flown == ["1", "2"] * 2
     monkeypatch.setattr(provenance, "commit", lambda: "abc-dirty")
     table(sections[:1])
     assert flown[4:] == ["1"]
+
+
+def test_a_section_follows_from_the_files_behind_its_names(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("my_wind.py").write_text("def breeze(key, size):\n    pass\n")
+    Path("lap.csv").write_text("t,x,y,z\n")
+    DISTURBANCES.find("my_wind:breeze")
+    names = "my_wind:breeze=3+none", "lap.csv:laps", "bem", None
+    before = files_behind(*names)
+    assert set(before) == {"my_wind:breeze=3", "lap.csv:laps"}
+    Path("lap.csv").write_text("t,x,y,z,yaw\n")
+    after = files_behind(*names)
+    assert [after[name] == before[name] for name in sorted(before)] == [False, True]
 
 
 def test_datt_is_trained_once_for_a_folder(tmp_path, monkeypatch):

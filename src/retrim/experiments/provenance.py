@@ -1,5 +1,6 @@
 """Where results come from: commit, versions, hardware and command line."""
 
+import contextlib
 import functools
 import hashlib
 import json
@@ -7,13 +8,15 @@ import os
 import platform
 import subprocess
 from collections.abc import Sequence
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import jax
 
 PACKAGES = ("retrim", "jax", "jaxlib", "equinox", "optax", "numpy")
+EXTRAS = ("rotorpy", "mujoco", "crazyflow", "foundation-policy")
+"""Packages that fly in some flights, where they are installed."""
 
 
 @functools.cache
@@ -40,8 +43,12 @@ def is_committed() -> bool:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of Python and of the packages that compute."""
-    return {name: version(name) for name in PACKAGES} | {"python": platform.python_version()}
+    """Return the versions of Python, of the packages that compute, and of those extras that are installed."""
+    found = {name: version(name) for name in PACKAGES}
+    for name in EXTRAS:
+        with contextlib.suppress(PackageNotFoundError):
+            found[name] = version(name)
+    return found | {"python": platform.python_version()}
 
 
 def section_key(**what: Any) -> str:

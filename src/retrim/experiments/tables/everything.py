@@ -23,7 +23,8 @@ from .transfer import transfer
 from .vision import vision
 
 Options = dict[str, Any]
-WITH_DATT = (*METHODS[:-2], "datt", *METHODS[-2:])
+OURS = METHODS.index("full")
+WITH_DATT = (*METHODS[:OURS], "datt", *METHODS[OURS:])
 FEW: Options = {"seeds": (0,), "starts": 2}
 PLAN: tuple[tuple[Callable[..., None], str, Options, Options], ...] = (
     (

@@ -1,7 +1,10 @@
 """Sections that a run has finished are kept in its folder: the same command goes on where it was killed."""
 
 import dataclasses
+import hashlib
 import json
+import sys
+from pathlib import Path
 from typing import Any
 
 from ..provenance import is_committed
@@ -34,3 +37,18 @@ def kept(run: Run, key: str) -> tuple[TableSection, list[dict[str, Any]]] | None
     except (OSError, ValueError, KeyError, TypeError):
         return None  # it is made again
     return None if picture is not None and not picture.is_file() else (section, rows)
+
+
+def files_behind(*names: str | None) -> dict[str, str]:
+    """Return digests of the files that stand behind names: of CSV files, and of the modules of ``module:name``.
+
+    Args:
+        *names: Of anything, sums of them too. Modules that they name have been imported.
+    """
+    found = dict[str, str]()
+    for part in (part for name in names if name for part in name.split("+")):
+        head = part.partition(":")[0].partition("=")[0]
+        path = Path(getattr(sys.modules.get(head) if ":" in part else None, "__file__", None) or head)
+        if path.is_file():
+            found[part] = hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+    return found

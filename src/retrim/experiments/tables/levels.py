@@ -20,7 +20,7 @@ from ..rivals import DATT_STEPS, RIVALS, check_rival, check_steps
 from ..run import Run
 from .beside import figures_table
 from .document import Document, TableSection
-from .kept import keep, kept
+from .kept import files_behind, keep, kept
 from .study import Study, fly_all, refuse_misfits, train_all
 
 LEVELS = {"none": "no disturbance", "small": "small, 0.5 m/s² per axis", "large": "large, 2 m/s² per axis"}
@@ -90,10 +90,11 @@ def fly_levels(
         name = section_key(
             preset=dump(section.preset), scenarios=[repr(each) for each in section.scenarios], title=section.title,
             methods=list(section.methods), seeds=list(document.seeds), starts=starts, seconds=seconds,
-            datt_steps=datt_steps if "datt" in section.methods else 0,
+            datt_steps=datt_steps if "datt" in section.methods else 0, files=_files_behind(section),
         )  # fmt: skip
         if (made := kept(run, name)) is not None:
             reporter.say(f"{section.title}: as an earlier run of this folder has made it")
+            document.earlier += 1
             document.add(*made)
             document.add(figures_table(made[1], section.title, section.levels))
             continue
@@ -115,6 +116,15 @@ def fly_levels(
         if made is not None:
             keep(run, name, *made)
     document.write()
+
+
+def _files_behind(section: Levels) -> dict[str, str]:
+    """What is not in retrim and not in the preset."""
+    preset, named = section.preset, list[str | None](section.methods)
+    for each in section.scenarios:
+        named += [each.plant, each.sensors, each.disturbance, each.reference]
+    trained_on = None if preset.track is None else preset.track.reference
+    return files_behind(*named, preset.task, preset.adapt.residual, trained_on)
 
 
 def _level_section(
