@@ -10,7 +10,7 @@ from helpers import tiny_preset
 from made_up import flight
 from retrim import Event, Scenario, Setup
 from retrim.experiments import FlightSpec
-from retrim.experiments.figures import picture, spans
+from retrim.experiments.figures import _colours, picture, spans
 
 pytestmark = pytest.mark.usefixtures("optax_promotion")
 
@@ -34,6 +34,18 @@ def test_a_picture_shows_the_flights_of_its_scenario_only(tmp_path):
     assert named[0].name == "hover_wind_3_payload_0.1.png"
     again = picture([adapted], setup, scenario, tmp_path, stem="mine")
     assert dataclasses.asdict(scenario)["disturbance"] in again[1].read_text()
+
+
+def test_a_picture_calls_methods_what_they_are(tmp_path):
+    """A controller that learns nothing is not called adapted."""
+    scenario, setup = Scenario("large"), Setup.of(tiny_preset())
+    shown = [flight(error, spec=FlightSpec(scenario, name, 0)) for name, error in (("base", 0.3), ("indi", 0.1))]
+    text = picture(shown, setup, scenario, tmp_path)[1].read_text()
+    assert "base policy: 30.0 cm over the last 2 s" in text
+    assert "INDI: 10.0 cm over the last 2 s" in text
+    assert "adapted" not in text
+    assert _colours(["base", "indi", "full", "lora"]) == {"base": 0, "indi": 2, "full": 1, "lora": 3}
+    assert _colours(["indi"]) == {"indi": 1}
 
 
 def test_spans_of_disturbances():

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Array
 
+from ..config.methods import find_method
 from ..config.scenario import Scenario
 from ..config.setup import Setup
 from ..physics.effects import ExternalEffects
@@ -24,7 +25,7 @@ from .recovery import FEW, timeline
 def picture(
     flights: Sequence[Flight], setup: Setup, scenario: Scenario, folder: Path, *, stem: str | None = None
 ) -> list[Path]:
-    """Draw the flights of one scenario, before and after adaptation.
+    """Draw the flights of one scenario, method beside method.
 
     Args:
         flights: What was flown; flights of other scenarios are left out.
@@ -39,10 +40,12 @@ def picture(
     shown = [f for f in flights if f.spec.scenario == scenario]
     if not shown:
         return []
-    before = [f for f in shown if f.spec.method == "base"]
-    after = [f for f in shown if f.spec.method != "base"]
-    base, adapted = ([_track(f) for f in group] for group in (before, after))
-    seconds = max(float(track.t[-1]) for track in (*base, *adapted))
+    methods = list(dict.fromkeys(f.spec.method for f in shown))
+    by = {method: [f for f in shown if f.spec.method == method] for method in methods}
+    names = {method: find_method(method).label.strip("*") for method in methods}
+    colours = _colours(methods)
+    groups = [plots.Group(names[method], [_track(f) for f in by[method]], colours[method]) for method in methods]
+    seconds = max(float(track.t[-1]) for group in groups for track in group.tracks)
     task, preset = setup.flown, setup.preset
     where = f"{shown[0].vehicle} on plant {scenario.plant!r}"
     kind = preset.task.rpartition(":")[2]
@@ -51,16 +54,17 @@ def picture(
     observation = setup.env.task.observation
     if isinstance(observation, Keypoints):
         home = jax.tree.map(lambda leaf: leaf[None], State.at(task.home()))
-        first, last = (
-            [_image_track(observation, f.log.true.as_state()) for f in group[:1]] for group in (before, after)
-        )
-        beside = partial(plots.camera, base=first, adapted=last, wanted=_image_track(observation, home).pixel[0])
+        seen = [
+            plots.Group(names[method], [_image_track(observation, by[method][0].log.true.as_state())], colours[method])
+            for method in methods
+        ]
+        beside = partial(plots.camera, groups=seen, wanted=_image_track(observation, home).pixel[0])
     elif isinstance(task, AbstractTrack) and isinstance(task.reference, Reference):
-        beside = partial(plots.laps, base=base, adapted=adapted, lap=np.asarray(task.reference.rows)[:, :3])
+        beside = partial(plots.laps, groups=groups, lap=np.asarray(task.reference.rows)[:, :3])
     else:
         x, y, z = (float(value) for value in task.home())
-        beside = partial(plots.paths, base=base, adapted=adapted, goal=(x, y, z))
-    figure = plots.flight_figure(title, base, adapted, spans(scenario.disturbance, task.home(), seconds), beside)
+        beside = partial(plots.paths, groups=groups, goal=(x, y, z))
+    figure = plots.flight_figure(title, groups, spans(scenario.disturbance, task.home(), seconds), beside)
     clean = "".join(sign if sign.isalnum() or sign in "-." else "_" for sign in scenario.disturbance)
     return plots.save(figure, folder, stem or f"{kind}_{clean}")
 
@@ -93,6 +97,13 @@ def _label(here: ExternalEffects) -> str:
     if np.any(here.gain != 1):
         words.append("rotors at " + ", ".join(f"{100 * g:.0f}" for g in here.gain) + " %")
     return "; ".join(words)
+
+
+def _colours(methods: Sequence[str]) -> dict[str, int]:
+    """The base policy and full adaptation keep theirs; others take what is left, adaptation's first."""
+    own = {"base": 0, "full": 1}
+    left = itertools.count(2 if "full" in methods else 1)
+    return {method: own[method] if method in own else next(left) for method in methods}
 
 
 def _track(flight: Flight) -> plots.Track:

@@ -1,8 +1,9 @@
 """Pictures of flights: the only place that imports matplotlib."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Generic, TypeVar
 
 import matplotlib
 
@@ -13,8 +14,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+T = TypeVar("T")
+
 # Okabe and Ito's colours, distinguishable with any colour vision.
 BASE, ADAPTED, UPDATE, PUSH, INK = "#D55E00", "#0072B2", "#009E73", "#E69F00", "#333333"
+GROUPS = (BASE, ADAPTED, "#CC79A7", "#56B4E9")
 ASPECT = 720 / 1280  # of a camera's image, whose axes both run from -1 to 1
 
 
@@ -33,6 +37,16 @@ class Track:
     crashed: bool = False
     last_s: float = 2.0
     """The flight is scored over this long at its end [s]."""
+
+
+@dataclass(frozen=True)
+class Group(Generic[T]):
+    """Flights of one method."""
+
+    name: str
+    tracks: Sequence[T]
+    colour: int = 0
+    """Which of :data:`GROUPS`."""
 
 
 @dataclass(frozen=True)
@@ -58,9 +72,9 @@ class Span:
 
 
 def flight_figure(
-    title: str, base: list[Track], adapted: list[Track], spans: list[Span], beside: Callable[[Axes], None]
+    title: str, groups: Sequence[Group[Track]], spans: Sequence[Span], beside: Callable[[Axes], None]
 ) -> Figure:
-    """Error over time, base against adapted, one thin line a flight, the mean thick; ``beside`` draws what is right."""
+    """Error over time, group against group, one thin line a flight, the mean thick; ``beside`` draws what is right."""
     with plt.rc_context(
         {"font.size": 11, "axes.spines.top": False, "axes.spines.right": False, "svg.fonttype": "none"}
     ):
@@ -68,7 +82,7 @@ def flight_figure(
             1, 2, figsize=(13, 5.4), width_ratios=(1.9, 1), layout="constrained", facecolor="white"
         )
         figure.suptitle(title, fontsize=14, fontweight="bold", color=INK)
-        _errors(left, base, adapted, spans)
+        _errors(left, groups, spans)
         beside(right)
         figure.legend(loc="outside lower center", ncols=4, frameon=False)
     return figure
@@ -84,8 +98,15 @@ def save(figure: Figure, folder: Path, name: str) -> list[Path]:
     return paths
 
 
-def _errors(axes: Axes, base: list[Track], adapted: list[Track], spans: list[Span]) -> None:
-    top = 1.15 * max((float(np.nanmax(track.error)) for track in (*base, *adapted)), default=1.0)
+def _coloured(groups: Sequence[Group[T]]) -> Iterator[tuple[Sequence[T], str, str]]:
+    """Tracks, colour and name of each group."""
+    for group in groups:
+        yield group.tracks, GROUPS[group.colour % len(GROUPS)], group.name
+
+
+def _errors(axes: Axes, groups: Sequence[Group[Track]], spans: Sequence[Span]) -> None:
+    every = [track for group in groups for track in group.tracks]
+    top = 1.15 * max((float(np.nanmax(track.error)) for track in every), default=1.0)
     for span in spans:
         axes.axvspan(span.start, span.end, color=PUSH, alpha=0.28 if span.strong else 0.13, linewidth=0)
         axes.text(
@@ -93,14 +114,14 @@ def _errors(axes: Axes, base: list[Track], adapted: list[Track], spans: list[Spa
             ha="center", va="top", color="#8a5a00", fontsize=9 if len(spans) > 1 else 11, zorder=5,
             bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 2},
         )  # fmt: skip
-    swaps = sorted({round(t, 2) for track in adapted for t in track.swaps})
+    swaps = sorted({round(t, 2) for track in every for t in track.swaps})
     few = len(swaps) <= 12  # many would hide the flights: they are marked along the axis of time
     for i, t in enumerate(swaps):
         axes.axvline(
             t, ymax=1.0 if few else 0.03, color=UPDATE, linestyle="--" if few else "-", linewidth=1.2,
             label=None if i else "new policy takes over",
         )  # fmt: skip
-    for tracks, color, name in ((base, BASE, "base policy"), (adapted, ADAPTED, "adapted in flight")):
+    for tracks, color, name in _coloured(groups):
         for i, track in enumerate(tracks):
             label = f"{name}: single flights" if len(tracks) > 1 and i == 0 else None
             axes.plot(track.t, track.error, color=color, alpha=0.35, linewidth=0.8, label=label)
@@ -117,9 +138,9 @@ def _errors(axes: Axes, base: list[Track], adapted: list[Track], spans: list[Spa
     axes.margins(x=0)
 
 
-def paths(axes: Axes, base: list[Track], adapted: list[Track], goal: tuple[float, float, float]) -> None:
+def paths(axes: Axes, groups: Sequence[Group[Track]], goal: tuple[float, float, float]) -> None:
     """The paths from above, to the goal."""
-    for tracks, color, name in ((base, BASE, "base"), (adapted, ADAPTED, "adapted")):
+    for tracks, color, name in _coloured(groups):
         for i, track in enumerate(tracks):
             axes.plot(track.p[:, 0], track.p[:, 1], color=color, alpha=0.35, linewidth=0.9)
             axes.plot(
@@ -127,7 +148,7 @@ def paths(axes: Axes, base: list[Track], adapted: list[Track], goal: tuple[float
                 ".",
                 color="#999999",
                 markersize=5,
-                label="starts" if i == 0 and color == BASE else None,
+                label="starts" if i == 0 and name == groups[0].name else None,
             )
         for i, track in enumerate(tracks):
             axes.plot(
@@ -139,10 +160,10 @@ def paths(axes: Axes, base: list[Track], adapted: list[Track], goal: tuple[float
     axes.set_aspect("equal", adjustable="datalim")
 
 
-def laps(axes: Axes, base: list[Track], adapted: list[Track], lap: np.ndarray) -> None:
+def laps(axes: Axes, groups: Sequence[Group[Track]], lap: np.ndarray) -> None:
     """The paths of the last ten seconds from above, over the lap (points x 3)."""
     axes.plot(lap[:, 0], lap[:, 1], color="#BBBBBB", linewidth=5, label="reference", zorder=1)
-    for tracks, color, name in ((base, BASE, "base"), (adapted, ADAPTED, "adapted")):
+    for tracks, color, name in _coloured(groups):
         for i, track in enumerate(track for track in tracks if not track.crashed):
             last = track.t >= track.t[-1] - 10.0
             axes.plot(
@@ -153,9 +174,9 @@ def laps(axes: Axes, base: list[Track], adapted: list[Track], lap: np.ndarray) -
     axes.set_aspect("equal", adjustable="datalim")
 
 
-def camera(axes: Axes, base: list[ImageTrack], adapted: list[ImageTrack], wanted: np.ndarray) -> None:
+def camera(axes: Axes, groups: Sequence[Group[ImageTrack]], wanted: np.ndarray) -> None:
     """What the camera saw in the first flight of each kind; ``wanted`` (7 x 2): where the points are at the goal."""
-    for sightings, color, name in ((base, BASE, "base"), (adapted, ADAPTED, "adapted")):
+    for sightings, color, name in _coloured(groups):
         for sighting in sightings[:1]:
             seen = np.where(sighting.visible[:, :, None], sighting.pixel, np.nan)
             for i in range(seen.shape[1]):
@@ -165,7 +186,9 @@ def camera(axes: Axes, base: list[ImageTrack], adapted: list[ImageTrack], wanted
                     label=None if i else f"{name}, at the end",
                 )  # fmt: skip
             first = seen[0][sighting.visible[0]]
-            axes.plot(first[:, 0], first[:, 1], ".", color="#999999", label="at the start" if color == BASE else None)
+            axes.plot(
+                first[:, 0], first[:, 1], ".", color="#999999", label="at the start" if name == groups[0].name else None
+            )
     axes.plot(wanted[:, 0], wanted[:, 1], "+", color=INK, markersize=14, markeredgewidth=1.6, label="at the target")
     axes.set(xlabel="image, across", ylabel="image, down", title="what the camera saw of the seven points")
     ticks = (-1.0, -0.5, 0.0, 0.5, 1.0)

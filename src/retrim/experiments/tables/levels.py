@@ -51,6 +51,8 @@ class Levels:
     paper: PaperRows = field(default_factory=dict)
     levels: Mapping[str, str] = field(default_factory=lambda: LEVELS)
     """Disturbances, and what they are called."""
+    drawn: Sequence[str] = ("base", "full")
+    """Methods in the picture, which is of the last level."""
 
     @property
     def scenarios(self) -> list[Scenario]:
@@ -161,7 +163,7 @@ def _level_section(
         f"{crashed} of {len(flown)} flights crashed."
     )
     setup = Setup.of(study.preset, section.scenario.reference)
-    first = [f for f in flown if f.spec.seed == flown[0].spec.seed and f.spec.method in ("base", "full")]
+    first = [f for f in flown if f.spec.seed == flown[0].spec.seed and f.spec.method in section.drawn]
     drawn = picture(first, setup, section.scenarios[-1], run.folder, stem=section.stem)
     table = level_table(found, methods, section.paper, title, section.levels)
     return replace(table, about=about, picture=drawn[0] if drawn else None), found

@@ -17,10 +17,10 @@ and the last 10 s of tracking [m]: mean ± standard deviation over flights. Poli
 mass and limits; RAPTOR knows nothing of it. Learning is charged to flight time by the preset's fixed latencies."""
 DISTURBED = {
     "none": "no disturbance",
-    "large": "large, 2 m/s² per axis",
-    "wind=6": "wind of 6 m/s",
-    "payload": "payload of 70 g",
     "weak-rotor": "weak rotor",
+    "payload": "payload of 70 g",
+    "wind=6": "wind of 6 m/s",
+    "large": "large, 2 m/s² per axis",
 }
 METHODS = ("raptor", "base", "base-i", "geometric-i", "indi", "full", "lora")
 
@@ -55,6 +55,9 @@ def raptor(
         for what, preset, reference in (("Hover", hover, None), ("Figure-8", track, "figure8")):
             own = changed(preset, vehicle=vehicle)
             title, stem = f"{what}, {vehicle}", f"raptor_{what.lower().replace('-', '')}_{vehicle}"
-            sections.append(Levels(title, own, Scenario(reference=reference), stem, methods, levels=DISTURBED))
+            drawn = ("raptor", "full")
+            sections.append(
+                Levels(title, own, Scenario(reference=reference), stem, methods, levels=DISTURBED, drawn=drawn)
+            )
     document = Document(run, "raptor", "RAPTOR, without re-training", INTRO, seeds, reporter)
     fly_levels(document, sections, starts=starts, seconds=seconds)
