@@ -207,16 +207,21 @@ def test_every_section_is_written_when_it_is_added(tmp_path):
 
 def test_errors_are_read_around_reversals_and_updates(tmp_path):
     """A reversal every 15 s; updates start every 5 s and fly a second later."""
-    moments = _moments(Adapt(), 60.0)
+    moments, updates = _moments(Adapt(), 60.0)
+    assert updates == [1, 2, 3]
     np.testing.assert_allclose(moments, [[15, 16, 21, 26, 30], [30, 31, 36, 41, 45], [45, 46, 51, 56, 60]])
     t = DT * np.arange(3001)
     ramp = dataclasses.replace(flight(t, flown=log(t=t)))
     # fifty ticks, that of the moment last
     np.testing.assert_allclose(_errors(ramp, moments), moments - 0.49, atol=1e-9)
     errors = {method: [] for method in METHODS} | {"full": [_errors(ramp, moments)] * 2}
-    section = _section(errors, moments, "", tmp_path / "x.png")
+    section = _section(errors, moments, updates, "", tmp_path / "x.png")
     assert len(section.rows) == 3 * len(METHODS)
     assert section.rows[0] == ("reversed at 15 s, base policy", *["-"] * 5)
     (adapted,) = [row for row in section.rows if row[0] == "reversed at 15 s, **adapted**"]
     assert adapted[1:3] == ("14.510 ± 0.000", "15.510 ± 0.000")
     assert len(section.columns) == len(adapted)
+    often, updates = _moments(Adapt(update_every=0.5, update_latency=0.1), 60.0)
+    assert updates == [1, 2, 4, 8, 16, 30]
+    np.testing.assert_allclose(often[0], [15, 15.1, 15.6, 16.1, 17.1, 19.1, 23.1, 30])
+    np.testing.assert_allclose(_errors(ramp, often, 0.5), often - 0.24, atol=1e-9)
