@@ -84,7 +84,7 @@ def flight_figure(
         figure.suptitle(title, fontsize=14, fontweight="bold", color=INK)
         _errors(left, groups, spans)
         beside(right)
-        figure.legend(loc="outside lower center", ncols=4, frameon=False)
+        figure.legend(loc="outside lower center", ncols=3, frameon=False, fontsize=10)
     return figure
 
 
