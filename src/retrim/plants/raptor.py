@@ -5,11 +5,14 @@ Albani and Loianno 2025). It runs on board, at 100 Hz, on what it observes of it
 is what it is given from outside. Differences from the reference are clipped as in the flight firmware that has it.
 """
 
+import functools
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jax import lax
+import numpy as np
+from jax import lax, random
 from jaxtyping import Array, Float, Int
 
 from ..physics import so3
@@ -28,12 +31,9 @@ ORDER = (0, 2, 1, 3)  # its rotors are front-right, back-right, back-left, front
 class RaptorNet(eqx.Module):
     """The network: a layer, a gated recurrent unit, a layer."""
 
-    first: tuple[Float[Array, "hidden 22"], Float[Array, " hidden"]]
-    inner: tuple[Float[Array, "gates hidden"], Float[Array, " gates"]]
-    """From the first layer to the gates: reset, update, candidate."""
-    recurrent: tuple[Float[Array, "gates hidden"], Float[Array, " gates"]]
-    """From the hidden state to the gates."""
-    last: tuple[Float[Array, "4 hidden"], Float[Array, "4"]]
+    first: eqx.nn.Linear
+    unit: eqx.nn.GRUCell
+    last: eqx.nn.Linear
     start: Float[Array, " hidden"]
     """Hidden state at the start of a flight."""
 
@@ -44,19 +44,17 @@ class RaptorNet(eqx.Module):
         Raises:
             PlantError: It is not installed.
         """
-        theirs = import_extra("foundation_policy", "raptor", package="foundation-policy", kind="method")
-        first, unit, last = theirs.Raptor().layers
-
-        def pair(weights: Any, biases: Any) -> tuple[Array, Array]:
-            return jnp.asarray(weights, dtype=float), jnp.asarray(biases, dtype=float).reshape(-1)
-
-        return cls(
-            pair(first.weights, first.biases),
-            pair(unit.weights_input, unit.biases_input),
-            pair(unit.weights_hidden, unit.biases_hidden),
-            pair(last.weights, last.biases),
-            jnp.asarray(unit.initial_hidden_state, dtype=float),
+        first, unit, last = _layers()
+        inputs, hidden = unit.weights_input.shape[1], unit.hidden_dim
+        # The library's unit has one bias for what both inputs of a gate add up to, and one for the candidate alone.
+        both = unit.biases_input + np.append(unit.biases_hidden[: 2 * hidden], np.zeros(hidden))
+        weights = unit.weights_input, unit.weights_hidden, both, unit.biases_hidden[2 * hidden :]
+        cell = eqx.tree_at(
+            lambda cell: (cell.weight_ih, cell.weight_hh, cell.bias, cell.bias_n),
+            eqx.nn.GRUCell(inputs, hidden, key=random.key(0)),
+            tuple(jnp.asarray(each, dtype=float) for each in weights),
         )
+        return cls(_linear(first), cell, _linear(last), jnp.asarray(unit.initial_hidden_state, dtype=float))
 
     def __call__(
         self, hidden: Float[Array, " hidden"], o: Float[Array, "22"]
@@ -68,16 +66,24 @@ class RaptorNet(eqx.Module):
             o: Differences of position [m] and velocity [m/s] from the reference around the attitude, row by row (12 and
                 3 numbers), body rates [rad/s], and the last commands.
         """
+        hidden = self.unit(jax.nn.relu(self.first(o)), hidden)
+        return self.last(hidden), hidden
 
-        def affine(layer: tuple[Array, Array], x: Array) -> Array:
-            return layer[0] @ x + layer[1]
 
-        inner = affine(self.inner, jnp.maximum(affine(self.first, o), 0.0))
-        recurrent = affine(self.recurrent, hidden)
-        (r_in, z_in, n_in), (r_rec, z_rec, n_rec) = jnp.split(inner, 3), jnp.split(recurrent, 3)
-        reset, update = 1.0 / (1.0 + jnp.exp(-(r_in + r_rec))), 1.0 / (1.0 + jnp.exp(-(z_in + z_rec)))
-        hidden = update * hidden + (1.0 - update) * jnp.tanh(n_in + reset * n_rec)
-        return affine(self.last, hidden), hidden
+@functools.cache
+def _layers() -> tuple[Any, ...]:
+    """The package's layers, NumPy arrays: a file is read, and its example checked, once and not for each flight."""
+    return tuple(
+        import_extra("foundation_policy", "raptor", package="foundation-policy", kind="method").Raptor().layers
+    )
+
+
+def _linear(layer: Any) -> eqx.nn.Linear:
+    n_out, n_in = layer.weights.shape
+    fresh = eqx.nn.Linear(n_in, n_out, key=random.key(0))
+    given = jnp.asarray(layer.weights, dtype=float), jnp.asarray(layer.biases, dtype=float).reshape(-1)
+    made: eqx.nn.Linear = eqx.tree_at(lambda linear: (linear.weight, linear.bias), fresh, given)
+    return made
 
 
 class RaptorState(eqx.Module):
@@ -86,7 +92,7 @@ class RaptorState(eqx.Module):
     body: BemState
     hidden: Float[Array, " hidden"]
     action: Float[Array, "4"]
-    """Last commands, -1 to 1."""
+    """Last commands, as the network gave them; motors take -1 to 1."""
     ms: Int[Array, ""]
     """Milliseconds flown."""
 
