@@ -13,7 +13,7 @@ from jax import random
 
 from commands import retrim
 from helpers import random_command, random_state, tiny_preset
-from retrim import ConfigError, Setup, changed
+from retrim import ConfigError, PlantError, Setup, changed
 from retrim.cli.reproduce import COMMANDS
 from retrim.config import named_presets
 from retrim.config.baselines import BASELINES
@@ -139,6 +139,15 @@ def test_readings_of_the_papers_formulation_differ_as_they_say(tmp_path, monkeyp
     for wrong in ({"readings": ("printd",)}, {"references": ("line",)}):
         with pytest.raises(ConfigError, match="there are"):
             phase_table.phase(Run("test", tmp_path), Silent(), **wrong)
+
+
+def test_a_table_whose_package_is_missing_is_said_to_be_left_out(tmp_path, monkeypatch):
+    def lacking(run, reporter):
+        raise PlantError("method 'raptor' needs the package")
+
+    monkeypatch.setattr(everything, "PLAN", ((lacking, "beside RAPTOR", {}, {}),))
+    everything.everything(Run("test", tmp_path), Silent())
+    assert "lacking, left out: method 'raptor' needs the package" in (tmp_path / "everything.md").read_text()
 
 
 def test_every_table_of_the_plan_has_the_options_that_are_planned():

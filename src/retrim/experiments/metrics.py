@@ -32,6 +32,7 @@ def record(flight: Flight) -> dict[str, Any]:
     """Return the figures of one flight; errors of a flight that was terminated are None."""
     spec, crashed = flight.spec, flight.log.terminated
     effort = flight.effort if find_method(spec.method).on_board is None else (np.nan, np.nan)  # no rates are commanded
+    behind, unshifted = flight.behind or (None, None)
     scenario = spec.scenario
     return {
         "disturbance": scenario.disturbance,
@@ -49,8 +50,8 @@ def record(flight: Flight) -> dict[str, Any]:
         "peak_after_5s": _finite(flight.peak),
         "settle_s": _finite(flight.settle_s),
         "cross_track_m": None if crashed else flight.cross_track,
-        "behind_s": None if flight.behind is None else flight.behind[0],
-        "unshifted_m": None if flight.behind is None else flight.behind[1],
+        "behind_s": behind,
+        "unshifted_m": unshifted,
         "rates_rms": _finite(effort[0]),
         "rates_change_rms": _finite(effort[1]),
         "crashed": crashed,

@@ -94,11 +94,16 @@ def everything(run: Run, reporter: Reporter, *, quick: bool = False) -> None:
             try:
                 make(part, reporter, **options)
             except PlantError as error:
-                reporter.say(f"{name}: left out, {error}")
+                rows.append({"table": name, "what": what, "left_out": str(error)})
                 continue
             row["s"] = part.watch.total_s
             if not run.interrupted:
                 run.write_text(str(done.relative_to(run.folder)), f"{part.watch.total_s:.1f}\n")
         rows.append(row)
-    lines = tuple((row["what"], f"[{row['table']}]({row['page']})", f"{row['s'] / 60:.1f}") for row in rows)
+    lines = tuple(
+        (row["what"], f"{row['table']}, left out: {row['left_out']}", "-")
+        if "left_out" in row
+        else (row["what"], f"[{row['table']}]({row['page']})", f"{row['s'] / 60:.1f}")
+        for row in rows
+    )
     document.add(TableSection(("of the paper", "table", "minutes"), lines), rows)
