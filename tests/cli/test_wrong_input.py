@@ -129,6 +129,7 @@ WRONG = [
     (("reproduce", "hover", "--datt-steps", "0"), "--datt-steps 0 must be between 1 and"),
     (("reproduce", "design", "--epochs", "15"), "--epochs 15 must be a positive multiple of 10"),
     (("reproduce", "vision", "--presets", "slow"), "no preset 'slow'"),
+    (("reproduce", "vision", "--methods", "indy"), "no method 'indy'; did you mean 'indi'?"),
     (("reproduce", "plants", "--plant", "nope"), "no plant 'nope'"),
     (("reproduce", "reversing", "--preset", "track/paper"), "preset 'track/paper' is for track, not for hover"),
     # files

@@ -53,13 +53,13 @@ def test_settings_are_searched_by_their_command(tmp_path):
     assert "no baseline with settings" in retrim("reproduce", "tuning", "--methods", "base", cwd=tmp_path, code=1)
 
 
-@pytest.mark.parametrize("rotors", [False, True])
-def test_gradients_through_the_residual_change_gradients_alone(rotors, key):
+@pytest.mark.parametrize(("rotors", "own"), [(False, True), (True, True), (True, False)])
+def test_gradients_through_the_residual_change_gradients_alone(rotors, own, key):
     setup = Setup.of(tiny_preset())
     x, u = random_state(key, 0.3), random_command(key)
 
     def end(x, backprop):
-        model = design.design_dynamics(setup, lambda x, u: -0.5 * x.v, rotors=rotors, backprop=backprop)
+        model = design.design_dynamics(setup, lambda x, u: -0.5 * x.v, design.Choice(rotors, own, backprop))
         return jnp.sum(model.state(model.step(model.init(x), u, jnp.zeros(3))).v)
 
     without, through = (jax.jit(jax.value_and_grad(lambda x, b=b: end(x, b)))(x) for b in (False, True))
@@ -86,7 +86,7 @@ def test_a_policy_is_retrained_from_where_it_was():
     setup = Setup.of(tiny_preset())
     policy = setup.new_policy(random.key(0))
     logs = design.flown(setup, policy, 2, 1.0, 0)
-    made = design.retrained(setup, policy, logs, random.key(1), rotors=False, backprop=False,
+    made = design.retrained(setup, policy, logs, random.key(1), design.CHOICES["low fidelity, res-fwd"],
                             fit_epochs=20, epochs=10, envs=4)  # fmt: skip
     assert made.residual_rms < 3.0
     assert any(np.any(a.weight != b.weight) for a, b in zip(made.policy.layers, policy.layers, strict=True))

@@ -9,14 +9,16 @@ import jax.numpy as jnp
 from jaxtyping import Array, Key
 
 from ..adapt.learner import LearnerState
-from ..control.controller import PolicyController
+from ..control.controller import AbstractController, PolicyController
 from ..control.datt import DattNet
 from ..control.integral import IntegralAction
 from ..control.passive import Passive
+from ..control.seen_pose import SeenPose
 from ..errors import ConfigError
 from ..plants.plant import Plant
 from ..runtime.pilot import ControllerPilot, Pilot
 from ..tasks.keypoints import Keypoints
+from ..tasks.occluded import OccludedKeypoints
 from .baselines import BASELINES, Baseline, datt_of
 from .learners import check_frame, felt_frame
 from .on_board import raptor
@@ -107,25 +109,32 @@ def _gravity_frame(request: MethodRequest) -> Pilot:
     return ControllerPilot(felt_frame(request.controller(), request.setup.preset))
 
 
-def _check_state(request: MethodRequest, name: str) -> None:
-    if isinstance(request.setup.env.task.observation, Keypoints):
-        raise ConfigError(f"method {name!r} needs the measured state; a policy that sees keypoints is shown none")
+def _shown_state(controller: AbstractController[Any], request: MethodRequest, name: str) -> AbstractController[Any]:
+    """Return the controller as it can be flown: where a policy would see keypoints, with the pose that they give."""
+    seen = request.setup.flown.observation_in_flight
+    if isinstance(seen, OccludedKeypoints):
+        return SeenPose(seen, controller)
+    if isinstance(seen, Keypoints):
+        raise ConfigError(
+            f"method {name!r} needs a state; where a policy sees keypoints, it is that of the pose filter, which "
+            "[vision] occlusion = true has"
+        )
+    return controller
 
 
 def _without_policy(baseline: Baseline, request: MethodRequest) -> Pilot:
-    _check_state(request, baseline.label)
-    return ControllerPilot(baseline.controller(request.setup, request.key))
+    return ControllerPilot(_shown_state(baseline.controller(request.setup, request.key), request, baseline.label))
 
 
 def _datt(request: MethodRequest) -> Pilot:
     if not isinstance(request.policy, DattNet):
         raise ConfigError("method 'datt' flies a network of its own: `retrim reproduce hover --methods datt` trains it")
-    _check_state(request, "datt")
-    return ControllerPilot(datt_of(request.setup, request.policy))
+    return ControllerPilot(_shown_state(datt_of(request.setup, request.policy), request, "datt"))
 
 
 def _raptor(request: MethodRequest) -> Pilot:
-    _check_state(request, "raptor")
+    if isinstance(request.setup.env.task.observation, Keypoints):
+        raise ConfigError("method 'raptor' needs the measured state; a policy that sees keypoints is shown none")
     return ControllerPilot(Passive())
 
 

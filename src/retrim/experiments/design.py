@@ -1,6 +1,7 @@
 """The paper's design study (Sec. IV-C): which model is simulated, and through what the gradient flows."""
 
 import functools
+import math
 import time
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -13,6 +14,7 @@ import optax
 from jax import random
 from jaxtyping import Array, Key
 
+from ..adapt.optimisers import FreshAdam
 from ..config.scenario import Scenario
 from ..config.setup import Setup
 from ..control.controller import PolicyController
@@ -37,13 +39,26 @@ FIT_EPOCHS, POLICY_EPOCHS, ENVS = 200, 100, 100
 CHUNK = 10  # epochs of one program
 SCORED_S = 10.0  # [s]
 
+
+class Choice(NamedTuple):
+    """A way to simulate and to differentiate."""
+
+    rotors: bool
+    """The model has rotors, thrust map, drag and the rate controller, at 1 kHz; otherwise it is a point mass."""
+    through: bool
+    """The gradient is that of the model itself; otherwise the point mass's."""
+    backprop: bool
+    """Gradients flow through the residual, too."""
+
+
 CHOICES = {
-    "low fidelity, res-fwd": (False, False),
-    "low fidelity, res-fwd + res-back": (False, True),
-    "high fidelity, res-fwd": (True, False),
-    "high fidelity, res-fwd + res-back": (True, True),
+    "low fidelity, res-fwd": Choice(False, True, False),
+    "low fidelity, res-fwd + res-back": Choice(False, True, True),
+    "high fidelity, its own gradient, res-fwd": Choice(True, True, False),
+    "high fidelity, its own gradient, res-fwd + res-back": Choice(True, True, True),
+    "high fidelity, the gradient of low fidelity, res-fwd": Choice(True, False, False),
+    "high fidelity, the gradient of low fidelity, res-fwd + res-back": Choice(True, False, True),
 }
-"""Whether the simulated model has rotors, and whether gradients flow through the residual."""
 
 
 class Trained(NamedTuple):
@@ -71,23 +86,22 @@ def flown(setup: Setup, policy: Policy, n: int, seconds: float, seed: int) -> li
     )
 
 
-def design_dynamics(setup: Setup, residual: Any, *, rotors: bool, backprop: bool) -> AbstractDynamics[Any]:
+def design_dynamics(setup: Setup, residual: Any, choice: Choice) -> AbstractDynamics[Any]:
     """Return the model of a choice: what is simulated, and what the gradient flows through.
 
     Args:
         setup: Vehicle and control period.
         residual: What was learnt for the simulated model.
-        rotors: Simulate rotors, thrust map, drag and the rate controller; their gradient is the point mass's.
-        backprop: Let gradients flow through the residual, too.
+        choice: How to simulate and to differentiate.
     """
     simple = PointMass(setup.preset.dt)
-    if not rotors:
-        return Hybrid(simple, residual, backprop=backprop)
-    forward = Hybrid(_rotors(setup), residual)
-    return StraightThrough(forward, Hybrid(simple, residual, backprop=True) if backprop else simple)
+    forward = Hybrid(_rotors(setup) if choice.rotors else simple, residual, backprop=choice.backprop)
+    if choice.through:
+        return forward
+    return StraightThrough(forward, Hybrid(simple, residual, backprop=True) if choice.backprop else simple)
 
 
-def retrained(setup: Setup, policy: Policy, logs: Sequence[Log], key: Key[Array, ""], *, rotors: bool, backprop: bool,
+def retrained(setup: Setup, policy: Policy, logs: Sequence[Log], key: Key[Array, ""], choice: Choice, *,
               fit_epochs: int = FIT_EPOCHS, epochs: int = POLICY_EPOCHS, envs: int = ENVS) -> Trained:  # fmt: skip
     """Fit one residual network to flights, and re-train the policy with it.
 
@@ -96,22 +110,22 @@ def retrained(setup: Setup, policy: Policy, logs: Sequence[Log], key: Key[Array,
         policy: Where training begins.
         logs: The flights.
         key: Consumed.
-        rotors: See :func:`design_dynamics`.
-        backprop: See :func:`design_dynamics`.
+        choice: How to simulate and to differentiate.
         fit_epochs: Of the residual network.
         epochs: Of the policy; a multiple of ten.
         envs: Roll-outs of an epoch.
     """
     k_fit, k_train = random.split(key)
-    nominal: AbstractDynamics[Any] = _rotors(setup) if rotors else PointMass(setup.preset.dt)
+    nominal: AbstractDynamics[Any] = _rotors(setup) if choice.rotors else PointMass(setup.preset.dt)
     windows = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *(log.window(len(log.t) - 1) for log in logs))
     rows = _rows(windows, nominal, setup.preset.plant_delay_ticks)
-    adam = _adam(setup.preset.adapt.fit_learning_rate)
+    adapt = setup.preset.adapt
+    adam = _adam(adapt.fit_learning_rate)
     residual = EnsembleResidual.of(setup.flown.home(), setup.vehicle.omega_max, key=k_fit, members=1)
     fitted, errors = _fitted(EnsembleState.of(residual, adam), rows, adam, fit_epochs)
-    dynamics = design_dynamics(setup, fitted.residual, rotors=rotors, backprop=backprop)
+    dynamics = design_dynamics(setup, fitted.residual, choice)
     env = Env(dynamics, setup.env.task, setup.env.delay_ticks)
-    optimiser = _adam(setup.preset.adapt.learning_rate)
+    optimiser = _of_policy(adapt.learning_rate, adapt.max_grad_norm or math.inf, epochs)
     state = PolicyState(policy, optimiser.init(policy.params))
     times = list[float]()
     for k in random.split(k_train, 1 + epochs // CHUNK):  # the first one compiles, and is not kept
@@ -131,6 +145,12 @@ def _rotors(setup: Setup) -> LinearDragQuadrotor:
 def _adam(learning_rate: float) -> optax.GradientTransformation:
     """The same object for the same rate, so that what it takes part in is compiled once."""
     return optax.adam(learning_rate)
+
+
+@functools.cache
+def _of_policy(learning_rate: float, max_grad_norm: float, epochs: int) -> optax.GradientTransformation:
+    """What the paper re-trains by in flight, with the preset's limit; the same object for the same numbers."""
+    return FreshAdam(jnp.array(learning_rate), jnp.array(max_grad_norm)).transformation(epochs)
 
 
 @eqx.filter_jit

@@ -1,11 +1,14 @@
 """Table III of the paper: hover from keypoints."""
 
+from collections.abc import Sequence
+
+from ...config.baselines import BASELINES
 from ...config.presets import Preset
 from ...config.scenario import Scenario
 from ..reporter import Reporter
 from ..run import Run
 from .document import Document
-from .levels import Levels, PaperRows, fly_levels
+from .levels import METHODS, Levels, PaperRows, fly_levels
 from .study import table_presets
 
 PAPER: PaperRows = {  # Table III [m]
@@ -23,7 +26,8 @@ INTRO = """\
 Made by `retrim reproduce vision`. Steady-state error [m], the mean over the last 2 s: mean ± standard deviation
 over flights. Small quadrotor; seven points on the ground, five frames, three past commands, no state. The
 residual is learnt from the state, as in the paper. Learning is charged to flight time by the preset's fixed
-latencies. In brackets the paper's figures, which are from its own plant."""
+latencies. Controllers without a policy fly by the estimate of the pose filter, which sees the points that
+the policy sees. In brackets the paper's figures, which are from its own plant."""
 
 
 def vision(
@@ -31,6 +35,7 @@ def vision(
     reporter: Reporter,
     *,
     presets: tuple[str, ...] = tuple(TITLES),
+    methods: tuple[str, ...] = METHODS,
     seeds: tuple[int, ...] = (0,),
     seconds: float = 30.0,
     starts: int = 8,
@@ -42,6 +47,8 @@ def vision(
         run: Folder of vision.md, vision.json and the pictures.
         reporter: Receives progress and the sections.
         presets: Presets to train and fly; vision/paper trains for several minutes.
+        methods: How they fly; each preset those that it can: baselines fly by the estimate of a pose filter, and
+            base-do in the frame of felt gravity.
         seeds: Training seeds.
         seconds: Length of a flight [s].
         starts: Flights per disturbance, method and seed.
@@ -49,13 +56,15 @@ def vision(
     """
     loaded = table_presets(presets, "vision", seeds=seeds, starts=starts, seconds=seconds)
     document = Document(run, "vision", "Hover from keypoints (Table III of the paper)", INTRO, seeds, reporter)
-    fly_levels(document, [_section(preset, Scenario(plant=plant)) for preset in loaded], starts=starts, seconds=seconds)
+    sections = [_section(preset, Scenario(plant=plant), methods) for preset in loaded]
+    fly_levels(document, sections, starts=starts, seconds=seconds)
 
 
-def _section(preset: Preset, scenario: Scenario) -> Levels:
-    # An update of the paper's size takes seconds; its preset adapts all weights only.
-    methods = ("base", "full") if preset.name == "vision/paper" else ("base", "full", "lora")
-    if preset.adapt.frame == "gravity":
-        methods = ("base", "base-do", *methods[1:])
+def _section(preset: Preset, scenario: Scenario, methods: Sequence[str]) -> Levels:
+    cannot = {"base-i", *(() if preset.adapt.frame == "gravity" else ("base-do",))}
+    if preset.vision is None or not preset.vision.occlusion:
+        cannot |= {*BASELINES}
+    flown = [method for method in methods if method not in cannot]
     stem = f"vision_{preset.name.rpartition('/')[2]}"
-    return Levels(TITLES.get(preset.name, preset.name), preset, scenario, stem, methods, PAPER)
+    drawn = ("base", "indi", "full")
+    return Levels(TITLES.get(preset.name, preset.name), preset, scenario, stem, flown, PAPER, drawn=drawn)
