@@ -6,32 +6,20 @@ import subprocess
 import sys
 import tempfile
 import time
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-import jax
-from jax import lax, random
-from jaxtyping import Array, Key
+from jax import random
 
-from ..adapt.gate import Verdict
-from ..adapt.learner import HELD_OUT, LearnerState, OnlineLearner
-from ..config.disturbances import disturbance
+from ..adapt.learner import HELD_OUT, OnlineLearner
 from ..config.loading import load
 from ..config.scenario import Scenario
 from ..config.setup import Setup
-from ..control.controller import PolicyController
 from ..experiments.fleet import Fleet
 from ..experiments.stopwatch import Stopwatch
-from ..learn.bptt import PolicyState
-from ..learn.window import Window
-from ..physics.bem import BemQuadrotor
-from ..physics.state import Command, State
-from ..physics.vehicle import small
-from ..plants.sim import SimPlant
-from ..runtime.batch import batch_flight
-from ..runtime.batched import stacked
+from ..physics.state import Command
 from ..runtime.flight import fly
 from .beside import policies
+from .fleet import eight, fleet
 from .flown import learner_in_flight
 from .machine import on_core, rates
 from .timing import Work, compiled, timed
@@ -78,25 +66,6 @@ def _tick() -> dict[str, Any]:
     return row
 
 
-def _eight() -> dict[str, Any]:
-    """Eight flights of 30 s on bem, plant and policy as one program; four on each of two threads."""
-    setup = Setup.of(load("hover/fast"))
-    controller = PolicyController(setup.flown.observation_in_flight, setup.new_policy(random.key(0)))
-    simulation = SimPlant(BemQuadrotor.of(small(), 0.02), disturbance("none")).simulation
-    starts = setup.flight_starts(8)
-    halves = [stacked(starts[i : i + 4]) for i in (0, 4)]
-
-    @jax.jit
-    def four(controller: PolicyController, x0s: State) -> State:
-        flown: State = jax.vmap(lambda x0: batch_flight(simulation, controller, x0, ticks=1500).true)(x0s)
-        return flown
-
-    program, compile_s = compiled(four, controller, halves[0])
-    with ThreadPoolExecutor(2) as pool:
-        fly_all = lambda: list(pool.map(lambda x0s: jax.block_until_ready(program(controller, x0s)), halves))  # noqa: E731
-        return timed(compile_s, fly_all, 3)
-
-
 def _bem_tick() -> dict[str, Any]:
     """One step of the blade-element plant."""
     plant, u = Scenario().make(), Command.hover()
@@ -113,32 +82,6 @@ def _bem_tick() -> dict[str, Any]:
     row = timed(compile_s, ticks, 5)
     per_tick = {"run_s": row["run_s"] / 500, "units": row["units"] / 500}
     return row | per_tick | {"remarks": f"500 ticks: {row['remarks']}"}
-
-
-def _fleet(how: str) -> dict[str, Any]:
-    """Eight updates of eight vehicles."""
-    learner, state, window = learner_in_flight()
-    fitted, _ = learner.fit_residual(state.residual, window)
-    keys = random.split(random.key(0), 8)
-
-    def one(state: LearnerState, window: Window, key: Key[Array, ""]) -> tuple[PolicyState, Verdict]:
-        return learner.update_policy(state.policy, state.residual, window, key)
-
-    state = LearnerState(state.policy, fitted)
-    if how == "threads":
-        jax.block_until_ready(one(state, window, keys[0]))
-        with ThreadPoolExecutor(2) as pool:
-            row = timed(0.0, lambda: list(pool.map(lambda k: jax.block_until_ready(one(state, window, k)), keys)), 3)
-        return row | {"compile_s": None, "remarks": row["remarks"] + "; compiled as one update"}
-
-    @jax.jit
-    def fleet(state: LearnerState, window: Window, keys: Key[Array, "8"]) -> tuple[PolicyState, Verdict]:
-        if how == "map":
-            return lax.map(lambda key: one(state, window, key), keys)  # type: ignore[no-any-return]
-        return jax.vmap(lambda key: one(state, window, key))(keys)
-
-    program, compile_s = compiled(fleet, state, window, keys)
-    return timed(compile_s, lambda: program(state, window, keys), 3)
 
 
 def _demo() -> dict[str, Any]:
@@ -203,11 +146,11 @@ WORKS: dict[str, Work] = {
     "programs-cold": Work("all programs of a flight, empty cache", "compile 60 s", _programs, cached=True),
     "programs-warm": Work("all programs of a flight, from the cache", "compile 5 s", _programs, cached=True),
     "bem-tick": Work("one tick of the plant bem", "0.002 s", _bem_tick, one_core=True),
-    "bem-eight": Work("8 flights of 30 s on bem, one program", "3 s", _eight, one_core=True),
+    "bem-eight": Work("8 flights of 30 s on bem, one program", "3 s", eight, one_core=True),
     "flight": Work("30 s of flight, not adapting", "-", _tick, one_core=True),
-    "fleet-map": Work("8 policy updates, lax.map", "-", lambda: _fleet("map")),
-    "fleet-vmap": Work("8 policy updates, vmap", "-", lambda: _fleet("vmap")),
-    "fleet-threads": Work("8 policy updates, 2 threads", "-", lambda: _fleet("threads")),
+    "fleet-map": Work("8 policy updates, lax.map", "-", lambda: fleet("map")),
+    "fleet-vmap": Work("8 policy updates, vmap", "-", lambda: fleet("vmap")),
+    "fleet-threads": Work("8 policy updates, 2 threads", "-", lambda: fleet("threads")),
     "demo": Work("retrim demo", "75 s in all, 2000 MB", _demo),
 }  # fmt: skip
 

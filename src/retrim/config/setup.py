@@ -4,12 +4,9 @@ import math
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, Literal
 
 import jax
-import jax.numpy as jnp
-import numpy as np
 import optax
 from jax import random
 from jaxtyping import Array, Float, Key
@@ -24,19 +21,17 @@ from ..learn.encoder import pretrain_encoder
 from ..learn.env import Env
 from ..learn.pretrain import pretrain
 from ..learn.residuals.model import FittedResidual, ResidualModel
-from ..physics.actuators import Lagged
-from ..physics.dynamics import AbstractDynamics, PointMass
 from ..physics.state import State
 from ..physics.vehicle import Vehicle
 from ..runtime.adaptive import AdaptivePilot, Scheduled
 from ..runtime.lockstep import LockstepLearner
 from ..runtime.pilot import Pilot
-from ..tasks.hover import TILT, Hover
 from ..tasks.keypoints import Keypoints
-from ..tasks.observation import StateObs
 from ..tasks.reference import Reference
 from ..tasks.task import AbstractTask
+from .fresh import flight_starts, low_rank
 from .learners import felt_frame, make_learner
+from .nominal import nominal_model, pretraining_optimiser
 from .presets import Preset
 from .presets import Track as TrackTable
 from .references import make_reference, make_training_reference
@@ -46,9 +41,6 @@ from .vehicles import make_vehicle
 
 Latency = Literal["fixed", "measured"]
 """What learning costs in flight time: the preset's fixed figures, or the time that the clock shows."""
-
-START_TAG = 2**30 + 1  # folded into a seed for the starts of flights: they share no key with training
-LOW_RANK_TAG = 2**30 + 4  # folded into a learner's key for the delta that it starts from
 
 
 @dataclass(frozen=True)
@@ -99,9 +91,7 @@ class Setup:
             if reference is not None:
                 followed = make_reference(reference) if isinstance(reference, str) else reference
                 flown = entry.make(TaskRequest(preset, vehicle, followed))
-            nominal: AbstractDynamics[Any] = PointMass(preset.dt)
-            if preset.actuator_tau is not None:
-                nominal = Lagged(nominal, jnp.array(preset.actuator_tau))
+            nominal = nominal_model(preset)
             env = Env(nominal, task, preset.delay_ticks)
             model = residual_model or make_residual(ResidualRequest(preset, vehicle))
             learner = make_learner(preset, model, Env(nominal, flown, preset.delay_ticks))
@@ -109,10 +99,7 @@ class Setup:
             raise (
                 error if isinstance(error, ConfigError) else ConfigError(f"preset {preset.name!r}: {error}")
             ) from error
-        p = preset.pretrain
-        cosine = optax.cosine_decay_schedule(p.learning_rate, p.num_updates)
-        clip = optax.clip_by_global_norm(p.max_grad_norm or math.inf)
-        return cls(preset, vehicle, env, flown, learner, optax.chain(clip, optax.adam(cosine, b2=p.adam_b2)))
+        return cls(preset, vehicle, env, flown, learner, pretraining_optimiser(preset.pretrain))
 
     def new_policy(self, key: Key[Array, ""]) -> Policy:
         """Return an untrained policy; the key is consumed."""
@@ -194,13 +181,10 @@ class Setup:
         Raises:
             ConfigError: The policy has other than three layers, or one too narrow for its rank.
         """
-        if isinstance(policy, LoraPolicy):
-            return policy
         try:
-            fresh: LoraPolicy = _low_rank(policy, random.fold_in(key, LOW_RANK_TAG))
+            return low_rank(policy, key)
         except ValueError as error:  # whose traced message goes on for several lines
             raise ConfigError(f"preset {self.preset.name!r}: {str(error).splitlines()[0]}") from error
-        return fresh
 
     def adaptive_pilot(
         self,
@@ -215,21 +199,15 @@ class Setup:
         a, dt, fixed = self.preset.adapt, self.preset.dt, latency == "fixed"
         fit = LockstepLearner(ResidualWorker(self.learner, state), a.fit_latency if fixed else None, dt)
         update = LockstepLearner(PolicyWorker(self.learner, state, k_learn), a.update_latency if fixed else None, dt)
-        return AdaptivePilot(
-            self.controller,
-            state,
-            (Scheduled(fit, a.fit_every), Scheduled(update, a.update_every)),
-            dt=dt,
-            window=a.window,
-        )
+        learners = Scheduled(fit, a.fit_every), Scheduled(update, a.update_every)
+        return AdaptivePilot(self.controller, state, learners, dt=dt, window=a.window)
 
     def flight_starts(self, n: int, seed: int = 0) -> list[State]:
         """Return ``n`` starts: +- 1 m per axis from the task's home, 18 degrees about each axis, 0.1 m/s.
 
         They follow from the seed and the home alone, so that all presets of a task fly from the same ones.
         """
-        batch = _starts(self.flown.home(), random.fold_in(random.key(seed), START_TAG), n)
-        return [jax.tree.map(lambda leaf, i=i: jnp.asarray(np.asarray(leaf)[i]), batch) for i in range(n)]
+        return flight_starts(self.flown.home(), n, seed)
 
     def limits_exceeded(self, vehicle: Vehicle | None = None) -> str | None:
         """Return what a vehicle cannot fly of the flown reference, in words; None if it can fly all of it.
@@ -239,15 +217,3 @@ class Setup:
         """
         followed = getattr(self.flown, "reference", None)
         return followed.infeasibility(vehicle or self.vehicle) if isinstance(followed, Reference) else None
-
-
-@jax.jit
-def _low_rank(policy: Policy, key: Key[Array, ""]) -> LoraPolicy:
-    return LoraPolicy.of(policy, key=key)
-
-
-@partial(jax.jit, static_argnames="n")
-def _starts(home: Float[Array, "3"], key: Key[Array, ""], n: int) -> State:
-    nearby = Hover(home, StateObs(home, jnp.ones_like(home), 0), jnp.array(1.0), jnp.array(TILT))
-    begun: State = jax.vmap(nearby.reset)(random.split(key, n)).x
-    return begun

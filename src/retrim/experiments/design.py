@@ -95,7 +95,8 @@ def design_dynamics(setup: Setup, residual: Any, choice: Choice) -> AbstractDyna
         choice: How to simulate and to differentiate.
     """
     simple = PointMass(setup.preset.dt)
-    forward = Hybrid(_rotors(setup) if choice.rotors else simple, residual, backprop=choice.backprop)
+    nominal: AbstractDynamics[Any] = _rotors(setup) if choice.rotors else simple
+    forward = Hybrid(nominal, residual, backprop=choice.backprop)
     if choice.through:
         return forward
     return StraightThrough(forward, Hybrid(simple, residual, backprop=True) if choice.backprop else simple)

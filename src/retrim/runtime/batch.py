@@ -39,7 +39,18 @@ class Ticks(eqx.Module):
 def take_off(simulation: Simulation, controller: AbstractController[Any], x0: State) -> InFlight:
     """Return a flight that begins at ``x0``."""
     sim = simulation.launch(x0)
-    return InFlight(sim, controller.init(simulation.measured(sim)), jnp.array(0))
+    return begun(controller, sim, simulation.measured(sim))
+
+
+def begun(controller: AbstractController[Any], sim: SimState, measured: State) -> InFlight:
+    """Return a flight of a simulation that has been launched.
+
+    Args:
+        controller: What decides.
+        sim: The simulation.
+        measured: What is measured of it.
+    """
+    return InFlight(sim, controller.init(measured), jnp.array(0))
 
 
 def fly_ticks(

@@ -13,7 +13,7 @@ from jaxtyping import Array
 from ..learn.window import Window
 from ..physics.state import Command, State
 from ..plants.sim import SimState, Simulation
-from .batch import InFlight, Ticks, fly_ticks
+from .batch import InFlight, Ticks, begun, fly_ticks
 from .events import Event
 from .flight import FlightStopped, Log, States
 
@@ -158,10 +158,9 @@ def _launch(simulations: Simulation, starts: State) -> tuple[SimState, State]:
 
 @eqx.filter_jit
 def _begin(controllers: Any, sims: SimState, measured: State) -> InFlight:
-    begun: InFlight = eqx.filter_vmap(
-        lambda controller, sim, x: InFlight(sim, controller.init(jax.tree.map(lambda leaf: leaf[0], x)), jnp.array(0))
-    )(controllers, sims, measured)
-    return begun
+    first = jax.tree.map(lambda leaf: leaf[:, 0], measured)
+    flights: InFlight = eqx.filter_vmap(begun)(controllers, sims, first)
+    return flights
 
 
 @eqx.filter_jit

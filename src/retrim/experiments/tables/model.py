@@ -1,7 +1,6 @@
 """The blade-element plant: curves and figures beside published ones."""
 
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,20 +10,20 @@ from jaxtyping import Array, Float
 
 from ...config.disturbances import disturbance
 from ...config.vehicles import VEHICLES
-from ...physics.bem import FRAME_FACTOR, IN_PLANE_GAIN, BemQuadrotor, BemState
+from ...physics.bem import BemQuadrotor, BemState
 from ...physics.effects import ExternalEffects
-from ...physics.propeller import Inflow, Propeller, five_inch, rotor, three_inch, vortex_ring
+from ...physics.propeller import five_inch, vortex_ring
 from ...physics.state import STANDARD_GRAVITY, Command, State
 from ...physics.substep import SUBSTEP
 from ...viz import plots
 from ...viz.panels import Curve, Panel, panel_figure
+from ..published import GOLDEN_HOVER, Settled, published, settled
 from ..reporter import Reporter
 from ..run import Run
 from .document import Document, TableSection
 
 DT = 0.02  # [s]
 PUBLISHED_MAP = 1.562522e-6  # [N s^2], thrust map of the 5.1 in rotors (Agilicious)
-GOLDEN_HOVER = ((1800.0, 5.13804), (1850.0, 5.42739), (1900.0, 5.72464), (1950.0, 6.02982))  # rad/s, N; see docs
 
 
 def model(run: Run, reporter: Reporter) -> None:
@@ -51,48 +50,6 @@ def model(run: Run, reporter: Reporter) -> None:
     title = "The blade-element plant beside published figures"
     document = Document(run, "model", title, "Made by `retrim reproduce model`.", [0], reporter)
     document.add(TableSection(("quantity", "here", "published", "deviation", "source"), lines, picture=drawn), table)
-
-
-def published() -> list[dict[str, Any]]:
-    """Our figures beside published ones."""
-    big, little = five_inch(), three_inch()
-    still = Settled(big, 1109.15, 0.0, 0.0)
-    low = Settled(little, 1548.8, 0.0, 0.0)
-    side = Settled(big, 1109.15, 3.0, 0.0)
-    up, down = Settled(big, 1109.15, 0.0, -0.5), Settled(big, 1109.15, 0.0, 0.0)
-    damping = FRAME_FACTOR * 4 * (down.thrust - up.thrust) / 0.5 / 0.752
-    return [
-        _row("thrust coefficient, 5.1 in, hover [1e-6 N s^2]", 1e6 * still.thrust / 1109.15**2, 1.5625, "thrust map"),
-        _row("induced velocity, 5.1 in, 1109 rad/s [m/s]", still.v_i, 7.79, "recomputed"),
-        _row("torque over thrust, 5.1 in, hover [m]", still.torque / still.thrust, 0.0117, "recomputed"),
-        _row("thrust coefficient, 3.07 in, hover [1e-7 N s^2]", 1e7 * low.thrust / 1548.8**2, 2.05, "authors' code"),
-        _row("torque over thrust, 3.07 in, hover [m]", low.torque / low.thrust, 0.00804, "authors' code"),
-        _row(
-            "edgewise rotor drag, kingfisher, 3 m/s [1/s]",
-            4 * IN_PLANE_GAIN * side.in_plane / 0.752 / 3.0,
-            0.24,
-            "recomputed",
-        ),
-        _row("axial damping, kingfisher, climbing [1/s]", damping, 0.37, "recomputed"),
-        *(
-            _row(f"thrust, {int(w)} rad/s [N]", Settled(big, w, 0.0, 0.0).thrust, T, "Agilicious")
-            for w, T in GOLDEN_HOVER
-        ),
-    ]
-
-
-class Settled:
-    """One rotor in steady air, its inflow found."""
-
-    def __init__(self, prop: Propeller, omega: float, v_hor: float, v_ver: float) -> None:
-        forces, inflow = _settled(prop, jnp.array(omega), jnp.array(v_hor), jnp.array(v_ver))
-        self.thrust, self.in_plane, self.torque = (float(f) for f in forces)
-        self.v_i = float(vortex_ring(inflow, jnp.array(v_ver)))
-
-
-@eqx.filter_jit
-def _settled(prop: Propeller, omega: Array, v_hor: Array, v_ver: Array) -> Any:
-    return rotor(prop, omega, v_hor, v_ver, Inflow.above(omega.dtype), steps=16)
 
 
 def thrust_panel() -> Panel:
@@ -150,7 +107,7 @@ def inflow_panel() -> Panel:
     descents = np.linspace(-6.0, 14.0, 81)
     ruled, plain = list[float](), list[float]()
     for v in descents:
-        _, inflow = _settled(five_inch(), jnp.array(1109.15), jnp.array(0.0), jnp.array(float(v)))
+        _, inflow = settled(five_inch(), jnp.array(1109.15), jnp.array(0.0), jnp.array(float(v)))
         ruled.append(float(vortex_ring(inflow, jnp.array(float(v)))))
         plain.append(float(inflow.v_i))
     spec = np.array([[-4, 5.3631], [-2, 6.5346], [-1, 7.1522], [0, 7.7904], [1, 8.7662], [2, 9.5403], [4, 10.9296]])
@@ -222,7 +179,3 @@ def _flown(bem: BemQuadrotor, u: Command, see: Callable[[BemState], Array], step
         return after, see(after)
 
     return lax.scan(step, bem.init(State.at(jnp.zeros(3))), None, length=steps)[1]
-
-
-def _row(what: str, ours: float, theirs: float, source: str) -> dict[str, Any]:
-    return {"what": what, "ours": ours, "published": theirs, "source": source}
