@@ -151,7 +151,7 @@ OURS = {
         "task": "vision",
         "delay_ticks": 1,
         "vision": {"occlusion": False, "pixel_noise": 0.0, "dropout": 0.0, "whiten_pixels": False}
-        | {"encoder_steps": 3000},
+        | {"encoder_steps": 10000, "encoder_motions": "wild"},
         "pretrain": {"num_updates": 500, "num_envs": 300, "learning_rate": 1e-3, "max_start_yaw": 0.1 * math.pi},
         "adapt": {"num_updates": 50, "num_envs": 30, "update_latency": 5.0},
     },
@@ -160,7 +160,7 @@ OURS = {
         "reward": "l2",
         "delay_ticks": 1,
         "vision": {"occlusion": False, "pixel_noise": 0.5, "dropout": 0.0, "whiten_pixels": True}
-        | {"encoder_steps": 3000},
+        | {"encoder_steps": 3000, "encoder_motions": "near"},
         "pretrain": {
             "num_updates": 300,
             "num_envs": 16,
@@ -186,7 +186,8 @@ OURS["track/fast"] = OURS["track/retrim"] | {
     "track": OURS["track/retrim"]["track"] | {"reference": "circle=8+figure8=8+circle=4+figure8=4+star=1.5"},
 }
 OURS["vision/occluded"] = OURS["vision/ideal"] | {
-    "vision": {"occlusion": True, "pixel_noise": 1.0, "dropout": 0.05, "whiten_pixels": True, "encoder_steps": 3000}
+    "vision": {"occlusion": True, "pixel_noise": 1.0, "dropout": 0.05, "whiten_pixels": True}
+    | {"encoder_steps": 3000, "encoder_motions": "near"}
 }
 OURS["vision/retrim"] = OURS["vision/occluded"] | {
     "reward": "view",

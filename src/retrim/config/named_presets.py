@@ -125,7 +125,7 @@ PRESETS: dict[str, Preset] = {
         name="vision/paper",
         task="vision",
         delay_ticks=1,
-        vision=Vision(encoder_steps=3000),
+        vision=Vision(encoder_steps=10000, encoder_motions="wild"),
         pretrain=Pretrain(num_updates=500, num_envs=300, learning_rate=1e-3, max_start_yaw=TILT),
         adapt=Adapt(num_updates=50, num_envs=30, update_latency=5.0),
     ),

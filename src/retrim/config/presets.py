@@ -122,6 +122,8 @@ class Vision:
     """Pixels are whitened over random short motions; else fed as they are."""
     encoder_steps: int = Field(default=0, ge=0, le=1_000_000, strict=True)
     """Optimiser steps of encoder pretraining, before the policy is trained."""
+    encoder_motions: Literal["near", "wild"] = "near"
+    """What the encoder sees: motions of a vehicle that hovers, or those of one that a random policy flies."""
 
 
 @dataclass(frozen=True, config=STRICT)

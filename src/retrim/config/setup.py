@@ -27,6 +27,7 @@ from ..runtime.adaptive import AdaptivePilot, Scheduled
 from ..runtime.lockstep import LockstepLearner
 from ..runtime.pilot import Pilot
 from ..tasks.keypoints import Keypoints
+from ..tasks.motions import MOTIONS
 from ..tasks.reference import Reference
 from ..tasks.task import AbstractTask
 from .fresh import flight_starts, low_rank
@@ -104,8 +105,7 @@ class Setup:
     def new_policy(self, key: Key[Array, ""]) -> Policy:
         """Return an untrained policy; the key is consumed."""
         size, hidden = self.env.task.observation.size, self.preset.pretrain.hidden_sizes
-        fresh: Policy = jax.jit(lambda key: Policy.of(size, self.vehicle, key=key, hidden=hidden))(key)
-        return fresh
+        return jax.jit(lambda key: Policy.of(size, self.vehicle, key=key, hidden=hidden))(key)  # type: ignore[no-any-return]
 
     def pretraining(self, seed: int = 0) -> Iterator[tuple[Policy, Float[Array, " updates"]]]:
         """Train a policy from scratch.
@@ -121,7 +121,8 @@ class Setup:
         fresh, p = self.new_policy(k_init), self.preset.pretrain
         vision, observation = self.preset.vision, self.env.task.observation
         if vision is not None and vision.encoder_steps and isinstance(observation, Keypoints):
-            fresh, _ = pretrain_encoder(fresh, observation, random.split(k_init)[1], steps=vision.encoder_steps)
+            steps, motions = vision.encoder_steps, MOTIONS[vision.encoder_motions]
+            fresh, _ = pretrain_encoder(fresh, observation, random.split(k_init)[1], motions=motions, steps=steps)
         chunks = pretrain(
             fresh,
             self.env,

@@ -12,13 +12,20 @@ from jax import lax, random
 from jaxtyping import Array, Float, Key
 
 from ..control.policy import Policy
-from ..tasks.keypoints import Keypoints, random_motion
+from ..tasks.keypoints import Keypoints
+from ..tasks.motions import NEAR, Motions
 from ..tasks.observation import POSITION_SCALE, VELOCITY_SCALE
 
 
 @eqx.filter_jit
 def pretrain_encoder(
-    policy: Policy, observation: Keypoints, key: Key[Array, ""], *, steps: int = 3000, batch: int = 512
+    policy: Policy,
+    observation: Keypoints,
+    key: Key[Array, ""],
+    *,
+    motions: Motions = NEAR,
+    steps: int = 3000,
+    batch: int = 512,
 ) -> tuple[Policy, Float[Array, " steps"]]:
     """Train the hidden layers of ``policy`` to predict [p, R, v]; the output layer stays.
 
@@ -29,6 +36,7 @@ def pretrain_encoder(
         policy: A policy with at least one hidden layer.
         observation: The observation of the policy.
         key: Consumed.
+        motions: Of the camera. What a policy meets beyond them it will not know.
         steps: Optimiser steps.
         batch: Random motions per step.
 
@@ -42,7 +50,7 @@ def pretrain_encoder(
     optimiser = optax.adam(optax.cosine_decay_schedule(1e-3, steps))
 
     def sample(key: Key[Array, ""]) -> tuple[Float[Array, " o"], Float[Array, "15"]]:
-        x, omega = random_motion(key, observation.goal)
+        x, omega = motions.draw(key, observation.goal)
         features = observation.features(observation.stacked(observation.history(x, omega)))
         _, visible = observation.pixels(x)
         still = jnp.zeros(observation.size - features.shape[0] - 7, dtype=x.p.dtype)

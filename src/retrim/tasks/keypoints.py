@@ -13,6 +13,7 @@ from ..estimation.camera import Camera, in_camera
 from ..physics import so3
 from ..physics.felt_frame import FeltFrame
 from ..physics.state import STANDARD_GRAVITY, Command, State
+from .motions import NEAR
 from .observation import AbstractObservation
 
 PATTERN = ((0.5, 0.5), (0.5, -0.5), (-0.5, -0.5), (-0.5, 0.5), (-0.5, 0.0), (0.0, 0.5), (0.5, 0.0))
@@ -162,18 +163,10 @@ def key_of(x: State) -> Key[Array, ""]:
 def _whitening(plain: Keypoints) -> tuple[Float[Array, "70"], Float[Array, "70 70"]]:
     """Return mean and whitening matrix of the frames of random short motions, always the same ones."""
     keys = random.split(random.key(0), 20000)
-    frames = jax.vmap(lambda k: plain.stacked(plain.history(*random_motion(k, plain.goal))))(keys)
+    frames = jax.vmap(lambda k: plain.stacked(plain.history(*NEAR.draw(k, plain.goal))))(keys)
     mean = jnp.mean(frames, axis=0)
     centred = frames - mean[None]
     # symmetric: unique, so that a policy means the same on every machine; the floor is one pixel's variance
     lam, V = jnp.linalg.eigh(centred.T @ centred / frames.shape[0])
     scale = (jnp.maximum(lam, 0.0) + 1e-5) ** -0.5
     return mean, (V * scale[None]) @ V.T
-
-
-def random_motion(key: Key[Array, ""], goal: Float[Array, "3"]) -> tuple[State, Float[Array, "3"]]:
-    """Draw a random state near the goal, and body rates, for encoder pretraining; the key is consumed."""
-    kp, kr, ky, kv, kw = random.split(key, 5)
-    p = goal + random.uniform(kp, (3,), goal.dtype, minval=-1.2, maxval=1.2)
-    R = so3.rotz(0.4 * random.normal(ky, (), goal.dtype)) @ so3.exp(0.2 * random.normal(kr, (3,), goal.dtype))
-    return State(p, R, 0.7 * random.normal(kv, (3,), goal.dtype)), random.normal(kw, (3,), goal.dtype)
