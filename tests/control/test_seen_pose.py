@@ -5,46 +5,49 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax import lax
+from jax import lax, random
 
-from helpers import GOAL, hover_task
-from retrim.control.geometric import Gains, Geometric
-from retrim.control.indi import Incremental
+from helpers import GOAL, random_state, replaced
+from retrim import ConfigError, Setup, load
+from retrim.config.baselines import BASELINES
+from retrim.config.methods import MethodRequest
 from retrim.control.seen_pose import SeenPose
-from retrim.estimation.prediction import Prediction
-from retrim.physics import Command, PointMass, State, small
+from retrim.physics import Command, PointMass, State, so3
 from retrim.physics.actuators import Lagged
-from retrim.tasks import Keypoints, OccludedKeypoints
+from retrim.physics.state import STANDARD_GRAVITY
 
 DT, TAU = 0.02, jnp.array(0.033)
-HEADING = 0.0
+HERE = State(jnp.array(GOAL), jnp.eye(3), jnp.zeros(3))
+ELSEWHERE = State(jnp.array([2.0, -1.0, 3.0]), so3.exp(jnp.array([0.3, -0.2, 0.5])), jnp.ones(3))
 
 
-def made(kind, *, noise=1.0, dropout=0.05):
-    """As tables fly them, with loops of the speed that the camera's delay-free frames allow."""
-    gains = Gains(jnp.array(12.0), jnp.array(6.0), jnp.array(12.0), jnp.array(12.0 if kind == "geometric-i" else 0.0))
-    task, ahead = hover_task(heading=HEADING), Prediction(TAU, DT, 1)
-    inner = {
-        "geometric-i": lambda: Geometric(task, gains, ahead, jnp.array(6.0)),
-        "indi": lambda: Incremental(task, gains, ahead, jnp.array(0.08)),
-    }[kind]()
-    full = Keypoints.of(jnp.array(GOAL), small().omega_max, whitened=False, noise=noise)
-    return SeenPose(OccludedKeypoints(full, jnp.array(dropout), lag=TAU, delay_ticks=1), inner)
+@pytest.fixture(scope="module")
+def setup():
+    with jax.numpy_dtype_promotion("standard"):
+        return Setup.of(load("vision/retrim"))
 
 
-@pytest.mark.parametrize("kind", ["geometric-i", "indi"])
-def test_it_hovers_and_rejects_a_step_by_what_the_camera_sees(kind):
-    controller, model = made(kind), Lagged(PointMass(DT), TAU)
+def made(setup, name, **changed):
+    """The baseline as tables fly it from keypoints."""
+    controller = MethodRequest(setup, None).by_state(BASELINES[name].controller(setup))
+    assert isinstance(controller, SeenPose)
+    return replaced(controller, observation=replaced(controller.observation, **changed))
+
+
+@pytest.mark.parametrize("name", ["geometric-i", "indi"])
+def test_it_hovers_and_rejects_a_step_by_what_the_camera_sees(setup, name):
+    controller, model = made(setup, name), Lagged(PointMass(DT), TAU)
     x0 = State(jnp.array([0.3, -0.2, 1.2]), jnp.eye(3), jnp.zeros(3))
 
     def tick(carry, k):
-        s, memory, waiting = carry
-        t = DT * k.astype(float)
-        u, memory = controller(memory, t, model.state(s))
-        push = jnp.where(t >= 6.0, jnp.array([1.0, -0.5, 0.5]), 0.0)
-        return (model.step(s, waiting, push), memory, u), model.state(s)
+        s, last, memory, waiting = carry
+        x = model.state(s)
+        now = controller.sensing(waiting.omega, (x.v - last.v) / DT)
+        u, memory = now(memory, DT * k.astype(float), x)
+        push = jnp.where(k >= 300, jnp.array([1.0, -0.5, 0.5]), 0.0)
+        return (model.step(s, waiting, push), x, memory, u), x
 
-    start = (model.init(x0), controller.init(x0), Command.hover(x0.p.dtype))
+    start = (model.init(x0), x0, controller.init(x0), Command.hover(x0.p.dtype))
     path = jax.jit(lambda: lax.scan(tick, start, jnp.arange(600))[1])()
     off = np.linalg.norm(np.asarray(path.p) - np.array(GOAL), axis=1)
     assert off[200:300].mean() < 0.02  # calm
@@ -52,16 +55,41 @@ def test_it_hovers_and_rejects_a_step_by_what_the_camera_sees(kind):
     assert off[-100:].mean() < 0.02  # and rejected
 
 
-def test_it_sees_nothing_but_points():
+def test_it_sees_nothing_but_points(setup):
     """With no point seen, its commands follow from the filter and the clock, wherever the vehicle is."""
-    call = eqx.filter_jit(made("indi", dropout=1.0))
-    here = State(jnp.array(GOAL), jnp.eye(3), jnp.zeros(3))
-    memory = made("indi", dropout=1.0).init(here)
-    there = State(jnp.array([2.0, -1.0, 3.0]), jnp.eye(3), jnp.ones(3))
-    (u, after), (other, _) = (call(memory, jnp.array(0.0), x) for x in (here, there))
-    np.testing.assert_array_equal(u.vector(), other.vector())
-    accepted = made("indi").accepted(after, Command.hover())
-    np.testing.assert_array_equal(accepted.last.vector(), Command.hover().vector())
-    seeing = eqx.filter_jit(made("indi", dropout=0.0))
-    u, other = (seeing(memory, jnp.array(0.0), x)[0] for x in (here, there))
-    assert np.any(np.asarray(u.vector()) != np.asarray(other.vector()))
+    blind, seeing = (made(setup, "geometric-i", dropout=jnp.array(missed)) for missed in (1.0, 0.0))
+    memory = blind.init(HERE)
+    call = eqx.filter_jit(lambda controller, x: controller(memory, jnp.array(0.0), x)[0].vector())
+    np.testing.assert_array_equal(call(blind, HERE), call(blind, ELSEWHERE))
+    assert np.any(np.asarray(call(seeing, HERE)) != np.asarray(call(seeing, ELSEWHERE)))
+
+
+def test_an_inertial_unit_does_not_tell_the_attitude(setup, key):
+    """The same reading in the body frame gives the same command, however the vehicle that it is on is turned."""
+    blind = made(setup, "indi", dropout=jnp.array(1.0))
+    memory, felt = blind.init(HERE), random.normal(key, (3,)) + jnp.array([0.0, 0.0, STANDARD_GRAVITY])
+    gravity = jnp.array([0.0, 0.0, -STANDARD_GRAVITY])
+    call = eqx.filter_jit(lambda omega, a, x: blind.sensing(omega, a)(memory, jnp.array(0.0), x)[0].vector())
+    omega = jnp.array([0.3, -0.1, 0.2])
+    turned = [random_state(k, 0.5) for k in random.split(key, 2)]
+    one, other = (call(omega, so3.act(x.R, felt) + gravity, x) for x in turned)
+    np.testing.assert_allclose(one, other, rtol=1e-9)
+    assert np.any(np.abs(np.asarray(call(2.0 * omega, gravity, HERE)) - np.asarray(one)) > 1e-3)
+
+
+def test_accepted_commands_and_ages_reach_the_controller_inside(setup):
+    controller = made(setup, "geometric-i")
+    _, memory = eqx.filter_jit(controller)(controller.init(HERE), jnp.array(0.0), HERE)
+    u = Command(jnp.array(7.0), jnp.array([1.0, -2.0, 0.5]))
+    accepted = controller.accepted(memory, u)
+    assert eqx.tree_equal(accepted.last, u)
+    assert eqx.tree_equal(accepted.inner, controller.inner.accepted(memory.inner, u))
+    assert not eqx.tree_equal(accepted.inner, memory.inner)
+    assert float(controller.aged(0.015).inner.prediction.age) == pytest.approx(0.015)
+
+
+def test_without_a_filter_there_is_no_state():
+    with jax.numpy_dtype_promotion("standard"):
+        setup = Setup.of(load("vision/ideal"))
+    with pytest.raises(ConfigError, match="'vision/ideal': Geometric needs a state"):
+        MethodRequest(setup, None).by_state(BASELINES["geometric"].controller(setup))

@@ -21,8 +21,10 @@ from retrim.experiments import Run, design, effort, provenance
 from retrim.experiments.reporter import Silent
 
 # The package has functions of these names.
-NAMES = ("design", "everything", "phase")
-design_table, everything, phase_table = (importlib.import_module(f"retrim.experiments.tables.{n}") for n in NAMES)
+NAMES = ("design", "everything", "phase", "vision")
+design_table, everything, phase_table, vision_table = (
+    importlib.import_module(f"retrim.experiments.tables.{n}") for n in NAMES
+)
 
 pytestmark = pytest.mark.usefixtures("as_a_user")
 
@@ -67,16 +69,28 @@ def test_gradients_through_the_residual_change_gradients_alone(rotors, own, key)
     np.testing.assert_allclose(through[1].v - without[1].v, -0.5 * 0.02, rtol=0.05)
 
 
+def test_the_gradient_is_that_of_the_model_or_of_the_point_mass(key):
+    setup, x, u = Setup.of(tiny_preset()), random_state(key, 0.3), random_command(key)
+
+    def jacobian(choice):
+        model = design.design_dynamics(setup, lambda x, u: jnp.zeros(3), choice)
+        return jax.jit(jax.jacobian(lambda v: model.state(model.step(model.init(x), v, jnp.zeros(3))).v))(u)
+
+    simple, own, borrowed = (jacobian(design.Choice(*c, False)) for c in ((False, True), (True, True), (True, False)))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-9), borrowed, simple)
+    assert float(jnp.abs(own.c - simple.c).max()) > 0.1 * float(jnp.abs(simple.c).max())  # motors take their time
+
+
 def test_the_design_study_by_its_command(tmp_path, monkeypatch):
     monkeypatch.setitem(named_presets.PRESETS, "hover/fast", tiny_preset())
     monkeypatch.setattr(design, "CHUNK", 10)
     for name, small in (("ROLLOUTS", 2), ("ROLLOUT_S", 1.0), ("SCORED_S", 3.0)):
         monkeypatch.setattr(design_table, name, small)
-    monkeypatch.setattr(design_table, "CHOICES", dict(list(design.CHOICES.items())[:2]))
+    monkeypatch.setattr(design_table, "CHOICES", dict(list(design.CHOICES.items())[1:3]))
     out = retrim("reproduce", "design", "--seeds", "0", "--starts", "1", "--epochs", "10", "--out", "d", cwd=tmp_path)
     assert "low fidelity, res-fwd + res-back" in out
     rows = json.loads((tmp_path / "d" / "design.json").read_text())["rows"]
-    assert [row["model"] for row in rows] == list(design.CHOICES)[:2]
+    assert [row["model"] for row in rows] == list(design.CHOICES)[1:3]
     assert all(time > 0 for row in rows for time in row["epoch_s"])
     said = retrim("reproduce", "design", "--epochs", "15", cwd=tmp_path, code=1)
     assert "--epochs 15 must be a positive multiple of 10" in said
@@ -169,3 +183,16 @@ def test_what_each_method_costs_by_its_command(tmp_path, monkeypatch):
     assert rows["hover/fast"]["steps"] == 10 * small.pretrain.num_envs * 20
     assert all(row["decision_s"] > 0 for name, row in rows.items() if "LoRA" not in name)
     assert "DATT, the paper's" in out
+
+
+def test_vision_flies_what_a_preset_can(tmp_path):
+    """Baselines where a pose filter gives a state, an observer where there is a frame."""
+    flyable = {name: set(vision_table._flyable(named_presets.PRESETS[name])) for name in vision_table.TITLES}
+    assert set(BASELINES) | {"base-do", "lora"} <= flyable["vision/retrim"]
+    assert set(BASELINES) <= flyable["vision/occluded"]
+    assert "base-do" not in flyable["vision/occluded"]
+    assert flyable["vision/paper"] == flyable["vision/ideal"] == {"base", "full", "lora"}
+    said = retrim("reproduce", "vision", "--methods", "base", "datt", cwd=tmp_path, code=1)
+    assert "--methods datt: it is trained by a measured state" in said
+    said = retrim("reproduce", "vision", "--presets", "vision/paper", "--methods", "indi", cwd=tmp_path, code=1)
+    assert "'vision/paper': Incremental needs a state" in said

@@ -1,5 +1,6 @@
 """Works on several vehicles at once: flights of a plant, and policy updates of a fleet."""
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -8,7 +9,7 @@ from jax import lax, random
 from jaxtyping import Array, Key
 
 from ..adapt.gate import Verdict
-from ..adapt.learner import LearnerState
+from ..adapt.learner import OnlineLearner
 from ..config.disturbances import disturbance
 from ..config.loading import load
 from ..config.setup import Setup
@@ -24,8 +25,11 @@ from ..runtime.batched import stacked
 from .flown import learner_in_flight
 from .timing import compiled, timed
 
+FLEET = 8  # vehicles
+Update = Callable[[Key[Array, ""]], tuple[PolicyState, Verdict]]
 
-def eight() -> dict[str, Any]:
+
+def eight_flights() -> dict[str, Any]:
     """Eight flights of 30 s on bem, plant and policy as one program; four on each of two threads."""
     setup = Setup.of(load("hover/fast"))
     controller = PolicyController(setup.flown.observation_in_flight, setup.new_policy(random.key(0)))
@@ -44,27 +48,46 @@ def eight() -> dict[str, Any]:
         return timed(compile_s, fly_all, 3)
 
 
-def fleet(how: str) -> dict[str, Any]:
-    """Eight updates of eight vehicles."""
-    learner, state, window = learner_in_flight()
-    fitted, _ = learner.fit_residual(state.residual, window)
-    keys = random.split(random.key(0), 8)
+def one_after_another() -> dict[str, Any]:
+    """Time eight updates as one program that makes them in turn; the row of the table."""
+    return _as_one(lambda one, keys: lax.map(one, keys))
 
-    def one(state: LearnerState, window: Window, key: Key[Array, ""]) -> tuple[PolicyState, Verdict]:
-        return learner.update_policy(state.policy, state.residual, window, key)
 
-    state = LearnerState(state.policy, fitted)
-    if how == "threads":
-        jax.block_until_ready(one(state, window, keys[0]))
-        with ThreadPoolExecutor(2) as pool:
-            row = timed(0.0, lambda: list(pool.map(lambda k: jax.block_until_ready(one(state, window, k)), keys)), 3)
-        return row | {"compile_s": None, "remarks": row["remarks"] + "; compiled as one update"}
+def side_by_side() -> dict[str, Any]:
+    """Time eight updates as one program that makes them all at once; the row of the table."""
+    return _as_one(lambda one, keys: jax.vmap(one)(keys))
+
+
+def on_threads() -> dict[str, Any]:
+    """Time eight updates of one program on two threads; the row of the table."""
+    learner, policy, fitted, window = _learnt()
+    keys = random.split(random.key(0), FLEET)
+
+    def update(key: Key[Array, ""]) -> tuple[PolicyState, Verdict]:
+        made: tuple[PolicyState, Verdict] = jax.block_until_ready(learner.update_policy(policy, fitted, window, key))
+        return made
+
+    update(keys[0])
+    with ThreadPoolExecutor(2) as pool:
+        row = timed(0.0, lambda: list(pool.map(update, keys)), 3)
+    return row | {"compile_s": None, "remarks": row["remarks"] + "; compiled as one update"}
+
+
+def _as_one(together: Callable[[Update, Key[Array, " n"]], Any]) -> dict[str, Any]:
+    learner, *learnt = _learnt()
 
     @jax.jit
-    def together(state: LearnerState, window: Window, keys: Key[Array, "8"]) -> tuple[PolicyState, Verdict]:
-        if how == "map":
-            return lax.map(lambda key: one(state, window, key), keys)  # type: ignore[no-any-return]
-        return jax.vmap(lambda key: one(state, window, key))(keys)
+    def fleet(learnt: list[Any], keys: Key[Array, " n"]) -> Any:
+        policy, fitted, window = learnt
+        return together(lambda key: learner.update_policy(policy, fitted, window, key), keys)
 
-    program, compile_s = compiled(together, state, window, keys)
-    return timed(compile_s, lambda: program(state, window, keys), 3)
+    arguments = learnt, random.split(random.key(0), FLEET)
+    program, compile_s = compiled(fleet, *arguments)
+    return timed(compile_s, lambda: program(*arguments), 3)
+
+
+def _learnt() -> tuple[OnlineLearner, PolicyState, Any, Window]:
+    """What an update is given: the learner, a policy, a fitted residual and the window that it was fitted to."""
+    learner, state, window = learner_in_flight()
+    fitted, _ = learner.fit_residual(state.residual, window)
+    return learner, state.policy, fitted, window

@@ -19,7 +19,7 @@ from ..experiments.stopwatch import Stopwatch
 from ..physics.state import Command
 from ..runtime.flight import fly
 from .beside import policies
-from .fleet import eight, fleet
+from .fleet import eight_flights, on_threads, one_after_another, side_by_side
 from .flown import learner_in_flight
 from .machine import on_core, rates
 from .timing import Work, compiled, timed
@@ -146,11 +146,11 @@ WORKS: dict[str, Work] = {
     "programs-cold": Work("all programs of a flight, empty cache", "compile 60 s", _programs, cached=True),
     "programs-warm": Work("all programs of a flight, from the cache", "compile 5 s", _programs, cached=True),
     "bem-tick": Work("one tick of the plant bem", "0.002 s", _bem_tick, one_core=True),
-    "bem-eight": Work("8 flights of 30 s on bem, one program", "3 s", eight, one_core=True),
+    "bem-eight": Work("8 flights of 30 s on bem, one program", "3 s", eight_flights, one_core=True),
     "flight": Work("30 s of flight, not adapting", "-", _tick, one_core=True),
-    "fleet-map": Work("8 policy updates, lax.map", "-", lambda: fleet("map")),
-    "fleet-vmap": Work("8 policy updates, vmap", "-", lambda: fleet("vmap")),
-    "fleet-threads": Work("8 policy updates, 2 threads", "-", lambda: fleet("threads")),
+    "fleet-map": Work("8 policy updates, lax.map", "-", one_after_another),
+    "fleet-vmap": Work("8 policy updates, vmap", "-", side_by_side),
+    "fleet-threads": Work("8 policy updates, 2 threads", "-", on_threads),
     "demo": Work("retrim demo", "75 s in all, 2000 MB", _demo),
 }  # fmt: skip
 

@@ -54,5 +54,5 @@ def _low_rank(policy: Policy, key: Key[Array, ""]) -> LoraPolicy:
 @partial(jax.jit, static_argnames="n")
 def _starts(home: Float[Array, "3"], key: Key[Array, ""], n: int) -> State:
     nearby = Hover(home, StateObs(home, jnp.ones_like(home), 0), jnp.array(1.0), jnp.array(TILT))
-    begun: State = jax.vmap(nearby.reset)(random.split(key, n)).x
-    return begun
+    drawn: State = jax.vmap(nearby.reset)(random.split(key, n)).x
+    return drawn

@@ -1,10 +1,11 @@
-"""The learner of a preset, and the frame that its policy is flown in."""
+"""What a policy of a preset is trained in and by, the learner beside its flight, and the frame that it is flown in."""
 
 import math
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import optax
 
 from ..adapt.learner import OnlineLearner
 from ..adapt.optimisers import CarriedAdam, FreshAdam
@@ -17,17 +18,30 @@ from ..errors import ConfigError, FrameError
 from ..estimation.disturbance_observer import DisturbanceObserver
 from ..learn.env import Env
 from ..learn.residuals.model import FittedResidual, ResidualModel
-from ..physics.dynamics import PointMass
+from ..physics.actuators import Lagged
+from ..physics.dynamics import AbstractDynamics, PointMass
 from ..physics.felt_frame import FeltFrame
 from ..tasks.keypoints import Keypoints
 from ..tasks.occluded import OccludedKeypoints
 from ..tasks.task import AbstractTask
-from .presets import Preset
+from .presets import Preset, Pretrain
 from .tasks import find_task
 
 OBSERVER_TAU = 0.05  # [s]: half of it is unstable where the plant's delay is 40 ms longer than declared
 WANDER = 4.0  # [m/s^2] in a second
 TILT_LIMIT = 6.0  # [m/s^2], largest disturbance that turns a frame: gravity keeps a downward part
+
+
+def nominal_model(preset: Preset) -> AbstractDynamics[Any]:
+    """Return the point mass of Eq. (1) of the paper, behind the lag of the actuators where a preset declares one."""
+    model = PointMass(preset.dt)
+    return model if preset.actuator_tau is None else Lagged(model, jnp.array(preset.actuator_tau))
+
+
+def pretraining_optimiser(table: Pretrain) -> optax.GradientTransformation:
+    """Return Adam under a cosine, behind a clip; each call makes another object, for which programs compile anew."""
+    rate = optax.cosine_decay_schedule(table.learning_rate, table.num_updates)
+    return optax.chain(optax.clip_by_global_norm(table.max_grad_norm or math.inf), optax.adam(rate, b2=table.adam_b2))
 
 
 def make_learner(preset: Preset, model: ResidualModel, env: Env) -> OnlineLearner:

@@ -45,6 +45,22 @@ class MethodRequest:
         """Return the policy behind the observation of flight."""
         return PolicyController(self.setup.flown.observation_in_flight, self.policy.merged())
 
+    def by_state(self, controller: AbstractController[Any]) -> AbstractController[Any]:
+        """Return a controller that needs the state as it can be flown: by a pose filter where keypoints are seen.
+
+        Raises:
+            ConfigError: The preset shows keypoints, and no filter makes a state of them.
+        """
+        seen = self.setup.flown.observation_in_flight
+        if isinstance(seen, OccludedKeypoints):
+            return SeenPose(seen, controller)
+        if isinstance(seen, Keypoints):
+            raise ConfigError(
+                f"preset {self.setup.preset.name!r}: {type(controller).__name__} needs a state; with keypoints only a "
+                "pose filter gives one: set [vision] occlusion = true"
+            )
+        return controller
+
     def needed_key(self) -> Key[Array, ""]:
         """Return the key.
 
@@ -109,27 +125,14 @@ def _gravity_frame(request: MethodRequest) -> Pilot:
     return ControllerPilot(felt_frame(request.controller(), request.setup.preset))
 
 
-def _shown_state(controller: AbstractController[Any], request: MethodRequest, name: str) -> AbstractController[Any]:
-    """Return the controller as it can be flown: where a policy would see keypoints, with the pose that they give."""
-    seen = request.setup.flown.observation_in_flight
-    if isinstance(seen, OccludedKeypoints):
-        return SeenPose(seen, controller)
-    if isinstance(seen, Keypoints):
-        raise ConfigError(
-            f"method {name!r} needs a state; where a policy sees keypoints, it is that of the pose filter, which "
-            "[vision] occlusion = true has"
-        )
-    return controller
-
-
 def _without_policy(baseline: Baseline, request: MethodRequest) -> Pilot:
-    return ControllerPilot(_shown_state(baseline.controller(request.setup, request.key), request, baseline.label))
+    return ControllerPilot(request.by_state(baseline.controller(request.setup, request.key)))
 
 
 def _datt(request: MethodRequest) -> Pilot:
     if not isinstance(request.policy, DattNet):
         raise ConfigError("method 'datt' flies a network of its own: `retrim reproduce hover --methods datt` trains it")
-    return ControllerPilot(_shown_state(datt_of(request.setup, request.policy), request, "datt"))
+    return ControllerPilot(request.by_state(datt_of(request.setup, request.policy)))
 
 
 def _raptor(request: MethodRequest) -> Pilot:

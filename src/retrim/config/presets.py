@@ -123,7 +123,8 @@ class Vision:
     encoder_steps: int = Field(default=0, ge=0, le=1_000_000, strict=True)
     """Optimiser steps of encoder pretraining, before the policy is trained."""
     encoder_motions: Literal["near", "wild"] = "near"
-    """What the encoder sees: motions of a vehicle that hovers, or those of one that a random policy flies."""
+    """The encoder sees synthetic motions: those of a vehicle that hovers, or about as wide as those of a random policy.
+    Pixels are whitened over the first."""
 
 
 @dataclass(frozen=True, config=STRICT)

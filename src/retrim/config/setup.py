@@ -31,8 +31,7 @@ from ..tasks.motions import MOTIONS
 from ..tasks.reference import Reference
 from ..tasks.task import AbstractTask
 from .fresh import flight_starts, low_rank
-from .learners import felt_frame, make_learner
-from .nominal import nominal_model, pretraining_optimiser
+from .learners import felt_frame, make_learner, nominal_model, pretraining_optimiser
 from .presets import Preset
 from .presets import Track as TrackTable
 from .references import make_reference, make_training_reference

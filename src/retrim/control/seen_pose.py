@@ -1,16 +1,19 @@
 """Controllers that need the state, flown from what a camera sees.
 
 The filter that estimates the pose behind :class:`OccludedKeypoints` for a policy estimates it for them too, from the
-same points and the same commands, so that both are told the same.
+same points and the same commands. A controller that looks at an inertial unit keeps it: what is measured in the body
+frame is turned into the world by the estimated attitude.
 """
 
 import dataclasses
 from typing import Any
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..physics.state import Command, State
+from ..physics import so3
+from ..physics.state import STANDARD_GRAVITY, Command, State
 from ..tasks.occluded import OccludedKeypoints, OccludedMemory
 from .controller import AbstractController
 
@@ -28,6 +31,10 @@ class SeenPose(AbstractController[SeenPoseState]):
 
     observation: OccludedKeypoints
     inner: AbstractController[Any]
+    omega: Float[Array, "3"] | None = None
+    """Measured body rates [rad/s]; None: they are not measured."""
+    a: Float[Array, "3"] | None = None
+    """Acceleration, the mean over the last tick, world [m/s^2]; None: it is not measured."""
 
     def aged(self, age: float | Float[Array, ""]) -> "SeenPose":
         """Return the same for frames that are ``age`` old [s]."""
@@ -35,7 +42,7 @@ class SeenPose(AbstractController[SeenPoseState]):
 
     def sensing(self, omega: Float[Array, "3"], a: Float[Array, "3"]) -> "SeenPose":
         """Return the same for a tick in which body rates and acceleration were measured."""
-        return dataclasses.replace(self, inner=self.inner.sensing(omega, a))
+        return dataclasses.replace(self, omega=omega, a=a)
 
     def init(self, x: State) -> SeenPoseState:
         """Return the memory at the start of a flight: the filter begins near the state, not in it."""
@@ -43,9 +50,14 @@ class SeenPose(AbstractController[SeenPoseState]):
         return SeenPoseState(seen, self.inner.init(seen.pose.x), Command.hover(x.p.dtype))
 
     def __call__(self, memory: SeenPoseState, t: Float[Array, ""], x: State) -> tuple[Command, SeenPoseState]:
-        """Decide for the pose that is estimated; the state is where the camera is, and nothing else sees it."""
+        """Decide for the pose that is estimated; the state says where camera and inertial unit are, and no more."""
         _, seen = self.observation(memory.seen, t, x, memory.last)
-        u, inner = self.inner(memory.inner, t, seen.pose.x)
+        here, controller = seen.pose.x, self.inner
+        if self.omega is not None and self.a is not None:
+            gravity = jnp.array([0.0, 0.0, -STANDARD_GRAVITY], dtype=x.p.dtype)
+            felt = so3.act(x.R.T, self.a - gravity)  # as an accelerometer measures it, in the body frame
+            controller = controller.sensing(self.omega, so3.act(here.R, felt) + gravity)
+        u, inner = controller(memory.inner, t, here)
         return u, SeenPoseState(seen, inner, u)
 
     def accepted(self, memory: SeenPoseState, u: Command) -> SeenPoseState:

@@ -14,7 +14,6 @@ import optax
 from jax import random
 from jaxtyping import Array, Key
 
-from ..adapt.optimisers import FreshAdam
 from ..config.scenario import Scenario
 from ..config.setup import Setup
 from ..control.controller import PolicyController
@@ -45,7 +44,7 @@ class Choice(NamedTuple):
 
     rotors: bool
     """The model has rotors, thrust map, drag and the rate controller, at 1 kHz; otherwise it is a point mass."""
-    through: bool
+    own_gradient: bool
     """The gradient is that of the model itself; otherwise the point mass's."""
     backprop: bool
     """Gradients flow through the residual, too."""
@@ -97,7 +96,7 @@ def design_dynamics(setup: Setup, residual: Any, choice: Choice) -> AbstractDyna
     simple = PointMass(setup.preset.dt)
     nominal: AbstractDynamics[Any] = _rotors(setup) if choice.rotors else simple
     forward = Hybrid(nominal, residual, backprop=choice.backprop)
-    if choice.through:
+    if choice.own_gradient:
         return forward
     return StraightThrough(forward, Hybrid(simple, residual, backprop=True) if choice.backprop else simple)
 
@@ -150,8 +149,9 @@ def _adam(learning_rate: float) -> optax.GradientTransformation:
 
 @functools.cache
 def _of_policy(learning_rate: float, max_grad_norm: float, epochs: int) -> optax.GradientTransformation:
-    """What the paper re-trains by in flight, with the preset's limit; the same object for the same numbers."""
-    return FreshAdam(jnp.array(learning_rate), jnp.array(max_grad_norm)).transformation(epochs)
+    """Adam whose rate falls to zero, as in updates in flight, behind the preset's clip; made once for the numbers."""
+    rate = optax.cosine_decay_schedule(learning_rate, epochs)
+    return optax.chain(optax.clip_by_global_norm(max_grad_norm), optax.adam(rate))
 
 
 @eqx.filter_jit

@@ -9,7 +9,12 @@ from jaxtyping import Array
 from ..physics.bem import FRAME_FACTOR, IN_PLANE_GAIN
 from ..physics.propeller import BladeForces, Inflow, Propeller, five_inch, rotor, three_inch, vortex_ring
 
-GOLDEN_HOVER = ((1800.0, 5.13804), (1850.0, 5.42739), (1900.0, 5.72464), (1950.0, 6.02982))  # rad/s, N; see docs
+GOLDEN_HOVER = (
+    (1800.0, 5.13804),
+    (1850.0, 5.42739),
+    (1900.0, 5.72464),
+    (1950.0, 6.02982),
+)  # rad/s, N: Agilicious
 
 
 def published() -> list[dict[str, Any]]:
@@ -44,14 +49,21 @@ class Settled:
     """One rotor in steady air, its inflow found."""
 
     def __init__(self, prop: Propeller, omega: float, v_hor: float, v_ver: float) -> None:
-        forces, inflow = settled(prop, jnp.array(omega), jnp.array(v_hor), jnp.array(v_ver))
+        forces, inflow = settled_rotor(prop, jnp.array(omega), jnp.array(v_hor), jnp.array(v_ver))
         self.thrust, self.in_plane, self.torque = (float(f) for f in forces)
         self.v_i = float(vortex_ring(inflow, jnp.array(v_ver)))
 
 
 @eqx.filter_jit
-def settled(prop: Propeller, omega: Array, v_hor: Array, v_ver: Array) -> tuple[BladeForces, Inflow]:
-    """Return forces and inflow of one rotor after the inflow has settled."""
+def settled_rotor(prop: Propeller, omega: Array, v_hor: Array, v_ver: Array) -> tuple[BladeForces, Inflow]:
+    """Return forces and inflow of a rotor in steady air.
+
+    Args:
+        prop: Its blades.
+        omega: Speed of the rotor [rad/s].
+        v_hor: Speed of the air in its plane [m/s].
+        v_ver: Speed along its axis, positive when descending [m/s].
+    """
     return rotor(prop, omega, v_hor, v_ver, Inflow.above(omega.dtype), steps=16)
 
 

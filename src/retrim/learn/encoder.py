@@ -36,7 +36,7 @@ def pretrain_encoder(
         policy: A policy with at least one hidden layer.
         observation: The observation of the policy.
         key: Consumed.
-        motions: Of the camera. What a policy meets beyond them it will not know.
+        motions: What the encoder is trained on; it does not generalise far beyond.
         steps: Optimiser steps.
         batch: Random motions per step.
 

@@ -1,11 +1,13 @@
 """Models of motion: x_{t+1} = f(x_t, u_t), one control tick at a time.
 
-The four configurations of the paper's runtime study (Sec. IV-C) are four expressions::
+The configurations of the paper's runtime study (Sec. IV-C) are expressions, with rotors = LinearDragQuadrotor.of(...)::
 
-    Hybrid(PointMass(dt), r)                                        # the paper's choice
+    Hybrid(PointMass(dt), r)                                    # the paper's choice
     Hybrid(PointMass(dt), r, backprop=True)
-    StraightThrough(Hybrid(Rotors(vehicle, dt), r), PointMass(dt))
-    StraightThrough(Hybrid(Rotors(vehicle, dt), r), Hybrid(PointMass(dt), r, backprop=True))
+    Hybrid(rotors, r)
+    Hybrid(rotors, r, backprop=True)
+    StraightThrough(Hybrid(rotors, r), PointMass(dt))
+    StraightThrough(Hybrid(rotors, r), Hybrid(PointMass(dt), r, backprop=True))
 """
 
 import abc

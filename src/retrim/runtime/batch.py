@@ -39,10 +39,10 @@ class Ticks(eqx.Module):
 def take_off(simulation: Simulation, controller: AbstractController[Any], x0: State) -> InFlight:
     """Return a flight that begins at ``x0``."""
     sim = simulation.launch(x0)
-    return begun(controller, sim, simulation.measured(sim))
+    return in_flight(controller, sim, simulation.measured(sim))
 
 
-def begun(controller: AbstractController[Any], sim: SimState, measured: State) -> InFlight:
+def in_flight(controller: AbstractController[Any], sim: SimState, measured: State) -> InFlight:
     """Return a flight of a simulation that has been launched.
 
     Args:

@@ -13,7 +13,7 @@ from jaxtyping import Array
 from ..learn.window import Window
 from ..physics.state import Command, State
 from ..plants.sim import SimState, Simulation
-from .batch import InFlight, Ticks, begun, fly_ticks
+from .batch import InFlight, Ticks, fly_ticks, in_flight
 from .events import Event
 from .flight import FlightStopped, Log, States
 
@@ -159,7 +159,7 @@ def _launch(simulations: Simulation, starts: State) -> tuple[SimState, State]:
 @eqx.filter_jit
 def _begin(controllers: Any, sims: SimState, measured: State) -> InFlight:
     first = jax.tree.map(lambda leaf: leaf[:, 0], measured)
-    flights: InFlight = eqx.filter_vmap(begun)(controllers, sims, first)
+    flights: InFlight = eqx.filter_vmap(in_flight)(controllers, sims, first)
     return flights
 
 

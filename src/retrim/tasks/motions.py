@@ -17,7 +17,7 @@ class Motions(NamedTuple):
     tilt: float
     """Standard deviation of the attitude about each axis [rad]."""
     turn: float
-    """Standard deviation of the heading beside that [rad]."""
+    """Standard deviation of the heading, in addition [rad]."""
     speed: float
     """Standard deviation of the velocity, per axis [m/s]."""
     rates: float
@@ -38,3 +38,4 @@ NEAR = Motions(box=1.2, tilt=0.2, turn=0.4, speed=0.7, rates=1.0)
 WILD = Motions(box=1.5, tilt=0.5, turn=0.4, speed=2.0, rates=2.0)
 """About as widely as a random policy moves, on whose flights the authors pretrain."""
 MOTIONS = {"near": NEAR, "wild": WILD}
+"""By the names that presets call them."""

@@ -42,7 +42,7 @@ def design(
     starts: int = 8,
     epochs: int = POLICY_EPOCHS,
 ) -> None:
-    """The design study: low or high fidelity, gradients through the residual or not; training time and final error.
+    """The design study: which model, whose gradient, and whether it flows through the residual; time and error.
 
     Args:
         run: Folder of design.md and design.json.
@@ -62,7 +62,7 @@ def design(
         f"{SCORED_S:g} s without further learning, scored over their last 2 s. Times are medians over seeds and "
         f"programs of {CHUNK} epochs, with their range; the ways take turns. Compiling: as the "
         "machine's compile cache had it, for the first seed. High fidelity: rotors, thrust map, "
-        "drag and rate controller at 1 kHz, differentiated themselves, or replaced by the point mass in the gradient."
+        "drag and rate controller at 1 kHz; its gradient is its own, or that of the point mass."
     )
     document = Document(run, "design", "Design study (Sec. IV-C of the paper)", intro, seeds, reporter)
     study = train_all(loaded, seeds, run, reporter)

@@ -22,7 +22,7 @@ from .study import fly_all, refuse_misfits, table_presets, train_all
 METHODS: dict[str, tuple[str, ...]] = {
     "hover": ("base", "base-i", "base-do", "geometric-i", "indi", "full"),
     "track": ("base", "base-i", "base-do", "geometric-i", "indi", "full"),
-    "vision": ("base", "base-do", "full"),  # the others need a measured position, which it is not shown
+    "vision": ("base", "base-do", "full"),  # what every preset can fly
 }
 METRICS = {"steady": "[m]", "late": "[m]", "peak": "[m]", "recovery_5cm": "[s]", "recovery_2cm": "[s]"}
 INTRO = """\

@@ -17,7 +17,7 @@ from ...physics.state import STANDARD_GRAVITY, Command, State
 from ...physics.substep import SUBSTEP
 from ...viz import plots
 from ...viz.panels import Curve, Panel, panel_figure
-from ..published import GOLDEN_HOVER, Settled, published, settled
+from ..published import GOLDEN_HOVER, Settled, published, settled_rotor
 from ..reporter import Reporter
 from ..run import Run
 from .document import Document, TableSection
@@ -107,7 +107,7 @@ def inflow_panel() -> Panel:
     descents = np.linspace(-6.0, 14.0, 81)
     ruled, plain = list[float](), list[float]()
     for v in descents:
-        _, inflow = settled(five_inch(), jnp.array(1109.15), jnp.array(0.0), jnp.array(float(v)))
+        _, inflow = settled_rotor(five_inch(), jnp.array(1109.15), jnp.array(0.0), jnp.array(float(v)))
         ruled.append(float(vortex_ring(inflow, jnp.array(float(v)))))
         plain.append(float(inflow.v_i))
     spec = np.array([[-4, 5.3631], [-2, 6.5346], [-1, 7.1522], [0, 7.7904], [1, 8.7662], [2, 9.5403], [4, 10.9296]])

@@ -5,7 +5,9 @@ from collections.abc import Sequence
 from ...config.baselines import BASELINES
 from ...config.presets import Preset
 from ...config.scenario import Scenario
+from ...errors import ConfigError
 from ..reporter import Reporter
+from ..rivals import RIVALS
 from ..run import Run
 from .document import Document
 from .levels import METHODS, Levels, PaperRows, fly_levels
@@ -26,8 +28,9 @@ INTRO = """\
 Made by `retrim reproduce vision`. Steady-state error [m], the mean over the last 2 s: mean ± standard deviation
 over flights. Small quadrotor; seven points on the ground, five frames, three past commands, no state. The
 residual is learnt from the state, as in the paper. Learning is charged to flight time by the preset's fixed
-latencies. Controllers without a policy fly by the estimate of the pose filter, which sees the points that
-the policy sees. In brackets the paper's figures, which are from its own plant."""
+latencies. Controllers without a policy fly by the estimate of the pose filter, which sees the points that the
+policy sees; INDI has an inertial unit beside it, which the policy has not. In brackets the paper's figures,
+which are from its own plant."""
 
 
 def vision(
@@ -35,7 +38,7 @@ def vision(
     reporter: Reporter,
     *,
     presets: tuple[str, ...] = tuple(TITLES),
-    methods: tuple[str, ...] = METHODS,
+    methods: tuple[str, ...] = (),
     seeds: tuple[int, ...] = (0,),
     seconds: float = 30.0,
     starts: int = 8,
@@ -47,24 +50,33 @@ def vision(
         run: Folder of vision.md, vision.json and the pictures.
         reporter: Receives progress and the sections.
         presets: Presets to train and fly; vision/paper trains for several minutes.
-        methods: How they fly; each preset those that it can: baselines fly by the estimate of a pose filter, and
-            base-do in the frame of felt gravity.
+        methods: How they fly; by default each preset flies what it can: baselines by the estimate of a pose filter,
+            and base-do in the frame of felt gravity.
         seeds: Training seeds.
         seconds: Length of a flight [s].
         starts: Flights per disturbance, method and seed.
         plant: Where the policies fly.
     """
     loaded = table_presets(presets, "vision", seeds=seeds, starts=starts, seconds=seconds)
+    if trained := [method for method in methods if method in RIVALS]:
+        raise ConfigError(f"--methods {trained[0]}: it is trained by a measured state; this table has none")
     document = Document(run, "vision", "Hover from keypoints (Table III of the paper)", INTRO, seeds, reporter)
     sections = [_section(preset, Scenario(plant=plant), methods) for preset in loaded]
     fly_levels(document, sections, starts=starts, seconds=seconds)
 
 
 def _section(preset: Preset, scenario: Scenario, methods: Sequence[str]) -> Levels:
-    cannot = {"base-i", *(() if preset.adapt.frame == "gravity" else ("base-do",))}
-    if preset.vision is None or not preset.vision.occlusion:
-        cannot |= {*BASELINES}
-    flown = [method for method in methods if method not in cannot]
     stem = f"vision_{preset.name.rpartition('/')[2]}"
     drawn = ("base", "indi", "full")
+    flown = methods or _flyable(preset)
     return Levels(TITLES.get(preset.name, preset.name), preset, scenario, stem, flown, PAPER, drawn=drawn)
+
+
+def _flyable(preset: Preset) -> list[str]:
+    """Methods of the other tables that a policy which sees keypoints, or a filter of its pose, can fly."""
+    cannot = {"base-i"}
+    if preset.adapt.frame != "gravity":
+        cannot.add("base-do")
+    if preset.vision is None or not preset.vision.occlusion:
+        cannot.update(BASELINES)
+    return [method for method in METHODS if method not in cannot]
