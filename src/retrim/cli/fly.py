@@ -64,7 +64,7 @@ def fly(
             the samples lost), or module:name.
         thrust_error: By how much more than commanded the rotors give, as a share (bem and simple).
         delay: Command delay of the plant [s], in whole milliseconds (bem and simple); the policy does not know of it.
-        residual: Residual model: ensemble, regression, or module:name.
+        residual: Residual model: ensemble, regression, layered, or module:name.
         config: TOML file that overlays the policy's own preset, for example with a table [adapt].
         latency: fixed: learning costs the preset's flight time, so that a run repeats bit for bit; measured: what the
             clock says.
