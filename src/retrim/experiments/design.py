@@ -94,8 +94,7 @@ def design_dynamics(setup: Setup, residual: Any, choice: Choice) -> AbstractDyna
         choice: How to simulate and to differentiate.
     """
     simple = PointMass(setup.preset.dt)
-    nominal: AbstractDynamics[Any] = _rotors(setup) if choice.rotors else simple
-    forward = Hybrid(nominal, residual, backprop=choice.backprop)
+    forward = Hybrid(_nominal(setup, choice), residual, backprop=choice.backprop)
     if choice.own_gradient:
         return forward
     return StraightThrough(forward, Hybrid(simple, residual, backprop=True) if choice.backprop else simple)
@@ -116,7 +115,7 @@ def retrained(setup: Setup, policy: Policy, logs: Sequence[Log], key: Key[Array,
         envs: Roll-outs of an epoch.
     """
     k_fit, k_train = random.split(key)
-    nominal: AbstractDynamics[Any] = _rotors(setup) if choice.rotors else PointMass(setup.preset.dt)
+    nominal = _nominal(setup, choice)
     windows = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *(log.window(len(log.t) - 1) for log in logs))
     rows = _rows(windows, nominal, setup.preset.plant_delay_ticks)
     adapt = setup.preset.adapt
@@ -137,8 +136,9 @@ def retrained(setup: Setup, policy: Policy, logs: Sequence[Log], key: Key[Array,
     return Trained(state.policy.merged(), times[0] - run, [t / CHUNK for t in times[1:]], float(errors[-1]) ** 0.5)
 
 
-def _rotors(setup: Setup) -> LinearDragQuadrotor:
-    return LinearDragQuadrotor.of(setup.vehicle, setup.preset.dt, thrust_error=0.0)
+def _nominal(setup: Setup, choice: Choice) -> AbstractDynamics[Any]:
+    dt = setup.preset.dt
+    return LinearDragQuadrotor.of(setup.vehicle, dt, thrust_error=0.0) if choice.rotors else PointMass(dt)
 
 
 @functools.cache

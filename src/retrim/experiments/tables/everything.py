@@ -44,7 +44,7 @@ PLAN: tuple[tuple[Callable[..., None], str, Options, Options], ...] = (
         vision,
         "Table III",
         {"presets": ("vision/retrim",), "seeds": (0, 1, 2)},
-        {**FEW, "presets": ("vision/retrim",), "seconds": 12.0},
+        {**FEW, "presets": ("vision/retrim",), "seconds": 12.0, "methods": ("base", "base-do", "indi", "full", "lora")},
     ),
     (reversing, "Sec. IV-B.3", {"seeds": (0, 1, 2)}, {**FEW, "seconds": 35.0}),
     (design, "Sec. IV-C", {}, {**FEW, "epochs": 20}),
