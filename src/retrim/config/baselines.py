@@ -1,6 +1,7 @@
 """Classical controllers beside the policies, given what a preset declares of the vehicle: delay, lag and limits.
 
-``retrim reproduce tuning`` found their settings, on pushes, starts and seeds of its own: see docs/results/tuning.md.
+``retrim reproduce tuning`` found their settings, on pushes, starts and seeds of its own, once for a measured state and
+once for the pose that is estimated from keypoints: see docs/results/tuning.md and tuning_keypoints.md.
 """
 
 from collections.abc import Callable, Mapping
@@ -19,6 +20,7 @@ from ..control.mppi import Mppi
 from ..estimation.l1 import L1Estimator
 from ..estimation.prediction import Prediction
 from ..learn.datt import KNOWN
+from ..tasks.keypoints import Keypoints
 
 if TYPE_CHECKING:
     from .setup import Setup
@@ -42,6 +44,9 @@ class Baseline:
     make: Callable[["Setup", Settings, Key[Array, ""]], AbstractController[Any]]
     """From a set-up, settings, and a seed for what is random."""
     settings: Settings
+    """For a measured state."""
+    settings_from_keypoints: Settings
+    """For a pose that a filter estimates from keypoints: it is late and shakes, so slower loops fly better."""
     ranges: Mapping[str, tuple[float, float]]
     """Smallest and largest value that the search draws, evenly in the logarithm."""
     cost: int = 1
@@ -49,7 +54,12 @@ class Baseline:
 
     def controller(self, setup: "Setup", key: Key[Array, ""] | None = None) -> AbstractController[Any]:
         """Return the controller with its settings."""
-        return self.make(setup, self.settings, random.key(0) if key is None else key)
+        return self.make(setup, self.settings_for(setup), random.key(0) if key is None else key)
+
+    def settings_for(self, setup: "Setup") -> Settings:
+        """Return the settings for what the controller is shown."""
+        seen = isinstance(setup.flown.observation_in_flight, Keypoints)
+        return self.settings_from_keypoints if seen else self.settings
 
 
 def prediction_of(setup: "Setup") -> Prediction:
@@ -111,17 +121,20 @@ BASELINES: dict[str, Baseline] = {
         "geometric controller",
         _geometric,
         {"position": 56.3, "velocity": 12.6, "attitude": 23.9},
+        {"position": 56.3, "velocity": 12.6, "attitude": 23.9},
         _LOOPS,
     ),
     "geometric-i": Baseline(
         "geometric controller + integral action",
         _geometric,
         {"position": 40.2, "velocity": 6.85, "attitude": 21.4, "integral": 20.6},
+        {"position": 40.2, "velocity": 6.85, "attitude": 21.4, "integral": 20.6},
         {**_LOOPS, "integral": (2.0, 60.0)},
     ),
     "indi": Baseline(
         "INDI",
         _indi,
+        {"position": 46.7, "velocity": 7.55, "attitude": 22.0, "filter": 0.0335},
         {"position": 46.7, "velocity": 7.55, "attitude": 22.0, "filter": 0.0335},
         {**_LOOPS, "filter": (0.02, 0.3)},
     ),
@@ -132,12 +145,20 @@ BASELINES: dict[str, Baseline] = {
             "thrust": 1.46, "rates": 1.69, "correlation": 0.133, "temperature": 0.0896, "position": 6.89,
             "velocity": 0.0514, "attitude": 2.02,
         },
+        {
+            "thrust": 1.46, "rates": 1.69, "correlation": 0.133, "temperature": 0.0896, "position": 6.89,
+            "velocity": 0.0514, "attitude": 2.02,
+        },
         _SAMPLING,
         cost=3,
     ),
     "l1-mpc": Baseline(
         "MPPI + L1",
         _mppi,
+        {
+            "thrust": 1.05, "rates": 1.47, "correlation": 0.0762, "temperature": 0.133, "position": 14.1,
+            "velocity": 0.0528, "attitude": 0.694, "estimator": 0.126,
+        },
         {
             "thrust": 1.05, "rates": 1.47, "correlation": 0.0762, "temperature": 0.133, "position": 14.1,
             "velocity": 0.0528, "attitude": 0.694, "estimator": 0.126,

@@ -2,13 +2,14 @@
 
 import contextlib
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jax import random
 
 from ...config.baselines import BASELINES, Baseline, Settings
 from ...config.loading import load
+from ...config.methods import MethodRequest
 from ...config.scenario import Scenario
 from ...config.setup import Setup
 from ...errors import ConfigError
@@ -23,12 +24,21 @@ from ..reporter import Reporter
 from ..run import Run
 from .document import Document, TableSection
 
-CONDITIONS = (
-    ("hover/retrim", "push=1.2", "onboard", None),
-    ("hover/retrim", "gusts=3+step=-1.5", "ideal", None),
-    ("track/retrim", "wind=5+push=-0.8", "onboard", "figure8"),
-)
-"""Preset, for task and declared lag; disturbance, sensors and reference."""
+Shown = Literal["state", "keypoints"]
+CONDITIONS: dict[Shown, tuple[tuple[str, str, str, str | None], ...]] = {
+    "state": (
+        ("hover/retrim", "push=1.2", "onboard", None),
+        ("hover/retrim", "gusts=3+step=-1.5", "ideal", None),
+        ("track/retrim", "wind=5+push=-0.8", "onboard", "figure8"),
+    ),
+    "keypoints": (
+        ("vision/retrim", "push=1.2", "onboard", None),
+        ("vision/retrim", "gusts=3+step=-1.5", "ideal", None),
+        ("vision/retrim", "push=-1.8", "ideal", None),
+    ),
+}
+"""By what the controllers are shown: preset, for task and declared lag; disturbance, sensors and reference."""
+SHOWN = {"state": "the measured state", "keypoints": "the pose that a filter estimates from keypoints"}
 CRASH = 1.0  # [m], the error that a crashed flight counts as
 SETTLING = 3.0  # [s] at the start that do not count
 
@@ -38,6 +48,7 @@ def tuning(
     reporter: Reporter,
     *,
     methods: tuple[str, ...] = tuple(BASELINES),
+    shown: Shown = "state",
     candidates: int = 96,
     starts: int = 2,
     seconds: float = 12.0,
@@ -50,6 +61,7 @@ def tuning(
         run: Folder of tuning.md and tuning.json.
         reporter: Receives progress and the sections.
         methods: Which baselines.
+        shown: What they fly by: the measured state, or the pose that a filter estimates from keypoints.
         candidates: Settings that are tried for each, beside the present ones; a third of them for MPPI.
         starts: Flights of a candidate under each condition.
         seconds: Length of a flight [s]; the first 3 s do not count.
@@ -66,30 +78,33 @@ def tuning(
         raise ConfigError(f"--candidates {candidates} must be between 0 and 10000")
     if unknown := [name for name in methods if name not in BASELINES]:
         raise ConfigError(f"{', '.join(unknown)}: no baseline with settings; there are {', '.join(BASELINES)}")
-    conditions = "; ".join(
+    conditions = CONDITIONS[shown]
+    listed = "; ".join(
         f"{preset.partition('/')[0]}{f' ({reference})' if reference else ''}, {disturbed}, sensors {sensors}"
-        for preset, disturbed, sensors, reference in CONDITIONS
+        for preset, disturbed, sensors, reference in conditions
     )
     intro = (
-        f"Made by `retrim reproduce tuning`. {candidates} candidates for each method (a third for MPPI), drawn "
-        "evenly in the logarithm of each range, and the present settings, fly the small quadrotor on plant "
-        f"`{plant}` from {starts} starts (seed {seed}) under: {conditions}. The score is the root mean square of the "
-        f"error after {SETTLING:g} s, the mean over flights [m], a crash counting {CRASH:g} m. No table flies "
-        "these conditions, starts or seeds."
+        f"Made by `retrim reproduce tuning --shown {shown}`. {candidates} candidates for each method (a third for "
+        "MPPI), drawn evenly in the logarithm of each range, and the present settings, fly the small quadrotor on "
+        f"plant `{plant}` by {SHOWN[shown]}, from {starts} starts (seed {seed}) under: {listed}. The score is the root "
+        f"mean square of the error after {SETTLING:g} s, the mean over flights [m], a crash counting {CRASH:g} m. No "
+        "table flies these conditions, starts or seeds."
     )
     document = Document(run, "tuning", "Settings of the baselines", intro, [], reporter)
     for name in methods:
         if run.interrupted:
             break
-        tried = [dict(BASELINES[name].settings), *_drawn(BASELINES[name], -(-candidates // BASELINES[name].cost), seed)]
+        baseline = BASELINES[name]
+        present = baseline.settings if shown == "state" else baseline.settings_from_keypoints
+        tried = [dict(present), *_drawn(baseline, -(-candidates // baseline.cost), seed)]
         with contextlib.suppress(FlightStopped), run.interruptible(), reporter.progress(name) as advance:
             scores = np.zeros(len(tried))
-            for i, (preset, disturbed, sensors, reference) in enumerate(CONDITIONS):
+            for i, (preset, disturbed, sensors, reference) in enumerate(conditions):
                 scenario = Scenario(disturbed, plant, sensors=sensors, reference=reference)
-                advance(i / len(CONDITIONS), f"condition {i + 1} of {len(CONDITIONS)}")
-                found = _flown(BASELINES[name], tried, Setup.of(load(preset), scenario.reference), scenario,
+                advance(i / len(conditions), f"condition {i + 1} of {len(conditions)}")
+                found = _flown(baseline, tried, Setup.of(load(preset), scenario.reference), scenario,
                                starts=starts, seconds=seconds, seed=seed, stop=run.stop)  # fmt: skip
-                scores += np.array(found) / len(CONDITIONS)
+                scores += np.array(found) / len(conditions)
             document.add(_section(name, tried, scores), _rows(name, tried, scores))
     document.write()
 
@@ -120,7 +135,11 @@ def _flown(
     plants = [each for each in made if isinstance(each, SimPlant)]
     if len(plants) < len(made):
         raise ConfigError(f"plant {scenario.plant!r}: candidates are flown as one batch, which bem and simple can be")
-    pilots = [ControllerPilot(baseline.make(setup, settings, spec.key())) for settings in tried for spec in specs]
+    pilots = [
+        ControllerPilot(MethodRequest(setup, None).by_state(baseline.make(setup, settings, spec.key())))
+        for settings in tried
+        for spec in specs
+    ]
     logs = fly_together(plants, pilots, begun * len(tried), ticks=round(seconds / dt), stop=stop)
     flights = [scored(setup, specs[0], until_terminated(setup.flown, log)) for log in logs]
     errors = [
