@@ -65,7 +65,7 @@ bench: setup
 tables: dev
 	$(BIN)/retrim reproduce hover --out docs/results
 	$(BIN)/retrim reproduce reversing --out docs/results
-	$(BIN)/retrim reproduce tracking --out docs/results
+	$(BIN)/retrim reproduce track --out docs/results
 	$(BIN)/retrim reproduce vision --out docs/results
 	$(BIN)/retrim reproduce plants --out docs/results
 	$(BIN)/retrim reproduce model --out docs/results

@@ -92,7 +92,7 @@ WRONG = [
     (("reproduce", "hover", "--seeds", "-1"), "seed -1: must be"),
     (("reproduce", "hover", "--seeds", "3", "3"), "seeds 3, 3: at least one is needed, and each only once"),
     (("reproduce", "vision", "--starts", "0"), "0 starts: must be"),
-    (("reproduce", "tracking", "--seconds", "nan"), "flights of nan s: must be"),
+    (("reproduce", "track", "--seconds", "nan"), "flights of nan s: must be"),
     (("reproduce", "plants", "--seconds", "0"), "flights of 0 s: must be"),
     (("reproduce", "reversing", "--seconds", "20"), "flights of 20 s: a push that reverses needs at least 30 s"),
     # names
@@ -122,7 +122,7 @@ WRONG = [
     (("bench", "--works", "nap"), "no work nap; there are pretrain-retrim"),
     (("reproduce", "hover", "--presets", "vision/ideal"), "preset 'vision/ideal' is for vision, not for hover"),
     (("reproduce", "hover", "--sensors", "nope"), "no sensor 'nope'"),
-    (("reproduce", "tracking", "--plant", "nope"), "no plant 'nope'"),
+    (("reproduce", "track", "--plant", "nope"), "no plant 'nope'"),
     (("reproduce", "tuning", "--seconds", "3"), "--seconds 3 must be at least 4: the first 3 do not count"),
     (("reproduce", "tuning", "--candidates", "-5"), "--candidates -5 must be between 0 and 10000"),
     (("reproduce", "tuning", "--methods", "base"), "base: no baseline with settings"),

@@ -17,12 +17,12 @@ from retrim import ConfigError, PlantError, Setup, changed
 from retrim.cli.reproduce import COMMANDS
 from retrim.config import named_presets
 from retrim.config.baselines import BASELINES
-from retrim.experiments import Run, design, effort, provenance
+from retrim.experiments import Run, design, effort, provenance, tables
 from retrim.experiments.reporter import Silent
 
 # The package has functions of these names.
-NAMES = ("design", "everything", "phase", "vision")
-design_table, everything, phase_table, vision_table = (
+NAMES = ("design", "everything", "phase", "quick", "vision")
+design_table, everything, phase_table, quick, vision_table = (
     importlib.import_module(f"retrim.experiments.tables.{n}") for n in NAMES
 )
 
@@ -119,8 +119,9 @@ def test_all_tables_go_on_where_they_were_killed(tmp_path, monkeypatch):
             raise RuntimeError("killed")
         dying.append(False)
 
-    plan = tuple((make, "Table", {"size": 9}, {"size": 1}) for make in (one, two))
-    monkeypatch.setattr(everything, "PLAN", plan)
+    monkeypatch.setattr(everything, "PLAN", tuple((make, "Table", {"size": 9}) for make in (one, two)))
+    for name in ("one", "two"):
+        monkeypatch.setitem(quick.QUICK, name, {"size": 1})
     monkeypatch.setattr(provenance, "commit", lambda: "abc")
     dying.insert(0, False)
     for name in ("one", "two"):
@@ -159,16 +160,43 @@ def test_a_table_whose_package_is_missing_is_said_to_be_left_out(tmp_path, monke
     def lacking(run, reporter):
         raise PlantError("method 'raptor' needs the package")
 
-    monkeypatch.setattr(everything, "PLAN", ((lacking, "beside RAPTOR", {}, {}),))
+    monkeypatch.setattr(everything, "PLAN", ((lacking, "beside RAPTOR", {}),))
     everything.everything(Run("test", tmp_path), Silent())
     assert "lacking, left out: method 'raptor' needs the package" in (tmp_path / "everything.md").read_text()
 
 
 def test_every_table_of_the_plan_has_the_options_that_are_planned():
-    for make, _, full, quick in everything.PLAN:
-        known = set(inspect.signature(make).parameters)
-        assert {*full, *quick} <= known, make.__name__
+    for make, _, full in everything.PLAN:
+        assert {*full, *quick.QUICK[make.__name__]} <= set(inspect.signature(make).parameters), make.__name__
     assert "all" in COMMANDS
+
+
+def test_every_table_of_the_paper_has_a_quick_look_of_options_that_it_has():
+    made = {make.__name__: make for make in tables.MADE}
+    of_paper = {"hover", "track", "vision", "reversing", "design", "efficiency", "transfer"}
+    assert of_paper <= set(quick.QUICK) <= set(made)
+    for name, smaller in quick.QUICK.items():
+        options = {each.name: each.default for each in quick.options_of(made[name])}
+        assert options["quick"] is False
+        assert set(smaller) <= set(options), name
+        assert not smaller or any(options[option] != value for option, value in smaller.items()), name
+
+
+def test_a_quick_look_takes_less_of_what_nobody_asked_for(tmp_path):
+    """And says in its document that it is one."""
+    chosen = {"seconds": 30.0, "starts": 8, "seeds": (4,), "quick": True}
+    options, remark = quick.looked(tables.hover, chosen)
+    assert (options["seconds"], options["starts"], options["seeds"]) == (12.0, 2, (4,))
+    assert "not to quote" in remark
+    assert quick.looked(tables.hover, {**chosen, "quick": False}) == (
+        {k: chosen[k] for k in options if k in chosen},
+        "",
+    )
+    words = "--methods", "geometric", "--candidates", "1", "--seconds", "4", "--plant", "simple", "--quick"
+    retrim("reproduce", "tuning", *words, "--out", "t", cwd=tmp_path)
+    assert remark in (tmp_path / "t" / "tuning.md").read_text()
+    assert len(json.loads((tmp_path / "t" / "tuning.json").read_text())["rows"]) == 2
+    assert "unrecognized" in retrim("reproduce", "buses", "--quick", cwd=tmp_path, code=2).lower()
 
 
 def test_what_each_method_costs_by_its_command(tmp_path, monkeypatch):

@@ -17,7 +17,7 @@ COMMANDS = {
     "fly": "Fly a policy on a plant, as it is and adapting as it flies.",
     "demo": "The whole loop: pretrain, fly, adapt; a table and pictures.",
     "sweep": "Presets x scenarios x seeds from a TOML file, to one table and one picture.",
-    "reproduce": "Make a table of the paper again: hover, tracking, fast, vision, reversing, ...",
+    "reproduce": "Make a table of the paper again: hover, track, fast, vision, reversing, ...",
     "live": "Fly against the clock and learn at the same time, in processes of their own.",
     "learn": "Learn for a live flight on another machine.",
     "gauntlet": "A policy under everything that changes, at hover or on references: recovery, steady and worst error.",

@@ -9,36 +9,36 @@ from typing import Any
 
 from ..experiments import tables
 from ..experiments.run import Run
+from ..experiments.tables.quick import help_of, looked, options_of
 from .console import RichReporter, show_paths, started
 
 Ordered = Callable[[threading.Event], int]
-OUT = "    out: Folder of what is made; a new one under runs/ by default."
 
 
 def command_of(make: Callable[..., None], called: str = "reproduce") -> Callable[..., Ordered]:
-    """Return a command with the keyword-only options of ``make``, and ``out``.
+    """Return a command with the options of a table, and ``out``.
 
     Args:
         make: It makes a document of its own name from a run and a reporter.
         called: Name of the command, for the folder of its runs.
     """
-    name, signature = make.__name__, inspect.signature(make)
-    options = [each for each in signature.parameters.values() if each.kind is Parameter.KEYWORD_ONLY]
-    out = Parameter("out", Parameter.KEYWORD_ONLY, default=None, annotation=Path | None)
+    out_option = Parameter("out", Parameter.KEYWORD_ONLY, default=None, annotation=Path | None)
+    name, options = make.__name__, [*options_of(make), out_option]
 
     def command(*, out: Path | None = None, **chosen: Any) -> Ordered:
         def ordered(stop: threading.Event) -> int:
-            run = started(Run(called, out, stop=stop))
-            make(run, RichReporter(), **chosen)
+            asked, remark = looked(make, chosen)
+            run = started(Run(called, out, stop=stop, remark=remark))
+            make(run, RichReporter(), **asked)
             show_paths([run.folder / f"{name}.md"])
             return run.exit_code
 
         return ordered
 
     command.__name__ = name
-    command.__doc__ = f"{inspect.getdoc(make)}\n{OUT}"
-    command.__annotations__ = {each.name: each.annotation for each in (*options, out)}
-    vars(command)["__signature__"] = signature.replace(parameters=[*options, out], return_annotation=Parameter.empty)
+    command.__doc__ = f"{help_of(make)}\n    out: Folder of what is made; a new one under runs/ by default."
+    command.__annotations__ = {each.name: each.annotation for each in options}
+    vars(command)["__signature__"] = inspect.Signature(options)
     return command
 
 

@@ -23,18 +23,22 @@ class Run:
     ``stop`` is set by the first Ctrl-C, also where the KeyboardInterrupt itself is lost; long work looks at it.
     """
 
-    def __init__(self, command: str, out: Path | None = None, *, stop: threading.Event | None = None) -> None:
+    def __init__(
+        self, command: str, out: Path | None = None, *, stop: threading.Event | None = None, remark: str = ""
+    ) -> None:
         """Choose the folder and check that it can be written.
 
         Args:
             command: Names the folder if ``out`` is None: a new one under ``runs/``.
             out: The folder.
             stop: Set when the run should end early.
+            remark: What its documents say of how they were made.
 
         Raises:
             ConfigError: The folder cannot be written.
         """
         self.folder = out or Path("runs") / f"{command}-{datetime.now():%Y%m%d-%H%M%S}"
+        self.remark = remark
         self.watch = Stopwatch()
         self.replaces = out is not None and any(self.folder.glob("*.json"))
         self.stop = stop or threading.Event()

@@ -13,13 +13,13 @@ from .phase import phase as phase
 from .plants import plants as plants
 from .raptor import raptor as raptor
 from .reversing import reversing as reversing
-from .tracking import tracking as tracking
+from .track import track as track
 from .transfer import transfer as transfer
 from .tuning import tuning as tuning
 from .vision import vision as vision
 
 MADE = (
-    hover, reversing, tracking, phase, vision, plants, model, fast, ablation, design, efficiency, transfer, raptor,
+    hover, reversing, track, phase, vision, plants, model, fast, ablation, design, efficiency, transfer, raptor,
     buses, tuning,
 )  # fmt: skip
 """Those of ``retrim reproduce``; the gauntlet is a command of its own."""

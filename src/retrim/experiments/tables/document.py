@@ -64,7 +64,8 @@ class Document:
     def write(self) -> Path:
         """Write both files; return the path of the Markdown."""
         seeds = ", ".join(map(str, self.seeds))
-        head = [f"# {self.title}", "", self.intro, ""]
+        remark = [self.run.remark, ""] if self.run.remark else []
+        head = [f"# {self.title}", "", self.intro, "", *remark]
         trained = f"; training seeds {seeds}" if seeds else ""
         head += [f"Commit {commit()}; {describe_hardware()}{trained}.", ""]
         body = [line for section in self.sections for line in section.markdown()]

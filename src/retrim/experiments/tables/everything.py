@@ -16,50 +16,30 @@ from .levels import METHODS
 from .model import model
 from .phase import phase
 from .plants import plants
+from .quick import QUICK, REMARK, Options
 from .raptor import raptor
 from .reversing import reversing
-from .tracking import tracking
+from .track import track
 from .transfer import transfer
 from .vision import vision
 
-Options = dict[str, Any]
 OURS = METHODS.index("full")
 WITH_DATT = (*METHODS[:OURS], "datt", *METHODS[OURS:])
-FEW: Options = {"seeds": (0,), "starts": 2}
-PLAN: tuple[tuple[Callable[..., None], str, Options, Options], ...] = (
-    (
-        hover,
-        "Table I",
-        {"presets": ("hover/retrim", "hover/paper"), "seeds": (0, 1, 2), "methods": WITH_DATT},
-        {**FEW, "presets": ("hover/retrim",), "methods": WITH_DATT, "seconds": 12.0, "datt_steps": 1_000_000},
-    ),
-    (
-        tracking,
-        "Table II",
-        {"presets": ("track/retrim",), "seeds": (0, 1, 2), "methods": WITH_DATT, "seconds": 30.0},
-        {**FEW, "presets": ("track/retrim",), "methods": WITH_DATT, "seconds": 12.0, "datt_steps": 1_000_000},
-    ),
-    (phase, "Table II, the paper's formulation", {}, {}),
-    (
-        vision,
-        "Table III",
-        {"presets": ("vision/retrim",), "seeds": (0, 1, 2)},
-        {**FEW, "presets": ("vision/retrim",), "seconds": 12.0, "methods": ("base", "base-do", "indi", "full", "lora")},
-    ),
-    (reversing, "Sec. IV-B.3", {"seeds": (0, 1, 2)}, {**FEW, "seconds": 35.0}),
-    (design, "Sec. IV-C", {}, {**FEW, "epochs": 20}),
-    (efficiency, "compute and samples", {}, {"presets": ("hover/retrim",), "datt_steps": 1_000_000}),
-    (transfer, "Sec. IV-D", {}, {**FEW, "seconds": 12.0, "methods": ("base", "geometric-i", "indi", "full")}),
-    (
-        raptor,
-        "beside RAPTOR",
-        {},
-        {**FEW, "seconds": 12.0, "methods": ("raptor", "indi", "full")},
-    ),
-    (model, "the plant", {}, {}),
-    (plants, "other plants", {}, {}),
+SEEDS: Options = {"seeds": (0, 1, 2)}
+PLAN: tuple[tuple[Callable[..., None], str, Options], ...] = (
+    (hover, "Table I", {**SEEDS, "presets": ("hover/retrim", "hover/paper"), "methods": WITH_DATT}),
+    (track, "Table II", {**SEEDS, "presets": ("track/retrim",), "methods": WITH_DATT, "seconds": 30.0}),
+    (phase, "Table II, the paper's formulation", {}),
+    (vision, "Table III", {**SEEDS, "presets": ("vision/retrim",)}),
+    (reversing, "Sec. IV-B.3", SEEDS),
+    (design, "Sec. IV-C", {}),
+    (efficiency, "compute and samples", {}),
+    (transfer, "Sec. IV-D", {}),
+    (raptor, "beside RAPTOR", {}),
+    (model, "the plant", {}),
+    (plants, "other plants", {}),
 )
-"""Table, what of the paper it is, its options, and those of a quick look."""
+"""Table, what of the paper it is, and its options."""
 QUICK_LEAVES_OUT = (phase, plants)
 
 
@@ -72,20 +52,21 @@ def everything(run: Run, reporter: Reporter, *, quick: bool = False) -> None:
         quick: One seed, two starts and short flights, in a folder quick/; other plants and the paper's
             formulation of tracking are left out.
     """
-    intro = "Made by `retrim reproduce all`" + (
-        " `--quick`: one training seed, two starts, short flights; figures to look at, not to quote." if quick else "."
-    )
+    run.remark = REMARK if quick else ""
+    intro = f"Made by `retrim reproduce all{' --quick' if quick else ''}`."
     document = Document(run, "everything", "The tables of the paper", intro, [], reporter)
     rows: list[dict[str, Any]] = []
-    for make, what, full, small in PLAN:
+    for make, what, options in PLAN:
         if run.interrupted:
             break
         if quick and make in QUICK_LEAVES_OUT:
             continue
-        name, options = make.__name__, small if quick else full
+        name = make.__name__
+        if quick:
+            options = {**options, **QUICK[name]}
         folder = f"quick/{name}" if quick else name
         row: dict[str, Any] = {"table": name, "what": what, "page": f"{folder}/{name}.md"}
-        part = Run("reproduce", run.folder / folder, stop=run.stop)
+        part = Run("reproduce", run.folder / folder, stop=run.stop, remark=run.remark)
         done = run.folder / FOLDER / f"{section_key(table=name, options=options)}.done"
         if done.is_file() and (run.folder / row["page"]).is_file() and is_committed():
             reporter.say(f"{name}: as an earlier run of this folder has made it")

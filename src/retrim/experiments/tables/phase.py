@@ -11,7 +11,7 @@ from ..run import Run
 from .document import Document
 from .levels import Levels, fly_levels
 from .study import table_presets
-from .tracking import PAPER
+from .track import PAPER
 
 INTRO = """\
 Made by `retrim reproduce phase`. In the paper's formulation a tracking policy sees position, attitude and velocity, and

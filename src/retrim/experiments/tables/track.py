@@ -36,7 +36,7 @@ PAPER: dict[str, PaperRows] = {  # Table II [m]
     },
 }
 INTRO = """\
-Made by `retrim reproduce tracking`. Mean distance from where the reference is at the time [m], over the last 10
+Made by `retrim reproduce track`. Mean distance from where the reference is at the time [m], over the last 10
 s: mean ± standard deviation over flights. In step: but for the best constant shift in time. Cross-track:
 distance from the nearest point of the lap. Small quadrotor. Presets `track/retrim` and `track/preview`: one
 policy, trained on all three references, sees them ahead; `track/retrim` is flown and adapted in the frame of the
@@ -45,7 +45,7 @@ Learning is charged to flight time by the preset's fixed latencies. In brackets 
 from its own plant; its circle and ours take 3 s."""
 
 
-def tracking(
+def track(
     run: Run,
     reporter: Reporter,
     *,
@@ -60,7 +60,7 @@ def tracking(
     """Table II: circle, figure-8 and star under three disturbances, and a figure-8 that training never saw.
 
     Args:
-        run: Folder of tracking.md, tracking.json and the pictures.
+        run: Folder of track.md, track.json and the pictures.
         reporter: Receives progress and the sections.
         presets: Presets to train and fly.
         methods: How they fly, and baselines that need none of the policies; these fly once, beside the first preset.
@@ -76,7 +76,7 @@ def tracking(
         for preset in loaded
         for section in _sections(preset, plant, methods if preset is loaded[0] else of_policies(methods))
     ]
-    document = Document(run, "tracking", "Tracking (Table II of the paper)", INTRO, seeds, reporter)
+    document = Document(run, "track", "Tracking (Table II of the paper)", INTRO, seeds, reporter)
     fly_levels(document, sections, starts=starts, seconds=seconds, datt_steps=datt_steps)
 
 
@@ -87,7 +87,7 @@ def _sections(preset: Preset, plant: str, methods: Sequence[str]) -> list[Levels
         title: str, preset: Preset, reference: str, paper: PaperRows, methods: Sequence[str] = methods
     ) -> Levels:
         trained_on = preset.track.reference.replace("+", "-") if preset.track else ""
-        stem = "_".join(["tracking", preset.name.rpartition("/")[2], reference, trained_on])
+        stem = "_".join(["track", preset.name.rpartition("/")[2], reference, trained_on])
         return Levels(title, preset, Scenario(plant=plant, reference=reference), stem, methods, paper)
 
     if preset.track is not None and preset.track.observation != "state":
