@@ -15,7 +15,7 @@ from commands import retrim
 from helpers import random_command, random_state, tiny_preset
 from retrim import ConfigError, PlantError, Setup, changed
 from retrim.cli.reproduce import COMMANDS
-from retrim.config import named_presets
+from retrim.config import load, named_presets
 from retrim.config.baselines import BASELINES
 from retrim.experiments import Run, design, effort, provenance, tables
 from retrim.experiments.reporter import Silent
@@ -29,17 +29,26 @@ design_table, everything, phase_table, quick, vision_table = (
 pytestmark = pytest.mark.usefixtures("as_a_user")
 
 
-def test_every_baseline_has_a_range_for_every_setting_that_it_does_not_switch_off():
+def test_every_baseline_has_a_range_for_every_setting():
     for baseline in BASELINES.values():
-        assert {name for name, value in baseline.settings.items() if value} <= set(baseline.ranges)
+        assert set(baseline.settings) == set(baseline.settings_from_keypoints) == set(baseline.ranges)
         assert all(0.0 < low < high for low, high in baseline.ranges.values())
 
 
-def test_settings_are_those_that_the_published_search_found():
-    rows = json.loads((Path(__file__).parents[2] / "docs" / "results" / "tuning.json").read_text())["rows"]
+@pytest.mark.parametrize(("page", "field"), [("tuning", "settings"), ("tuning_keypoints", "settings_from_keypoints")])
+def test_settings_are_those_that_the_published_search_found(page, field):
+    rows = json.loads((Path(__file__).parents[2] / "docs" / "results" / f"{page}.json").read_text())["rows"]
     for name, baseline in BASELINES.items():
         best = min((row for row in rows if row["method"] == name), key=lambda row: row["score"])
-        assert baseline.settings == {key: float(f"{value:.3g}") for key, value in best["settings"].items()}
+        assert getattr(baseline, field) == {key: float(f"{value:.3g}") for key, value in best["settings"].items()}
+
+
+@pytest.mark.parametrize(
+    ("preset", "field"), [("hover/fast", "settings"), ("vision/retrim", "settings_from_keypoints")]
+)
+def test_a_baseline_flies_with_the_settings_for_what_it_is_shown(preset, field):
+    setup = Setup.of(load(preset))
+    assert all(each.settings_for(setup) is getattr(each, field) for each in BASELINES.values())
 
 
 def test_settings_are_searched_by_their_command(tmp_path):
@@ -223,4 +232,4 @@ def test_vision_flies_what_a_preset_can(tmp_path):
     said = retrim("reproduce", "vision", "--methods", "base", "datt", cwd=tmp_path, code=1)
     assert "--methods datt: it is trained by a measured state" in said
     said = retrim("reproduce", "vision", "--presets", "vision/paper", "--methods", "indi", cwd=tmp_path, code=1)
-    assert "'vision/paper': Incremental needs a state" in said
+    assert "method 'indi' needs the state, and preset 'vision/paper' shows keypoints" in said

@@ -45,8 +45,12 @@ class MethodRequest:
         """Return the policy behind the observation of flight."""
         return PolicyController(self.setup.flown.observation_in_flight, self.policy.merged())
 
-    def by_state(self, controller: AbstractController[Any]) -> AbstractController[Any]:
+    def by_state(self, controller: AbstractController[Any], called: str | None = None) -> AbstractController[Any]:
         """Return a controller that needs the state as it can be flown: by a pose filter where keypoints are seen.
+
+        Args:
+            controller: Any.
+            called: Name of the method, for a refusal; that of its class by default.
 
         Raises:
             ConfigError: The preset shows keypoints, and no filter makes a state of them.
@@ -55,9 +59,10 @@ class MethodRequest:
         if isinstance(seen, OccludedKeypoints):
             return SeenPose(seen, controller)
         if isinstance(seen, Keypoints):
+            name = called or type(controller).__name__
             raise ConfigError(
-                f"preset {self.setup.preset.name!r}: {type(controller).__name__} needs a state; with keypoints only a "
-                "pose filter gives one: set [vision] occlusion = true"
+                f"method {name!r} needs the state, and preset {self.setup.preset.name!r} shows keypoints, from which "
+                "only a pose filter gives one: set [vision] occlusion = true"
             )
         return controller
 
@@ -125,14 +130,14 @@ def _gravity_frame(request: MethodRequest) -> Pilot:
     return ControllerPilot(felt_frame(request.controller(), request.setup.preset))
 
 
-def _without_policy(baseline: Baseline, request: MethodRequest) -> Pilot:
-    return ControllerPilot(request.by_state(baseline.controller(request.setup, request.key)))
+def _without_policy(name: str, baseline: Baseline, request: MethodRequest) -> Pilot:
+    return ControllerPilot(request.by_state(baseline.controller(request.setup, request.key), name))
 
 
 def _datt(request: MethodRequest) -> Pilot:
     if not isinstance(request.policy, DattNet):
         raise ConfigError("method 'datt' flies a network of its own: `retrim reproduce hover --methods datt` trains it")
-    return ControllerPilot(request.by_state(datt_of(request.setup, request.policy)))
+    return ControllerPilot(request.by_state(datt_of(request.setup, request.policy), "datt"))
 
 
 def _raptor(request: MethodRequest) -> Pilot:
@@ -155,7 +160,7 @@ register_method("base", MethodEntry(_base, "base policy"))
 register_method("base-i", MethodEntry(_integral, "base policy + integral action"))
 register_method("base-do", MethodEntry(_gravity_frame, "base policy + disturbance observer"))
 for _name, _baseline in BASELINES.items():
-    register_method(_name, MethodEntry(partial(_without_policy, _baseline), _baseline.label))
+    register_method(_name, MethodEntry(partial(_without_policy, _name, _baseline), _baseline.label))
 register_method("datt", MethodEntry(_datt, "DATT"))
 register_method("raptor", MethodEntry(_raptor, "RAPTOR", on_board=raptor))
 register_method("full", MethodEntry(_full, "**adapted, all weights**"))
