@@ -57,8 +57,9 @@ def _ensemble(request: ResidualRequest, hidden: tuple[int, ...] = (128, 128)) ->
 
 
 def _regression(request: ResidualRequest) -> RegressionModel:
-    p, a = request.preset, request.preset.adapt
-    return RegressionModel.of(p.dt, memory=a.memory, thrust_prior=a.thrust_prior, tau=p.actuator_tau or 0.03)
+    p, a, v = request.preset, request.preset.adapt, request.vehicle
+    limits, tau = (v.command_min, v.command_max), p.actuator_tau or 0.03
+    return RegressionModel.of(p.dt, memory=a.memory, thrust_prior=a.thrust_prior, tau=tau, limits=limits)
 
 
 def _layered(request: ResidualRequest) -> ResidualModel:

@@ -10,7 +10,7 @@ from jax import random
 from helpers import random_command, random_field_flight, random_state, replaced, residual_targets
 from retrim.learn.residuals import RegressionModel, Targets
 from retrim.learn.residuals.regression import BLOCK, features_of
-from retrim.physics import PointMass, so3
+from retrim.physics import Command, PointMass, so3
 
 MODEL = RegressionModel.of(0.02, memory=0.5, noise=0.5)
 ENDLESS = replaced(MODEL, memory=jnp.array(1e9))
@@ -124,3 +124,29 @@ def test_the_spread_shrinks_with_data(key):
     narrow = MODEL.spread(fitted(MODEL, rows_of(jnp.zeros(10), key))[0], x, u)
     assert (np.asarray(narrow) < 0.2 * np.asarray(wide)).all()
     assert (np.asarray(narrow) > 0.0).all()
+
+
+LIMITS = Command(jnp.array(0.5), -10.0 * jnp.ones(3)), Command(jnp.array(40.5), 10.0 * jnp.ones(3))
+
+
+def test_commands_at_a_limit_tell_nothing(key):
+    """At the least thrust a mixer lifts by what it takes to turn: no gain of the thrust, and no bias of the rates."""
+    rows, model = rows_of(push(1.0, 0.0, 0.0), key), replaced(ENDLESS, limits=LIMITS)
+    at = jnp.arange(96) % 2 == 0
+    idle = jax.vmap(Command)(jnp.where(at, 1.0, rows.u.c), jnp.where(at[:, None], 9.5, rows.u.omega))
+    lifted = jnp.where(at[:, None], 10.0 * rows.x.R[:, :, 2], 0.0)
+    mixed = replaced(rows, u=idle, a_res=rows.a_res + lifted, omega=jnp.where(at[:, None], 0.0, rows.omega))
+    told, left = fitted(model, mixed)[0], fitted(model, replaced(mixed, valid=~at))[0]
+    jax.tree.map(np.testing.assert_array_equal, told, left)
+    np.testing.assert_allclose(told.mean, push(1.0, 0.0, 0.0), atol=0.05)
+    assert float(fitted(ENDLESS, mixed)[0].mean[3]) < -0.5  # the gain that would explain it
+
+
+def test_with_no_row_that_counts_it_knows_what_it_knew(key):
+    model = replaced(MODEL, limits=LIMITS)
+    known, _ = fitted(model, rows_of(push(1.0, 0.0, 0.0), key))
+    assert float(known.mean[0]) > 0.5
+    rows = rows_of(push(0.0, 2.0, 0.0), key)
+    idle = replaced(rows, u=jax.vmap(Command)(jnp.zeros(96), rows.u.omega))
+    state, _ = eqx.filter_jit(model.fit)(known, idle)
+    jax.tree.map(np.testing.assert_array_equal, state, known)

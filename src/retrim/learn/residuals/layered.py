@@ -61,7 +61,7 @@ class LayeredModel(eqx.Module):
         Returns:
             The new state, and the weighted error of what both predict [m/s^2].
         """
-        first, _, weight = self.first.fit_weighted(rows)
+        first, _, weight = self.first.fit_weighted(state.first, rows)
         left = rows.a_res - jax.vmap(lambda x, u: self.first.predict(first, x, u))(rows.x, rows.u)
         foretold = jax.vmap(lambda x, u: self._certain(state.second, x, u))(rows.x, rows.u)
         newest = (jnp.arange(weight.shape[0]) >= weight.shape[0] - BLOCK) & (weight > 0.0)

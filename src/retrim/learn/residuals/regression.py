@@ -1,14 +1,15 @@
 """A closed-form residual: Bayesian linear regression on physical features, with exponential forgetting."""
 
+import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from ...physics import so3
-from ...physics.state import STANDARD_GRAVITY, Command, State
+from ...physics.state import STANDARD_GRAVITY, Command, State, where
 from .rates import RateFit, RateModel
 from .targets import Targets
 
@@ -18,6 +19,8 @@ BLOCK = 8
 """Rows that are compared at once in the search for a change."""
 SURPRISE = 21.1
 """Of a chi-squared variable of three degrees of freedom, passed once in 10,000."""
+AT_LIMIT = 0.05
+"""A command this share of its range from a limit, or less, is at it."""
 
 
 class Normal(NamedTuple):
@@ -42,6 +45,9 @@ class RegressionModel(eqx.Module):
     a_res = d + R (k_c (c - g) e3 - k_1 v_b - k_2 |v_b| v_b), with v_b the velocity in the body frame and the products
     per axis. The thrust gain k_c acts on what exceeds hover thrust: at hover it cannot be told from a push along z,
     which d is. A fit is exact, takes less than a millisecond, and depends on the window alone, not on earlier fits.
+
+    Rows whose command is at a limit do not count. There the vehicle does not follow: at the least thrust, for example,
+    a mixer adds thrust to turn as fast as it is told. A gain that explains this reverses what thrust does.
     """
 
     prior: Float[Array, "10"]
@@ -54,10 +60,19 @@ class RegressionModel(eqx.Module):
     """What is wrong with body rates is no acceleration; it is identified beside."""
     dt: float = eqx.field(static=True)
     """Control tick [s]."""
+    limits: tuple[Command, Command] | None = None
+    """Smallest and largest command; None: commands have no limit."""
 
     @classmethod
     def of(
-        cls, dt: float, *, memory: float = 0.5, noise: float = 0.5, thrust_prior: float = 0.05, tau: float = 0.03
+        cls,
+        dt: float,
+        *,
+        memory: float = 0.5,
+        noise: float = 0.5,
+        thrust_prior: float = 0.05,
+        tau: float = 0.03,
+        limits: tuple[Command, Command] | None = None,
     ) -> "RegressionModel":
         """Return the model with priors that fit small and medium quadrotors.
 
@@ -67,9 +82,10 @@ class RegressionModel(eqx.Module):
             noise: Standard deviation of one row of targets [m/s^2]: of the sensors, and of what no feature explains.
             thrust_prior: Standard deviation of the thrust gain [-].
             tau: Most likely time constant of the body rates [s].
+            limits: Smallest and largest command; None: commands have no limit.
         """
         prior = jnp.array([5.0, 5.0, 5.0, thrust_prior, 0.3, 0.3, 0.3, 0.03, 0.03, 0.03])
-        return cls(prior, jnp.array(noise), jnp.array(memory), RateModel.of(dt, memory=memory, tau=tau), dt)
+        return cls(prior, jnp.array(noise), jnp.array(memory), RateModel.of(dt, memory=memory, tau=tau), dt, limits)
 
     def init(self, key: Key[Array, ""]) -> RegressionState:
         """Return the prior, which predicts zero; the key is not needed."""
@@ -83,18 +99,29 @@ class RegressionModel(eqx.Module):
         zero for what lies before a change: blocks of rows are compared with what the newest one predicts for them, and
         from the first that it does not explain (99.99 %) nothing older counts.
         """
-        del state  # the window says all: what is older has been forgotten
-        fitted, rms, _ = self.fit_weighted(rows)
+        fitted, rms, _ = self.fit_weighted(state, rows)
         return fitted, rms
 
-    def fit_weighted(self, rows: Targets) -> tuple[RegressionState, Float[Array, ""], Float[Array, " n"]]:
+    def fit_weighted(
+        self, state: RegressionState, rows: Targets
+    ) -> tuple[RegressionState, Float[Array, ""], Float[Array, " n"]]:
         """Fit as :meth:`fit`; also return how much each row counts: nothing, if invalid or from before a change."""
+        rows = dataclasses.replace(rows, valid=rows.valid & jax.vmap(self._followed)(rows.u))
         features = jax.vmap(features_of)(rows.x, rows.u)
         weight = self._weight(features, rows)
         posterior = self._posterior(features, rows.a_res, weight)
         error = jnp.sum((rows.a_res - features @ posterior.mean) ** 2, axis=1)
         rms = jnp.sqrt(jnp.sum(weight * error) / jnp.maximum(jnp.sum(weight), 1e-6))
-        return RegressionState(posterior.mean, posterior.covariance, self.rates.fit(rows)), rms, weight
+        fitted = RegressionState(posterior.mean, posterior.covariance, self.rates.fit(rows))
+        return where(jnp.any(rows.valid), fitted, state), rms, weight
+
+    def _followed(self, u: Command) -> Bool[Array, ""]:
+        """Whether no part of a command is at its limit."""
+        if self.limits is None:
+            return jnp.array(True)
+        ends = (jnp.concatenate([each.c[None], each.omega]) for each in (*self.limits, u))
+        low, high, asked = (end.astype(u.c.dtype) for end in ends)
+        return jnp.all(jnp.abs(asked - 0.5 * (low + high)) < (0.5 - AT_LIMIT) * (high - low))
 
     def _weight(self, features: Float[Array, "n 3 10"], rows: Targets) -> Float[Array, " n"]:
         age = jnp.arange(rows.valid.shape[0] - 1, -1, -1)
