@@ -1,0 +1,12 @@
+"""Conformance suites: what every plant, task, controller and residual model must do, as functions for anyone's tests.
+
+Each function raises ``AssertionError`` with the law that is broken::
+
+    def test_my_plant():
+        retrim.testing.check_plant(lambda: MyPlant())
+"""
+
+from .controller import check_controller as check_controller
+from .plant import check_plant as check_plant
+from .residual import check_residual as check_residual
+from .task import check_task as check_task

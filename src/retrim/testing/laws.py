@@ -1,0 +1,25 @@
+"""What the suites say of a law that is broken."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+def shapes(tree: Any) -> Any:
+    """Return structure, shapes and types of a pytree."""
+    return jax.tree.structure(tree), [(jnp.shape(leaf), jnp.result_type(leaf)) for leaf in jax.tree.leaves(tree)]
+
+
+def require(holds: bool, law: str) -> None:
+    """Raise ``AssertionError`` with the law unless it holds."""
+    if not holds:
+        raise AssertionError(f"broken law: {law}")
+
+
+def close(found: Any, expected: Any, tolerance: float, law: str) -> None:
+    """Raise ``AssertionError`` with the law if an element is further away than the tolerance, or not a number."""
+    away = float(np.max(np.abs(np.asarray(found) - np.asarray(expected))))
+    if not away <= tolerance:
+        raise AssertionError(f"broken law: {law}; found {np.asarray(found)}, expected {np.asarray(expected)}")

@@ -1,0 +1,50 @@
+"""What every residual model must do."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import random
+
+from ..learn.residuals.model import ResidualModel
+from ..learn.residuals.targets import Targets
+from ..physics.state import STANDARD_GRAVITY, Command, State
+from .laws import close, require, shapes
+
+
+def check_residual(model: ResidualModel, *, fits: int = 5, tolerance: float = 0.5) -> None:
+    """Check a residual model.
+
+    Args:
+        model: The model.
+        fits: Number of fits after which a constant acceleration must have been learnt.
+        tolerance: Largest error of its prediction then, as a share of the acceleration.
+
+    Raises:
+        AssertionError: A law does not hold.
+    """
+    require(isinstance(model, ResidualModel), "it has init, fit, predict and spread")
+    key, n = random.key(0), 60
+    k_p, k_v, k_u, k_init = random.split(key, 4)
+    p, v = (0.3 * random.normal(k, (n, 3)) for k in (k_p, k_v))
+    x = jax.vmap(State)(p + jnp.array([[0.0, 0.0, 1.0]]), jnp.broadcast_to(jnp.eye(3), (n, 3, 3)), v)
+    rates = 0.3 * random.normal(k_u, (n, 3))
+    u = jax.vmap(Command)(jnp.full(n, STANDARD_GRAVITY), rates)
+    wanted = jnp.array([1.0, -0.5, 0.8])
+    rows = Targets(x, u, jnp.broadcast_to(wanted, (n, 3)), rates, jnp.ones(n, dtype=bool))
+    state = model.init(k_init)
+    at, command = jax.tree.map(lambda leaf: leaf[0], (x, u))
+    close(model.predict(state, at, command), np.zeros(3), 1e-6, "a fresh state predicts zero")
+    fit, fitted = eqx.filter_jit(model.fit), state
+    for _ in range(fits):
+        fitted, rms = fit(fitted, rows)
+    require(shapes(fitted) == shapes(state), "a fit keeps the shapes of the state")
+    require(jnp.shape(rms) == () and bool(jnp.isfinite(rms)), "the error of a fit is a finite number")
+    size = float(jnp.linalg.norm(wanted))
+    close(model.predict(fitted, at, command), wanted, tolerance * size, "a constant acceleration is learnt")
+    spread = model.spread(fitted, at, command)
+    require(spread.shape == (3,) and bool((spread >= 0).all()), "the spread is three numbers, none negative")
+    nothing = Targets(x, u, rows.a_res, rates, jnp.zeros(n, dtype=bool))
+    kept, _ = fit(fitted, nothing)
+    finite = all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(eqx.filter(kept, eqx.is_array)))
+    require(finite, "a fit without a valid row stays finite")
