@@ -8,14 +8,16 @@ from jax import random
 
 from retrim.estimation.disturbance_observer import DisturbanceObserver
 from retrim.physics import Command, PointMass, State
+from retrim.physics.actuators import lagged
 
 DT, D = 0.02, jnp.array([1.5, -1.0, 2.0])
 
 
-def observed(observer, key, *, ticks=200, noise=0.0, late=0, turning=1.0, d=D):
+def observed(observer, key, *, ticks=200, noise=0.0, late=0, turning=1.0, d=D, thrust_tau=None):
     """Estimates while a vehicle tumbles under random commands that act ``late`` ticks after they were issued.
 
-    It turns ``turning`` times as fast as it is told to; its velocity is measured with ``noise`` [m/s].
+    It turns ``turning`` times as fast as it is told to, its thrust follows by ``thrust_tau`` [s], and its velocity is
+    measured with ``noise`` [m/s].
     """
     model = PointMass(DT)
     keys = random.split(key, ticks)
@@ -24,28 +26,29 @@ def observed(observer, key, *, ticks=200, noise=0.0, late=0, turning=1.0, d=D):
         return Command(9.81 + random.normal(k, ()), 2.0 * random.normal(random.fold_in(k, 1), (3,)))
 
     def tick(carry, xs):
-        s, x, queue = carry
+        s, x, queue, thrust = carry
         k, k_noise = xs
         u = command(k)
         s = observer.issued(s, u)
         queue = jax.tree.map(lambda old, new: jnp.concatenate([old[1:], new[None]]), queue, u)
         acting = jax.tree.map(lambda leaf: leaf[0], queue)
-        x = model.step(x, Command(acting.c, turning * acting.omega), d)
+        c, thrust = (acting.c, thrust) if thrust_tau is None else lagged(thrust, acting.c, DT, jnp.array(thrust_tau))
+        x = model.step(x, Command(c, turning * acting.omega), d)
         seen = State(x.p, x.R, x.v + noise * random.normal(k_noise, (3,)))
         s = observer(s, seen)
-        return (s, x, queue), (s.d_hat, s.noise)
+        return (s, x, queue, thrust), (s.d_hat, s.noise)
 
     x = State.at(jnp.zeros(3))
     hover = jax.tree.map(lambda leaf: jnp.stack([leaf] * (late + 1)), Command.hover(jnp.float64))
-    start = (observer.init(x), x, hover)
+    start = (observer.init(x), x, hover, hover.c[0])
     _, found = jax.lax.scan(tick, start, (keys, random.split(random.fold_in(key, 7), ticks)))
     return found
 
 
-def make(*, tau=0.05, wander=4.0, delay_ticks=0, limit=9.0):
-    return DisturbanceObserver(
-        PointMass(DT), jnp.array(tau), jnp.array(limit), jnp.array(wander), delay_ticks=delay_ticks
-    )
+def make(*, tau=0.05, wander=4.0, limit=9.0, thrust_tau=None, limits=None, delay_ticks=0):
+    thrust_tau = None if thrust_tau is None else jnp.array(thrust_tau)
+    numbers = (jnp.array(each) for each in (tau, limit, wander))
+    return DisturbanceObserver(PointMass(DT), *numbers, thrust_tau, limits, delay_ticks=delay_ticks)
 
 
 @pytest.mark.parametrize(("late", "turning"), [(0, 1.0), (2, 1.0), (0, 0.5)])
@@ -54,6 +57,38 @@ def test_without_noise_it_is_a_low_pass_of_what_acts(late, turning, key):
     found, _ = observed(make(delay_ticks=late, wander=np.inf), key, ticks=40, late=late, turning=turning)
     expected = np.asarray(D) * (1.0 - np.exp(-DT / 0.05 * np.arange(1, 41)))[:, None]
     np.testing.assert_allclose(found, expected, atol=2e-3 if turning == 1.0 else 2e-2)
+
+
+@pytest.mark.parametrize("late", [0, 2])
+def test_thrust_that_follows_late_is_no_disturbance(late, key):
+    """As long as the lag is declared; otherwise each change of thrust passes for one."""
+    calm = {"late": late, "thrust_tau": 0.04, "ticks": 60, "d": jnp.zeros(3)}
+    told, _ = observed(make(delay_ticks=late, wander=np.inf, thrust_tau=0.04), key, **calm)
+    untold, _ = observed(make(delay_ticks=late, wander=np.inf), key, **calm)
+    assert float(jnp.abs(told).max()) < 2e-3
+    assert float(jnp.abs(untold).max()) > 0.3
+
+
+def test_while_a_command_at_a_limit_acts_the_estimate_is_held(key):
+    """A mixer that lifts the vehicle although it is told to idle is not the wind."""
+    limits = Command(jnp.array(0.2), -10.0 * jnp.ones(3)), Command(jnp.array(40.0), 10.0 * jnp.ones(3))
+    observer, model, hover = make(limits=limits), PointMass(DT), Command.hover(jnp.float64)
+    idle = Command(jnp.array(0.3), jnp.array([9.9, 0.0, 0.0]))
+
+    def tick(carry, told):
+        s, x, acting = carry
+        at_limit = acting.c < 1.0
+        lifted = jnp.where(at_limit, 1.0, 0.0) * 9.0 * x.R[:, 2]
+        x = model.step(x, acting, D + lifted)
+        s = observer.issued(observer(s, x), told)
+        return (s, x, told), (s.d_hat, at_limit)
+
+    told = [hover] * 50 + [idle] * 20 + [hover] * 50
+    x = State.at(jnp.zeros(3))
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *told)
+    _, (found, at_limit) = jax.lax.scan(tick, (observer.init(x), x, hover), stacked)
+    np.testing.assert_allclose(found[51:], jnp.broadcast_to(D, found[51:].shape), atol=0.02)
+    assert int(at_limit.sum()) == 20
 
 
 def test_the_estimated_noise_is_that_of_the_velocities(key):

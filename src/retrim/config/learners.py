@@ -21,6 +21,7 @@ from ..learn.residuals.model import FittedResidual, ResidualModel
 from ..physics.actuators import Lagged
 from ..physics.dynamics import AbstractDynamics, PointMass
 from ..physics.felt_frame import FeltFrame
+from ..physics.vehicle import Vehicle
 from ..tasks.keypoints import Keypoints
 from ..tasks.occluded import OccludedKeypoints
 from ..tasks.task import AbstractTask
@@ -100,13 +101,14 @@ def check_frame(preset: Preset, task: AbstractTask) -> None:
 
 
 def felt_frame(
-    controller: AbstractController[Any], preset: Preset, known: FittedResidual | None = None
+    controller: AbstractController[Any], preset: Preset, vehicle: Vehicle, known: FittedResidual | None = None
 ) -> GravityFrame | SeenFrame:
     """Return a controller, flown in the gravity that is felt: by a disturbance observer, or by its own pose filter.
 
     Args:
         controller: It can be turned.
-        preset: Its control period and declared delay are those of the observer.
+        preset: Its control period, declared delay and declared lag are those of the observer.
+        vehicle: Its limits, too.
         known: What was learnt of the residual and of the body rates; the observer sees the rest. A pose filter sees
             it all.
     """
@@ -114,7 +116,13 @@ def felt_frame(
     if isinstance(controller, PolicyController) and isinstance(controller.observation, OccludedKeypoints):
         return SeenFrame(controller, limit)
     observer = DisturbanceObserver(
-        PointMass(preset.dt), jnp.array(OBSERVER_TAU), limit, jnp.array(WANDER), delay_ticks=preset.plant_delay_ticks
+        PointMass(preset.dt),
+        jnp.array(OBSERVER_TAU),
+        limit,
+        jnp.array(WANDER),
+        None if preset.actuator_tau is None else jnp.array(preset.actuator_tau),
+        (vehicle.command_min, vehicle.command_max),
+        delay_ticks=preset.plant_delay_ticks,
     )
     found = None if known is None else known.turning
     bias = jnp.zeros(3) if found is None else found.bias

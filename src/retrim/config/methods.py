@@ -127,7 +127,7 @@ def _integral(request: MethodRequest) -> Pilot:
 
 def _gravity_frame(request: MethodRequest) -> Pilot:
     check_frame(request.setup.preset, request.setup.env.task)
-    return ControllerPilot(felt_frame(request.controller(), request.setup.preset))
+    return ControllerPilot(felt_frame(request.controller(), request.setup.preset, request.setup.vehicle))
 
 
 def _without_policy(name: str, baseline: Baseline, request: MethodRequest) -> Pilot:

@@ -173,7 +173,7 @@ class Setup:
         if self.preset.adapt.frame == "world":
             return plain
         known = FittedResidual(self.learner.residual_model, state.residual)
-        return felt_frame(plain, self.preset, known)
+        return felt_frame(plain, self.preset, self.vehicle, known)
 
     def low_rank(self, policy: Policy | LoraPolicy, key: Key[Array, ""]) -> LoraPolicy:
         """Return ``policy`` with a fresh low-rank delta (ranks 4, 10, 1 and scale 4, as in the paper).

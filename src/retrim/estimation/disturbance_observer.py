@@ -10,6 +10,8 @@ with the poles z and w. One of them belongs to the time constant that a vehicle'
 The other has the bandwidth of the steady Kalman filter for a disturbance that wanders by q sqrt(t) and velocities of
 noise r per tick, (q / (r sqrt(dt)))^(1/2) [rad/s]; r is that of the last second. Without noise z is zero, and the
 observer is a first-order low-pass of what the model missed in each tick.
+
+While a command at a limit acts, what the vehicle does is no disturbance: d and r are held, and v is what is measured.
 """
 
 import dataclasses
@@ -20,8 +22,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..physics import so3
+from ..physics.actuators import is_followed, lagged
 from ..physics.dynamics import AbstractDynamics
-from ..physics.state import Command, State
+from ..physics.state import Command, State, where
 
 NOISE_TAU = 1.0  # [s], memory of the estimated noise
 SECOND_DIFFERENCE = 1.954  # mean magnitude of the second difference of white noise, in standard deviations
@@ -42,6 +45,8 @@ class ObserverState(eqx.Module):
     """What the model missed in the last tick by the measured velocities alone, world [m/s^2]."""
     noise: Float[Array, ""]
     """Estimated standard deviation of a measured velocity per axis [m/s]."""
+    thrust: Float[Array, ""]
+    """Thrust that acts at the end of the last tick, behind the lag [m/s^2]."""
 
 
 class DisturbanceObserver(eqx.Module):
@@ -54,6 +59,10 @@ class DisturbanceObserver(eqx.Module):
     """Largest norm of the estimate [m/s^2]."""
     wander: Float[Array, ""]
     """Standard deviation per axis of what the disturbance becomes within a second [m/s^2]; infinite: noise is none."""
+    thrust_tau: Float[Array, ""] | None = None
+    """Time constant with which thrust follows its command [s]; None: at once."""
+    limits: tuple[Command, Command] | None = None
+    """Smallest and largest command; None: commands have no limit."""
     delay_ticks: int = eqx.field(static=True, default=0)
     """Declared command delay of the plant [ticks]."""
 
@@ -61,16 +70,19 @@ class DisturbanceObserver(eqx.Module):
         """Return the memory of a vehicle that hovers at ``x`` undisturbed."""
         zero = jnp.zeros_like(x.p)
         commands = (Command.hover(x.p.dtype),) * (self.delay_ticks + 1)
-        return ObserverState(x, commands, x.v, zero, zero, jnp.zeros_like(x.p[0]))
+        return ObserverState(x, commands, x.v, zero, zero, jnp.zeros_like(x.p[0]), commands[0].c)
 
     def __call__(self, s: ObserverState, x: State) -> ObserverState:
         """Return the memory with the estimate corrected by the newly measured state ``x``.
 
         Call it once per tick, then :meth:`issued` with the command of the new tick.
         """
-        nominal, dt = self.nominal, self.nominal.dt
+        nominal, dt, given = self.nominal, self.nominal.dt, s.commands[0]
+        mean, thrust = given.c, given.c
+        if self.thrust_tau is not None:
+            mean, thrust = lagged(s.thrust, given.c, dt, self.thrust_tau.astype(x.p.dtype))
         # The vehicle turned as it was measured to turn, whatever rates it was told.
-        u = Command(s.commands[0].c, so3.log(so3.mul(s.last.R.T, x.R)) / dt)
+        u = Command(mean, so3.log(so3.mul(s.last.R.T, x.R)) / dt)
         gained = nominal.state(nominal.step(nominal.init(s.last), u, jnp.zeros_like(x.p))).v - s.last.v
         missed = (x.v - s.last.v - gained) / dt
         noise = self._noise(s, missed)
@@ -81,7 +93,11 @@ class DisturbanceObserver(eqx.Module):
         d_hat = s.d_hat + (1.0 - z) * (1.0 - w) * innovation / dt
         norm = jnp.sqrt(jnp.sum(d_hat * d_hat) + 1e-12)
         d_hat = d_hat * jnp.minimum(1.0, self.limit / norm)
-        return ObserverState(x, s.commands, predicted + (1.0 - z * w) * innovation, d_hat, missed, noise)
+        after = ObserverState(x, s.commands, predicted + (1.0 - z * w) * innovation, d_hat, missed, noise, thrust)
+        if self.limits is None:
+            return after
+        held = dataclasses.replace(after, v=x.v, d_hat=s.d_hat, missed=s.missed, noise=s.noise)
+        return where(is_followed(given, self.limits), after, held)
 
     def issued(self, s: ObserverState, u: Command) -> ObserverState:
         """Return the memory after the command ``u`` was issued for the tick that begins."""

@@ -5,10 +5,12 @@ from typing import Generic, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from .dynamics import AbstractDynamics, AbstractWrapper
 from .state import Command, State
+
+AT_LIMIT = 0.05  # a command this share of its range from a limit, or less, is at it
 
 X = TypeVar("X")
 U = TypeVar("U")
@@ -39,6 +41,20 @@ def lagged(acting: U, u: U, dt: float, tau: Float[Array, ""]) -> tuple[U, U]:
         jax.tree.map(lambda old, new, share=share: new + share * (old - new), acting, u) for share in (left, decay)
     )
     return mean, end
+
+
+def is_followed(u: Command, limits: tuple[Command, Command]) -> Bool[Array, ""]:
+    """Return whether no part of a command is at a limit, where vehicles do something else.
+
+    At the least thrust, for example, a mixer adds thrust to turn as fast as it is told.
+
+    Args:
+        u: Command.
+        limits: Smallest and largest command.
+    """
+    low, high, asked = (jnp.concatenate([each.c[None], each.omega]) for each in (*limits, u))
+    inside = jnp.abs(asked - 0.5 * (low + high)) < (0.5 - AT_LIMIT) * (high - low)
+    return jnp.all(inside)
 
 
 class RateBiased(AbstractWrapper[X]):

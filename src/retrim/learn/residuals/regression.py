@@ -1,14 +1,16 @@
 """A closed-form residual: Bayesian linear regression on physical features, with exponential forgetting."""
 
 import dataclasses
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Float, Int, Key
 
 from ...physics import so3
+from ...physics.actuators import is_followed
 from ...physics.state import STANDARD_GRAVITY, Command, State, where
 from .rates import RateFit, RateModel
 from .targets import Targets
@@ -19,8 +21,6 @@ BLOCK = 8
 """Rows that are compared at once in the search for a change."""
 SURPRISE = 21.1
 """Of a chi-squared variable of three degrees of freedom, passed once in 10,000."""
-AT_LIMIT = 0.05
-"""A command this share of its range from a limit, or less, is at it."""
 
 
 class Normal(NamedTuple):
@@ -46,8 +46,8 @@ class RegressionModel(eqx.Module):
     per axis. The thrust gain k_c acts on what exceeds hover thrust: at hover it cannot be told from a push along z,
     which d is. A fit is exact, takes less than a millisecond, and depends on the window alone, not on earlier fits.
 
-    Rows whose command is at a limit do not count. There the vehicle does not follow: at the least thrust, for example,
-    a mixer adds thrust to turn as fast as it is told. A gain that explains this reverses what thrust does.
+    Rows whose command is at a limit do not count: a gain that explains what a mixer does there reverses what thrust
+    does.
     """
 
     prior: Float[Array, "10"]
@@ -106,7 +106,9 @@ class RegressionModel(eqx.Module):
         self, state: RegressionState, rows: Targets
     ) -> tuple[RegressionState, Float[Array, ""], Float[Array, " n"]]:
         """Fit as :meth:`fit`; also return how much each row counts: nothing, if invalid or from before a change."""
-        rows = dataclasses.replace(rows, valid=rows.valid & jax.vmap(self._followed)(rows.u))
+        if self.limits is not None:
+            followed = jax.vmap(partial(is_followed, limits=self.limits))(rows.u)
+            rows = dataclasses.replace(rows, valid=rows.valid & followed)
         features = jax.vmap(features_of)(rows.x, rows.u)
         weight = self._weight(features, rows)
         posterior = self._posterior(features, rows.a_res, weight)
@@ -114,14 +116,6 @@ class RegressionModel(eqx.Module):
         rms = jnp.sqrt(jnp.sum(weight * error) / jnp.maximum(jnp.sum(weight), 1e-6))
         fitted = RegressionState(posterior.mean, posterior.covariance, self.rates.fit(rows))
         return where(jnp.any(rows.valid), fitted, state), rms, weight
-
-    def _followed(self, u: Command) -> Bool[Array, ""]:
-        """Whether no part of a command is at its limit."""
-        if self.limits is None:
-            return jnp.array(True)
-        ends = (jnp.concatenate([each.c[None], each.omega]) for each in (*self.limits, u))
-        low, high, asked = (end.astype(u.c.dtype) for end in ends)
-        return jnp.all(jnp.abs(asked - 0.5 * (low + high)) < (0.5 - AT_LIMIT) * (high - low))
 
     def _weight(self, features: Float[Array, "n 3 10"], rows: Targets) -> Float[Array, " n"]:
         age = jnp.arange(rows.valid.shape[0] - 1, -1, -1)
