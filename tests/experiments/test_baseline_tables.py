@@ -120,6 +120,7 @@ def test_all_tables_go_on_where_they_were_killed(tmp_path, monkeypatch):
     made, dying = [], [True]
 
     def one(run, reporter, *, size=0):
+        assert run.trained == tmp_path  # networks of DATT serve all tables
         made.append(("one", size))
 
     def two(run, reporter, *, size=0):

@@ -58,12 +58,12 @@ def steps_made(steps: int) -> int:
 def trained_datt(
     preset: Preset, seeds: Sequence[int], run: Run, reporter: Reporter, *, steps: int = DATT_STEPS
 ) -> dict[int, DattNet]:
-    """Return a network for each seed; those that the run's folder has are not trained again.
+    """Return a network for each seed; those that ``run.trained`` has are not trained again.
 
     Args:
         preset: Vehicle, control period and declared lag.
         seeds: Seeds of networks, references and episodes.
-        run: Its folder keeps the networks; an interruption leaves out the seeds that are not complete.
+        run: Its ``trained`` keeps the networks; an interruption leaves out the seeds that are not complete.
         reporter: Receives progress.
         steps: Steps of training.
     """
@@ -74,7 +74,7 @@ def trained_datt(
     for seed in seeds:
         if run.interrupted:
             break
-        path = run.folder / f"datt_{name}_seed{seed}.safetensors"
+        path = run.trained / f"datt_{name}_seed{seed}.safetensors"
         key = random.fold_in(random.key(seed), DATT_TAG)
         k_net, k_learn = random.split(key)
         net: DattNet = eqx.filter_jit(DattNet.of)(key=k_net)

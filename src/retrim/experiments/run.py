@@ -24,7 +24,13 @@ class Run:
     """
 
     def __init__(
-        self, command: str, out: Path | None = None, *, stop: threading.Event | None = None, remark: str = ""
+        self,
+        command: str,
+        out: Path | None = None,
+        *,
+        stop: threading.Event | None = None,
+        remark: str = "",
+        trained: Path | None = None,
     ) -> None:
         """Choose the folder and check that it can be written.
 
@@ -33,12 +39,14 @@ class Run:
             out: The folder.
             stop: Set when the run should end early.
             remark: What its documents say of how they were made.
+            trained: Folder of networks that take long to train, for several runs; the run's own by default.
 
         Raises:
             ConfigError: The folder cannot be written.
         """
         self.folder = out or Path("runs") / f"{command}-{datetime.now():%Y%m%d-%H%M%S}"
         self.remark = remark
+        self.trained = trained or self.folder
         self.watch = Stopwatch()
         self.replaces = out is not None and any(self.folder.glob("*.json"))
         self.stop = stop or threading.Event()

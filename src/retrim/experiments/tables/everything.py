@@ -37,7 +37,7 @@ PLAN: tuple[tuple[Callable[..., None], str, Options], ...] = (
     (transfer, "Sec. IV-D", {}),
     (raptor, "beside RAPTOR", {}),
     (model, "the plant", {}),
-    (plants, "other plants", {}),
+    (plants, "other plants", {"starts": 4}),
 )
 """Table, what of the paper it is, and its options."""
 QUICK_LEAVES_OUT = (phase, plants)
@@ -66,7 +66,7 @@ def everything(run: Run, reporter: Reporter, *, quick: bool = False) -> None:
             options = {**options, **QUICK[name]}
         folder = f"quick/{name}" if quick else name
         row: dict[str, Any] = {"table": name, "what": what, "page": f"{folder}/{name}.md"}
-        part = Run("reproduce", run.folder / folder, stop=run.stop, remark=run.remark)
+        part = Run("reproduce", run.folder / folder, stop=run.stop, remark=run.remark, trained=run.folder)
         done = run.folder / FOLDER / f"{section_key(table=name, options=options)}.done"
         if done.is_file() and (run.folder / row["page"]).is_file() and is_committed():
             reporter.say(f"{name}: as an earlier run of this folder has made it")
