@@ -228,6 +228,20 @@ def test_low_rank_updates_leave_the_base(setup, window, key):
     assert sizes < 3 * sum(leaf.size for leaf in jax.tree.leaves(policy.delta)) + 10
 
 
+def test_a_low_rank_delta_has_a_learning_rate_of_its_own(window, key):
+    """Adam's first step is as long as the rate; all weights keep theirs."""
+    setup = Setup.of(tiny_preset(adapt={"num_updates": 1, "low_rank_learning_rate": 0.04}))
+    policy, learner = setup.new_policy(key), setup.learner
+    steps = {}
+    for name, each in {"full": policy, "lora": setup.low_rank(policy, key)}.items():
+        state = learner.init(each, key)
+        after, _ = learner.update_policy(state.policy, state.residual, window, random.key(1))
+        moved = jax.tree.map(lambda a, b: float(jnp.abs(a - b).max()), after.policy.params, each.params)
+        steps[name] = max(jax.tree.leaves(moved))
+    assert steps["lora"] == pytest.approx(0.04, rel=1e-3)
+    assert steps["full"] == pytest.approx(setup.preset.adapt.learning_rate, rel=1e-3)
+
+
 @pytest.mark.parametrize("name", ["ensemble", "regression", "layered"])
 def test_what_was_learnt_has_the_types_of_nothing_learnt(window, name, key):
     """Weak types, too: a program that took the first state must not be compiled again for the second, in flight."""

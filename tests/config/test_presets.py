@@ -81,7 +81,7 @@ def test_several_mistakes_are_all_named():
 DEFAULTS = {
     "pretrain": (300, 100, 150, 5e-3, 0.999, None, (512, 512), math.pi),
     "adapt": (
-        *(100, "ensemble", 0.5, 0.05, 3.0, 100, 1e-2, 1e-3, 5.0, 30, 10, 1e-3, None, "fresh", None, 0.1, "world"),
+        *(100, "ensemble", 0.5, 0.05, 3.0, 100, 1e-2, 1e-3, 5.0, 30, 10, 1e-3, None, None, "fresh", None, 0.1, "world"),
         *("free", 0.2, 1.0),
     ),
     "rest": ("small", 0.02, (0.0, 0.0, 1.0), 5.0, 0, 0, 1, None),
@@ -106,6 +106,7 @@ OURS = {
             "update_every": 0.5,
             "num_updates": 5,
             "learning_rate": 1e-4,
+            "low_rank_learning_rate": 3e-4,
             "max_grad_norm": 1.0,
             "optimiser": "carried",
             "task_starts": 2,

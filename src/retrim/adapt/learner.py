@@ -62,6 +62,8 @@ class OnlineLearner(eqx.Module):
     """Coordinates in which the policy is trained, and flown."""
     trim: AbstractTrim = Untrimmed()
     """What it commands at rest after an update."""
+    low_rank_optimiser: AbstractPolicyOptimiser | None = None
+    """What re-trains a low-rank delta, of the same kind as ``optimiser``; None: the same."""
 
     def __check_init__(self) -> None:
         """Raise ``ValueError`` for sizes that cannot work."""
@@ -113,8 +115,9 @@ class OnlineLearner(eqx.Module):
         corrected = self.view(self.env, FittedResidual(self.residual_model, residual))
         k_train, k_gate, k_window = random.split(key, 3)
         x0 = self.starts(self.env.task, window, k_train, self.num_updates, self.num_envs)
-        begun = self.optimiser.begin(state, self.num_updates)
-        stepped, _ = bptt(begun, corrected, x0, optimiser=self.optimiser.transformation(self.num_updates))
+        optimiser = (isinstance(state.policy, LoraPolicy) and self.low_rank_optimiser) or self.optimiser
+        begun = optimiser.begin(state, self.num_updates)
+        stepped, _ = bptt(begun, corrected, x0, optimiser=optimiser.transformation(self.num_updates))
         trained = PolicyState(self.trim(stepped.policy, corrected, window), stepped.optimiser)
         held_out = jax.tree.map(
             lambda a, b: jnp.concatenate([a, b]),

@@ -62,16 +62,19 @@ def make_learner(preset: Preset, model: ResidualModel, env: Env) -> OnlineLearne
     if a.trim == "rest" and find_task(preset.task).has_reference:
         raise ConfigError(f"adapt.trim = 'rest' is for a task that rests at home, not for {preset.task!r}")
     adam = CarriedAdam if a.optimiser == "carried" else FreshAdam
+    rates = (a.learning_rate, a.low_rank_learning_rate or a.learning_rate)
+    optimiser, low_rank = (adam(jnp.array(rate), jnp.array(a.max_grad_norm or math.inf)) for rate in rates)
     return OnlineLearner(
         env,
         model,
-        adam(jnp.array(a.learning_rate), jnp.array(a.max_grad_norm or math.inf)),
+        optimiser,
         plant_delay_ticks=preset.plant_delay_ticks,
         num_updates=a.num_updates,
         num_envs=a.num_envs,
         starts=TaskStarts() if a.task_starts is None else FlownStarts(jnp.array(a.start_noise), a.task_starts),
         view=_view(preset, env.task),
         trim=RestTrim() if a.trim == "rest" else Untrimmed(),
+        low_rank_optimiser=low_rank,
     )
 
 

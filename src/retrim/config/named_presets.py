@@ -44,8 +44,9 @@ RETRIM = dataclasses.replace(
     reward="l2",
     pretrain=dataclasses.replace(FAST.pretrain, num_updates=300, learning_rate=3e-3, hidden_sizes=(128, 128)),
     adapt=Adapt(
-        residual="regression", fit_every=0.2, update_every=0.5, num_updates=5, learning_rate=1e-4, max_grad_norm=1.0,
-        optimiser="carried", task_starts=2, frame="gravity", trim="rest", fit_latency=0.02, update_latency=0.1,
+        residual="regression", fit_every=0.2, update_every=0.5, num_updates=5, learning_rate=1e-4,
+        low_rank_learning_rate=3e-4, max_grad_norm=1.0, optimiser="carried", task_starts=2, frame="gravity",
+        trim="rest", fit_latency=0.02, update_latency=0.1,
     ),
 )  # fmt: skip
 

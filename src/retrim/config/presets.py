@@ -72,6 +72,8 @@ class Adapt:
     """Starts per step."""
     learning_rate: LearningRate = 1e-3
     """Adam's rate at the start of an update; it falls to zero along a cosine."""
+    low_rank_learning_rate: LearningRate | None = None
+    """The same of LoRA; that of all weights by default. A few directions have to do what all weights do."""
     max_grad_norm: Positive | None = None
     """Largest norm of a gradient; none is clipped by default."""
     optimiser: Literal["fresh", "carried"] = "fresh"
