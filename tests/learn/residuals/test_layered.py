@@ -106,3 +106,15 @@ def test_it_knows_how_the_vehicle_turns_as_the_closed_form_does(key):
     rows = eqx.tree_at(lambda r: r.omega, rows, rows.omega + jnp.array([[0.3, 0.0, -0.2]]))
     state, _ = fit(MODEL.init(key), rows)
     np.testing.assert_allclose(MODEL.turning(state).bias, [0.3, 0.0, -0.2], atol=0.02)
+
+
+def test_with_no_row_that_counts_it_knows_what_it_knew(key):
+    """Neither layer learns, nor forgets, while commands are at a limit."""
+    limits = Command(jnp.array(5.0), -10.0 * jnp.ones(3)), Command(jnp.array(25.0), 10.0 * jnp.ones(3))
+    model = LayeredModel(RegressionModel.of(0.02, limits=limits), SECOND)
+    limited, rows = eqx.filter_jit(model.fit), rows_of(jet, key)
+    known, _ = limited(model.init(key), rows)
+    idle = Targets(rows.x, jax.vmap(Command)(jnp.full(N, 5.1), rows.u.omega), rows.a_res, rows.omega, rows.valid)
+    after, rms = limited(known, idle)
+    jax.tree.map(np.testing.assert_array_equal, eqx.filter(after, eqx.is_array), eqx.filter(known, eqx.is_array))
+    assert float(rms) == 0.0

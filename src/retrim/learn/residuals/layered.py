@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
-from ...physics.state import Command, State
+from ...physics.state import Command, State, where
 from .ensemble import EnsembleModel, EnsembleState
 from .rates import RateFit
 from .regression import BLOCK, RegressionModel, RegressionState
@@ -72,7 +72,7 @@ class LayeredModel(eqx.Module):
         fitted = LayeredState(first, second, agreed, squared, _smooth(left, weight))
         error = left - fitted.share * jax.vmap(lambda x, u: self._certain(second, x, u))(rows.x, rows.u)
         mean_square = jnp.sum(weight * jnp.sum(error**2, axis=1)) / jnp.maximum(jnp.sum(weight), 1e-6)
-        return fitted, jnp.sqrt(mean_square)
+        return where(jnp.any(weight > 0.0), fitted, state), jnp.sqrt(mean_square)
 
     def predict(self, state: LayeredState, x: State, u: Command) -> Float[Array, "3"]:
         """Return the prediction of the closed form and the share of the ensemble's [m/s^2]."""
