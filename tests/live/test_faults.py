@@ -125,7 +125,7 @@ def test_a_flight_without_faults(tmp_path, controller):
 def test_each_process_is_killed_at_a_random_time(tmp_path, controller, role, seed):
     at = np.random.default_rng([seed, len(role)]).uniform(0.0, SECONDS)
     status, events, took, punctual = flown(spec_in(tmp_path, controller), role, at)
-    rows = whole_log(tmp_path, status)
+    rows = whole_log(tmp_path, None if role == "control" else status)  # what it counted after its last report is lost
     if role == "plant":
         assert status.ended.startswith("the plant process is gone")
         assert abs(rows[-1, 1] - at) < 0.3
