@@ -26,7 +26,7 @@ QUICK: dict[str, Options] = {
     "model": {},
 }
 """By table: options that are smaller."""
-REMARK = "A quick look: one training seed, two starts, short flights; figures to look at, not to quote."
+REMARK = "A quick look: fewer seeds and starts, and shorter flights, than the table has; to look at, not to quote."
 
 
 def options_of(make: Callable[..., None]) -> list[Parameter]:
