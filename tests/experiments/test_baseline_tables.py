@@ -177,7 +177,7 @@ def test_a_table_whose_package_is_missing_is_said_to_be_left_out(tmp_path, monke
 
 def test_every_table_of_the_plan_has_the_options_that_are_planned():
     for make, _, full in everything.PLAN:
-        assert {*full, *quick.QUICK[make.__name__]} <= set(inspect.signature(make).parameters), make.__name__
+        assert {*full, *quick.QUICK.get(make.__name__, {})} <= set(inspect.signature(make).parameters), make.__name__
     assert "all" in COMMANDS
 
 
@@ -189,7 +189,7 @@ def test_every_table_of_the_paper_has_a_quick_look_of_options_that_it_has():
         options = {each.name: each.default for each in quick.options_of(made[name])}
         assert options["quick"] is False
         assert set(smaller) <= set(options), name
-        assert not smaller or any(options[option] != value for option, value in smaller.items()), name
+        assert any(options[option] != value for option, value in smaller.items()), name
 
 
 def test_a_quick_look_takes_less_of_what_nobody_asked_for(tmp_path):

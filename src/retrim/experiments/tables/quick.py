@@ -23,10 +23,9 @@ QUICK: dict[str, Options] = {
     "plants": {**SHORT, "plant": ("bem", "simple")},
     "ablation": {**FEW, "seconds": 14.0},
     "tuning": {"candidates": 12, "starts": 1, "methods": ("geometric", "geometric-i", "indi")},
-    "model": {},
 }
 """By table: options that are smaller."""
-REMARK = "A quick look: fewer seeds and starts, and shorter flights, than the table has; to look at, not to quote."
+REMARK = "A quick look, smaller than the table: figures to look at, not to quote."
 
 
 def options_of(make: Callable[..., None]) -> list[Parameter]:
