@@ -91,19 +91,20 @@ def tuning(
         "table flies these conditions, starts or seeds."
     )
     document = Document(run, "tuning", "Settings of the baselines", intro, [], reporter)
+    setups = [Setup.of(load(preset), reference) for preset, *_, reference in conditions]
     for name in methods:
         if run.interrupted:
             break
         baseline = BASELINES[name]
-        present = baseline.settings if shown == "state" else baseline.settings_from_keypoints
-        tried = [dict(present), *_drawn(baseline, -(-candidates // baseline.cost), seed)]
+        tried = [dict(baseline.settings_for(setups[0])), *_drawn(baseline, -(-candidates // baseline.cost), seed)]
         with contextlib.suppress(FlightStopped), run.interruptible(), reporter.progress(name) as advance:
             scores = np.zeros(len(tried))
-            for i, (preset, disturbed, sensors, reference) in enumerate(conditions):
+            for i, (setup, (_, disturbed, sensors, reference)) in enumerate(zip(setups, conditions, strict=True)):
                 scenario = Scenario(disturbed, plant, sensors=sensors, reference=reference)
                 advance(i / len(conditions), f"condition {i + 1} of {len(conditions)}")
-                found = _flown(baseline, tried, Setup.of(load(preset), scenario.reference), scenario,
-                               starts=starts, seconds=seconds, seed=seed, stop=run.stop)  # fmt: skip
+                found = _flown(
+                    baseline, tried, setup, scenario, starts=starts, seconds=seconds, seed=seed, stop=run.stop
+                )
                 scores += np.array(found) / len(conditions)
             document.add(_section(name, tried, scores), _rows(name, tried, scores))
     document.write()
