@@ -10,3 +10,4 @@ from .controller import check_controller as check_controller
 from .plant import check_plant as check_plant
 from .residual import check_residual as check_residual
 from .task import check_task as check_task
+from .vehicle import check_vehicle as check_vehicle

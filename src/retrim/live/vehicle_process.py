@@ -1,0 +1,91 @@
+"""The process of a link to a vehicle: it carries samples and commands, and time does not wait for it."""
+
+import math
+import signal
+import sys
+import time
+from types import FrameType
+
+import numpy as np
+
+from ..errors import PlantError
+from ..onboard.guard import HOVER
+from ..onboard.messages import Sample, last_note, pack_note
+from ..onboard.realtime import Lifeline, be_punctual
+from ..plants.bridges.frames import heading_of
+from ..plants.bridges.vehicle_plant import VehiclePlant
+from ..plants.bridges.vehicle_state import VehicleState
+from ..transport.bus import Bus
+from ..transport.shared_memory import SharedMemoryBus
+from .plant_process import ALONE, SHARE, PlantPlan, answer
+
+HOLD_S = 0.05  # [s] for which the autopilot holds before the order to begin is looked for again
+
+
+def fly(plan: PlantPlan) -> None:
+    """Take off, carry until the vehicle has landed, and leave it to its autopilot: the main function of the process."""
+    signal.signal(signal.SIGTERM, _ended)  # the vehicle is left to its autopilot all the same
+    bus, parent = SharedMemoryBus(plan.folder), Lifeline(plan.parent)
+
+    def wanted() -> bool:
+        return not parent.gone() and last_note(bus, "order").get("order") != "land"
+
+    try:
+        with plan.scenario.make(plan.vehicle, dt=plan.dt, seed=plan.seed) as plant:
+            if not isinstance(plant, VehiclePlant):
+                raise PlantError(f"plant {plan.scenario.plant!r} is no VehiclePlant")
+            plant.connect(wanted)
+            refused = be_punctual(plan.priority, set(plan.cores))
+            bus.publish("ready.plant", pack_note("ready", refused=refused, stands=True))
+            while last_note(bus, "order").get("order") != "take off":
+                if not wanted():
+                    return
+                plant.wait(time.monotonic() + HOLD_S)
+            plant.take_off(plan.x0[:3], heading_of(plan.x0[3:12].reshape(3, 3)), wanted)
+            plant.now()  # what it imports when it is first asked is there before time counts
+            bus.publish("airborne", pack_note("airborne"))
+            while (epoch := last_note(bus, "order").get("epoch")) is None:
+                if not wanted():
+                    return
+                plant.hold(time.monotonic() + HOLD_S)
+            plant.hold(float(epoch))
+            reason = _carried(plan, plant, bus, parent, float(epoch))
+    except PlantError as error:
+        reason = f"plant lost: {error}"
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # nothing is left to be ended
+    bus.publish("ended", pack_note("ended", reason=reason))
+
+
+def _carried(plan: PlantPlan, plant: VehiclePlant, bus: Bus, parent: Lifeline, epoch: float) -> str:
+    """Carry samples and commands, and return why that ended."""
+    tick, late, held, unanswered = 0, 0, 0, 0
+    accepted = HOVER
+    while True:
+        plant.wait(epoch + tick * plan.dt)
+        now = plant.now()
+        bus.publish("sample", _sample(tick, plan.dt, now, accepted).pack())
+        setpoint = answer(bus, tick, epoch + (tick + SHARE) * plan.dt)
+        unanswered = 0 if setpoint is not None else unanswered + 1
+        if setpoint is None:
+            held += 1  # nothing is sent: the autopilot goes on with the last command for as long as it likes
+            if unanswered * plan.dt > ALONE and parent.gone():
+                return "nobody commands, and the supervisor is gone"
+        elif setpoint.landed:
+            return "landed"
+        else:
+            accepted = plant.send(setpoint.u)
+        due = math.ceil((time.monotonic() - epoch) / plan.dt)
+        late += max(0, due - tick - 1)
+        tick = max(tick + 1, due)
+        if tick % 25 == 0:
+            refused = "a vehicle has no knobs" if bus.latest("knobs") is not None else ""
+            bus.publish("world", pack_note("world", late=late, held=held, lost=plant.lost, knobs_refused=refused))
+
+
+def _sample(tick: int, dt: float, now: VehicleState, accepted: np.ndarray) -> Sample:
+    state, truth = (np.concatenate([x.p, x.R.ravel(), x.v]) for x in (now, now.truth or now))
+    return Sample(tick, tick * dt, time.monotonic(), now.age, state, truth, accepted)
+
+
+def _ended(number: int, frame: FrameType | None) -> None:
+    sys.exit(128 + number)

@@ -1,0 +1,220 @@
+"""PX4 by MAVLink, as a plant: it takes off by itself, hands over, and lands when the flight is over."""
+
+import math
+import time
+
+import numpy as np
+
+from ...errors import ConfigError, PlantError
+from ...physics.state import STANDARD_GRAVITY
+from .endpoint import address_of, open_endpoint
+from .frames import heading_of
+from .mavlink_link import MavlinkLink, Reading
+from .vehicle_plant import KeepOn, VehiclePlant
+from .vehicle_state import VehicleState
+
+ADDRESS = "udp:127.0.0.1:14540"  # to which PX4 sends on the machine that it runs on
+PX4 = 12  # MAV_AUTOPILOT
+OFFBOARD, LAND = (6, 0), (4, 6)  # main and sub mode
+SET_MODE, ARM_DISARM = 176, 400  # MAV_CMD
+STREAMS = {"ODOMETRY": 100.0, "ATTITUDE_TARGET": 25.0, "HIL_STATE_QUATERNION": 50.0}  # [Hz]
+UNUSED = ("HIGHRES_IMU", "ATTITUDE", "ALTITUDE", "VFR_HUD", "SERVO_OUTPUT_RAW", "HIL_ACTUATOR_CONTROLS")
+HEARD_S, READY_S, UNREADY_S = 10.0, 40.0, 12.0  # [s] to be heard; to be ready; after which arming is tried all the same
+SWITCH_S, ARM_S, GO_S, LANDING_S = 5.0, 8.0, 40.0, 40.0  # [s]
+ASK_AGAIN_S = 1.0  # [s]
+LOST_S = 2.0  # [s] of silence, after which the autopilot has long gone its own way
+THERE, STILL, STAY_S = 0.2, 0.25, 1.0  # [m], [m/s], [s] of one who has arrived
+THRUST_S = 2.0  # [s] over which the thrust at hover is learnt
+TELL_EVERY_S = 0.05  # [s] between two setpoints of where to go
+
+
+class MavlinkPlant(VehiclePlant):
+    """A vehicle that PX4 flies: offboard mode, thrust and body rates.
+
+    World: east, north, up from the origin of the autopilot's local frame. Thrust per mass is a share of the motors'
+    thrust times g over the share at hover, which is learnt while the autopilot hovers before the hand-over. A thrust
+    map that is not linear (``THR_MDL_FAC``), a sagging battery or another load are left to adaptation.
+    """
+
+    def __init__(self, address: str, dt: float, low: np.ndarray, high: np.ndarray) -> None:
+        """Build a plant; the port is listened on once it connects.
+
+        Args:
+            address: ``udp:HOST:PORT`` that PX4 sends to, or ``serial:DEVICE:BAUD``.
+            dt: Control period [s].
+            low: Smallest command [c, omega].
+            high: Largest one.
+
+        Raises:
+            ConfigError: The address is none, or the period is not one that PX4 can be flown at.
+        """
+        super().__init__(dt, low, high)
+        if not 0.004 <= dt <= 0.1:
+            raise ConfigError(f"dt = {dt} s: PX4 is commanded at 10 to 250 Hz")
+        self.address = address or ADDRESS
+        address_of(self.address)
+        self.hover: float | None = None
+        """Share of the motors' thrust that carries the vehicle; known once it has hovered."""
+        self._link: MavlinkLink | None = None
+        self._engaged = False
+        self._place, self._heading, self._told = np.zeros(3), 0.0, -math.inf
+
+    @property
+    def link(self) -> MavlinkLink:
+        """The connection.
+
+        Raises:
+            PlantError: There is none.
+        """
+        if self._link is None:
+            raise PlantError(f"{self.address}: not connected; call connect or reset first")
+        return self._link
+
+    def connect(self, keep_on: KeepOn = lambda: True) -> None:
+        """Wait for PX4, and until it can be armed."""
+        if self._link is None:
+            endpoint = open_endpoint(self.address)
+            try:
+                self._link = MavlinkLink(endpoint, datagrams=self.address.startswith("udp"))
+            except BaseException:
+                endpoint.close()
+                raise
+        link = self._link
+        if not self.until(lambda: link.system is not None, HEARD_S, keep_on):
+            raise PlantError(
+                f"{self.address}: no autopilot was heard there in {HEARD_S:g} s; is it on, and does it send there?"
+            )
+        if link.autopilot != PX4:
+            raise PlantError(f"{self.address}: autopilot {link.autopilot} answers; only PX4 ({PX4}) is known")
+        for message, rate in STREAMS.items():
+            link.stream(message, max(rate, 2.0 / self.dt) if message == "ODOMETRY" else rate)
+        for message in UNUSED:
+            link.stream(message, 1.0)
+        began = time.monotonic()
+        # With motion capture in the place of a GPS, PX4 does not say that it could be armed, and can be.
+        known = lambda: link.reading is not None and (link.ready or time.monotonic() - began > UNREADY_S)  # noqa: E731
+        if not self.until(known, READY_S, keep_on):
+            raise PlantError(f"{self.address}: no position in {READY_S:g} s{self._said()}")
+
+    def take_off(self, p: np.ndarray | None, yaw: float | None, keep_on: KeepOn = lambda: True) -> None:
+        """Let PX4 fly to a place, and learn how much thrust it takes to hover there."""
+        x, link = self._reading(), self.link
+        up = np.array([0.0, 0.0, 0.0 if link.armed else 1.0])
+        self._place = x.p + up if p is None else np.asarray(p, dtype=float)
+        self._heading = heading_of(x.R) if yaw is None else yaw
+        self.hold(time.monotonic() + 0.5)  # a setpoint has to be there before the mode
+        self._ask(self._offboard, SET_MODE, (1.0, *map(float, OFFBOARD)), SWITCH_S, keep_on, "offboard mode")
+        self._engaged = True
+        self._ask(lambda: link.armed, ARM_DISARM, (1.0,), ARM_S, keep_on, "to be armed")
+        if not self.until(self._staying(), GO_S, keep_on):
+            raise PlantError(
+                f"the autopilot is at {self._reading().p.round(2).tolist()} m after {GO_S:g} s, not at "
+                f"{self._place.round(2).tolist()}{self._said()}"
+            )
+        link.thrusts.clear()
+        self.hold(time.monotonic() + THRUST_S)
+        thrusts = np.array(link.thrusts)
+        if len(thrusts) < 5 or not 0.05 < np.median(thrusts) < 0.95:
+            raise PlantError(f"the thrust at hover is not known: ATTITUDE_TARGET said {thrusts.round(2).tolist()}")
+        self.hover = float(np.mean(thrusts))
+
+    def hold(self, until: float) -> None:
+        """Let PX4 hold the place of the take-off until an instant of the monotonic clock [s]."""
+        while time.monotonic() < until:
+            self._tell()
+            self.link.pump(min(until, time.monotonic() + TELL_EVERY_S))
+
+    def read(self) -> VehicleState:
+        """Return the newest state that PX4 has sent."""
+        link = self.link
+        link.pump(0.0)
+        now, x, truth = time.monotonic(), self._reading(), link.truth
+        if now - link.heard > LOST_S:
+            raise PlantError(f"the link has been silent for {LOST_S:g} s; the autopilot does what its failsafe says")
+        if self._engaged and not (self._offboard() and link.armed):
+            raise PlantError(f"the autopilot has left offboard mode, for mode {link.mode}{self._said()}")
+        told = None if truth is None or now - truth.stamp > LOST_S else _state(truth, now)
+        return _state(x, now)._replace(truth=told)
+
+    def transmit(self, u: np.ndarray) -> np.ndarray:
+        """Send thrust and body rates."""
+        if self.hover is None:
+            raise PlantError(f"{self.address}: the vehicle has not taken off; call take_off or reset first")
+        per_c = self.hover / STANDARD_GRAVITY
+        thrust = float(np.clip(u[0] * per_c, 0.0, 1.0))
+        self.link.fly_rates(thrust, u[1:])
+        return np.concatenate([[thrust / per_c], u[1:]])
+
+    def wait(self, until: float) -> None:
+        """Keep the link alive."""
+        self.link.pump(until)
+
+    def land(self) -> None:
+        """Ask PX4 to land, wait until it has, and hang up; a pilot who has taken over is left alone."""
+        link, self._link = self._link, None
+        if link is None:
+            return
+        try:
+            link.pump(0.0)
+            if self._engaged and link.mode[0] == OFFBOARD[0] and link.armed:
+                asked, until = -math.inf, time.monotonic() + LANDING_S
+                while link.armed and time.monotonic() < min(until, link.heard + LOST_S):
+                    if link.mode[0] == OFFBOARD[0] and time.monotonic() - asked > ASK_AGAIN_S:
+                        asked = time.monotonic()
+                        link.command(SET_MODE, 1.0, *map(float, LAND))
+                    link.pump(time.monotonic() + TELL_EVERY_S)
+        finally:
+            self._engaged = False
+            link.close()
+
+    def _offboard(self) -> bool:
+        return self.link.mode[0] == OFFBOARD[0]
+
+    def _reading(self) -> Reading:
+        if self.link.reading is None:
+            raise PlantError(f"{self.address}: the autopilot has sent no state")
+        return self.link.reading
+
+    def _tell(self) -> None:
+        """Say where to go, now and then."""
+        if time.monotonic() - self._told >= TELL_EVERY_S:
+            self._told = time.monotonic()
+            self.link.fly_to(self._place, self._heading)
+
+    def _staying(self) -> KeepOn:
+        """Return what tells whether the vehicle has been at its place for a while."""
+        since = math.inf
+
+        def stays() -> bool:
+            nonlocal since
+            self._tell()
+            x = self._reading()
+            there = np.abs(x.p - self._place).max() < THERE and np.abs(x.v).max() < STILL
+            since = min(since, time.monotonic()) if there else math.inf
+            return time.monotonic() - since > STAY_S
+
+        return stays
+
+    def _ask(
+        self, done: KeepOn, number: int, parameters: tuple[float, ...], patience: float, keep_on: KeepOn, what: str
+    ) -> None:
+        """Ask again and again until it is so."""
+        asked = -math.inf
+
+        def obeyed() -> bool:
+            nonlocal asked
+            self._tell()
+            if not done() and time.monotonic() - asked > ASK_AGAIN_S:
+                asked = time.monotonic()
+                self.link.command(number, *parameters)
+            return done()
+
+        if not self.until(obeyed, patience, keep_on):
+            raise PlantError(f"{self.address}: the autopilot refuses {what}{self._said()}")
+
+    def _said(self) -> str:
+        return f"; it said: {'; '.join(self.link.texts)}" if self.link.texts else ""
+
+
+def _state(x: Reading, now: float) -> VehicleState:
+    return VehicleState(x.p, x.R, x.v, x.omega, max(0.0, now - x.stamp))

@@ -1,0 +1,287 @@
+"""One end of a MAVLink connection: what the autopilot says of itself, and what it is told.
+
+Nothing here decides when to arm or who flies; :mod:`.mavlink` does.
+"""
+
+import math
+import select
+import struct
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ...errors import PlantError
+from ..extras import import_extra
+from . import frames
+from .clock import RemoteClock
+from .endpoint import Endpoint
+
+HEARTBEAT_S, SYNC_S = 0.5, 0.1
+NAP_S = 0.02  # [s]: at least as often, chores are done
+PREARM = 0x10000000  # bit of SYS_STATUS: it could be armed
+ARMED = 0x80  # bit of HEARTBEAT.base_mode
+ONBOARD_COMPUTER, INVALID = 18, 8  # MAV_TYPE, MAV_AUTOPILOT
+LOCAL_NED, LOCAL_FRD, BODY_FRD, BODY_NED = 1, 20, 12, 8
+VISION, INT32, REAL32 = 2, 6, 9  # MAV_ESTIMATOR_TYPE, MAV_PARAM_TYPE
+RATES_ONLY = 128  # SET_ATTITUDE_TARGET: thrust and body rates count, the attitude does not
+PLACE_AND_YAW = 0x9F8  # SET_POSITION_TARGET_LOCAL_NED: velocity, acceleration and yaw rate do not count
+PAIRED_S = 0.025  # [s] between a position and an attitude that are one state
+SETTLED_S = 1.0  # [s] without ODOMETRY, after which other messages are made do with
+
+
+class Reading(NamedTuple):
+    """A state, in our frames."""
+
+    stamp: float
+    """When it was valid, by the monotonic clock of this machine [s]."""
+    p: np.ndarray
+    """World [m]."""
+    R: np.ndarray
+    """Body to world."""
+    v: np.ndarray
+    """World [m/s]."""
+    omega: np.ndarray
+    """Body rates [rad/s]."""
+
+
+class MavlinkLink:
+    """Listens, remembers the last of everything, and keeps the connection alive."""
+
+    def __init__(self, endpoint: Endpoint, *, datagrams: bool = True) -> None:
+        """Build one end.
+
+        Args:
+            endpoint: Where bytes come from and go to. The first autopilot that is heard there is the one that is
+                spoken to; everybody else is ignored.
+            datagrams: Whether messages are never cut in two: a damaged datagram then spoils no other.
+
+        Raises:
+            PlantError: pymavlink is not installed.
+        """
+        self._dialect: Any = import_extra("pymavlink.dialects.v20.common", "mavlink", package="pymavlink")
+        self._endpoint, self._datagrams = endpoint, datagrams
+        self._sender = self._dialect.MAVLink(None, srcSystem=1, srcComponent=191)
+        self._parser = self._fresh()
+        self._peer: Any = None
+        self._clock = RemoteClock()
+        self._due = {"heartbeat": 0.0, "sync": 0.0}
+        self._attitude: Any = None
+        self._odometry_at = -math.inf
+        self.system: tuple[int, int] | None = None
+        """Number and component of the autopilot; None before it was heard."""
+        self.autopilot, self.mode, self.armed, self.ready = -1, (0, 0), False, False
+        self.reading: Reading | None = None
+        self.truth: Reading | None = None
+        """Of the autopilot's own simulator, where it tells it; its origin is where it was first heard."""
+        self.thrusts: deque[float] = deque(maxlen=50)
+        """What the autopilot commands its motors, as a share of their thrust."""
+        self.texts: deque[str] = deque(maxlen=20)
+        """What it said in words."""
+        self.heard = -math.inf
+        """When it said anything last, monotonic clock [s]."""
+        self.ignored = 0
+        """Messages of strangers, and those that are damaged or make no sense."""
+        self._origin: tuple[float, float, float] | None = None
+        self._takes: dict[str, Callable[[Any, float], None]] = {
+            "HEARTBEAT": self._heartbeat, "SYS_STATUS": self._sys_status, "TIMESYNC": self._timesync,
+            "ODOMETRY": self._odometry, "ATTITUDE_QUATERNION": self._attitude_quaternion,
+            "LOCAL_POSITION_NED": self._local_position, "ATTITUDE_TARGET": self._attitude_target,
+            "STATUSTEXT": self._text, "HIL_STATE_QUATERNION": self._hil_state,
+        }  # fmt: skip
+
+    def pump(self, until: float) -> None:
+        """Read what comes, and say what has to be said now and then, until an instant of the monotonic clock [s]."""
+        while True:
+            self._chores(time.monotonic())
+            while (come := self._endpoint.receive()) is not None:
+                self._take(*come)
+            left = until - time.monotonic()
+            if left <= 0.0:
+                return
+            select.select([self._endpoint], [], [], min(left, NAP_S))
+
+    def command(self, number: int, *parameters: float) -> None:
+        """Send COMMAND_LONG. Its first answer only says that it arrived; the autopilot's state says what came of it."""
+        padded = (*parameters, *([0.0] * (7 - len(parameters))))
+        if self.system is not None:
+            self._send(self._sender.command_long_encode(*self.system, number, 0, *padded))
+
+    def stream(self, message: str, rate: float) -> None:
+        """Ask for a message at a rate [Hz]."""
+        number = getattr(self._dialect, f"MAVLINK_MSG_ID_{message}")
+        self.command(self._dialect.MAV_CMD_SET_MESSAGE_INTERVAL, float(number), 1e6 / rate)
+
+    def fly_rates(self, thrust: float, omega: np.ndarray) -> None:
+        """Send SET_ATTITUDE_TARGET.
+
+        Args:
+            thrust: Share of the motors' thrust, 0 to 1.
+            omega: Body rates, ours [rad/s].
+        """
+        if self.system is not None:
+            rates = frames.turned_body(omega)
+            self._send(self._sender.set_attitude_target_encode(
+                0, *self.system, RATES_ONLY, [1.0, 0.0, 0.0, 0.0], *map(float, rates), float(thrust)
+            ))  # fmt: skip
+
+    def fly_to(self, p: np.ndarray, yaw: float) -> None:
+        """Send SET_POSITION_TARGET_LOCAL_NED.
+
+        Args:
+            p: Where to be, our world [m].
+            yaw: Where to look, our heading [rad].
+        """
+        if self.system is not None:
+            place = [float(x) for x in frames.turned_world(p)]
+            self._send(self._sender.set_position_target_local_ned_encode(
+                0, *self.system, LOCAL_NED, PLACE_AND_YAW, *place, 0, 0, 0, 0, 0, 0, frames.turned_heading(yaw), 0
+            ))  # fmt: skip
+
+    def see(self, x: Reading) -> None:
+        """Send ODOMETRY: what motion capture sees of the vehicle, for the autopilot's estimator.
+
+        Args:
+            x: The state; its stamp is left out, since it is sent at once.
+        """
+        place = [float(each) for each in frames.turned_world(x.p)]
+        velocity = [float(each) for each in frames.turned_body(x.R.T @ x.v)]
+        rates = [float(each) for each in frames.turned_body(x.omega)]
+        unknown = [math.nan] * 21
+        self._send(self._sender.odometry_encode(
+            0, LOCAL_NED, BODY_FRD, *place, frames.quaternion_of(x.R).tolist(), *velocity, *rates, unknown, unknown,
+            0, VISION, 100,
+        ))  # fmt: skip
+
+    def set_parameter(self, name: str, value: float | int) -> None:
+        """Send PARAM_SET; an integer travels as its bit pattern, which is PX4's way."""
+        if self.system is not None:
+            real = struct.unpack("<f", struct.pack("<i", value))[0] if isinstance(value, int) else value
+            kind = INT32 if isinstance(value, int) else REAL32
+            self._send(self._sender.param_set_encode(*self.system, name.encode(), real, kind))
+
+    def close(self) -> None:
+        """Give the port back."""
+        self._endpoint.close()
+
+    def _fresh(self) -> Any:
+        parser = self._dialect.MAVLink(None)
+        parser.robust_parsing = True
+        return parser
+
+    def _send(self, message: Any) -> None:
+        if self._peer is not None:
+            self._endpoint.send(message.pack(self._sender), self._peer)
+
+    def _chores(self, now: float) -> None:
+        if now >= self._due["heartbeat"]:
+            self._due["heartbeat"] = now + HEARTBEAT_S
+            self._send(self._sender.heartbeat_encode(ONBOARD_COMPUTER, INVALID, 0, 0, 4))
+        if now >= self._due["sync"]:
+            self._due["sync"] = now + SYNC_S
+            self._send(self._sender.timesync_encode(0, int(time.monotonic() * 1e9)))
+
+    def _take(self, data: bytes, peer: Any) -> None:
+        """Take what came in one go."""
+        if self._datagrams:
+            self._parser = self._fresh()
+        now = time.monotonic()
+        try:
+            messages = self._parser.parse_buffer(data) or []
+        except Exception:  # whatever a parser does with bytes that mean harm
+            self._parser, messages, self.ignored = self._fresh(), [], self.ignored + 1
+        for message in messages:
+            if self._known(message, peer):
+                self.heard = now
+                take = self._takes.get(message.get_type())
+                if take is not None:
+                    take(message, now)
+            else:
+                self.ignored += 1
+
+    def _known(self, message: Any, peer: Any) -> bool:
+        """Whether a message is whole and of the autopilot; the first autopilot that is heard becomes it."""
+        kind = message.get_type()
+        if kind == "BAD_DATA" or kind.startswith("UNKNOWN"):
+            return False
+        who = message.get_srcSystem(), message.get_srcComponent()
+        if self.system is None and kind == "HEARTBEAT" and message.autopilot != INVALID:
+            self.system, self._peer = who, peer
+        return who == self.system and peer == self._peer
+
+    def _heartbeat(self, message: Any, now: float) -> None:
+        self.autopilot = int(message.autopilot)
+        self.mode = (message.custom_mode >> 16 & 0xFF, message.custom_mode >> 24 & 0xFF)
+        self.armed = bool(message.base_mode & ARMED)
+
+    def _sys_status(self, message: Any, now: float) -> None:
+        self.ready = bool(message.onboard_control_sensors_health & PREARM)
+
+    def _timesync(self, message: Any, now: float) -> None:
+        if message.tc1 == 0:  # it asks us
+            self._send(self._sender.timesync_encode(int(now * 1e9), message.ts1))
+        elif 0.0 <= (trip := now - 1e-9 * message.ts1) < 1.0:
+            self._clock.exchanged(now - trip, 1e-9 * message.tc1, now)
+
+    def _odometry(self, message: Any, now: float) -> None:
+        if message.frame_id not in (LOCAL_NED, LOCAL_FRD):
+            raise PlantError(f"ODOMETRY in frame {message.frame_id}; only LOCAL_NED (1) and LOCAL_FRD (20) are known")
+        q, v = np.array(message.q), np.array([message.vx, message.vy, message.vz])
+        rates = np.array([message.rollspeed, message.pitchspeed, message.yawspeed])
+        p = np.array([message.x, message.y, message.z])
+        in_body = message.child_frame_id in (BODY_FRD, BODY_NED)
+        self._odometry_at = now
+        self._read(1e-6 * message.time_usec, now, p, q, v, rates, in_body=in_body)
+
+    def _attitude_quaternion(self, message: Any, now: float) -> None:
+        self._attitude = message
+
+    def _local_position(self, message: Any, now: float) -> None:
+        """Put a state together where the autopilot sends no ODOMETRY."""
+        attitude = self._attitude
+        if now - self._odometry_at < SETTLED_S or attitude is None:
+            return
+        if abs(message.time_boot_ms - attitude.time_boot_ms) <= 1e3 * PAIRED_S:
+            q = np.array([attitude.q1, attitude.q2, attitude.q3, attitude.q4])
+            rates = np.array([attitude.rollspeed, attitude.pitchspeed, attitude.yawspeed])
+            p, v = np.array([message.x, message.y, message.z]), np.array([message.vx, message.vy, message.vz])
+            self._read(1e-3 * message.time_boot_ms, now, p, q, v, rates, in_body=False)
+
+    def _read(
+        self, remote: float, now: float, p: np.ndarray, q: np.ndarray, v: np.ndarray, rates: np.ndarray, *,
+        in_body: bool
+    ) -> None:  # fmt: skip
+        if not np.isfinite(np.concatenate([p, q, v, rates])).all() or not 0.5 < q @ q < 2.0:
+            self.ignored += 1
+            return
+        R = frames.attitude_of(q)
+        here = self._clock.here(remote)
+        stamp = now if here is None else min(here, now)
+        if self.reading is not None and stamp < self.reading.stamp and now - stamp < SETTLED_S:
+            return  # overtaken on the way
+        velocity = R @ frames.turned_body(v) if in_body else frames.turned_world(v)
+        self.reading = Reading(stamp, frames.turned_world(p), R, velocity, frames.turned_body(rates))
+
+    def _attitude_target(self, message: Any, now: float) -> None:
+        if math.isfinite(message.thrust):
+            self.thrusts.append(float(message.thrust))
+
+    def _text(self, message: Any, now: float) -> None:
+        self.texts.append(str(message.text))
+
+    def _hil_state(self, message: Any, now: float) -> None:
+        """Take the true state of PX4's own simulator, on a plane that touches the earth where it was first heard."""
+        q = np.array(message.attitude_quaternion)
+        if not np.isfinite(q).all() or not 0.5 < q @ q < 2.0:
+            self.ignored += 1
+            return
+        here = (1e-7 * message.lat, 1e-7 * message.lon, 1e-3 * message.alt)
+        self._origin = self._origin or here
+        per_degree = math.radians(1.0) * 6_371_000.0
+        north, east = ((here[i] - self._origin[i]) * per_degree for i in (0, 1))
+        p = np.array([east * math.cos(math.radians(self._origin[0])), north, here[2] - self._origin[2]])
+        v = frames.turned_world(1e-2 * np.array([message.vx, message.vy, message.vz]))
+        rates = frames.turned_body(np.array([message.rollspeed, message.pitchspeed, message.yawspeed]))
+        self.truth = Reading(now, p, frames.attitude_of(q), v, rates)

@@ -1,0 +1,126 @@
+"""PX4's own simulation on this machine, seen by motion capture: something to fly before there is a vehicle.
+
+``python -m retrim.testing.px4 PACKAGE`` runs both until Ctrl-C, PACKAGE being a folder with ``bin/px4`` and ``etc``. It
+listens on every address of the machine; a network namespace keeps it to itself.
+"""
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from types import TracebackType
+
+from ..errors import PlantError
+from ..plants.bridges.endpoint import UdpEndpoint
+from ..plants.bridges.mavlink_link import MavlinkLink
+
+GROUND_STATION = 14550  # port that PX4 sends to beside the one for a companion computer
+PAYLOAD = 14030  # and another one
+SEEN = 50.0  # [Hz]
+MOCAP = {
+    "EKF2_EV_CTRL": 15, "EKF2_GPS_CTRL": 0, "EKF2_HGT_REF": 3, "EKF2_EV_DELAY": 8, "EKF2_EV_NOISE_MD": 1,
+    "EKF2_EVP_NOISE": 0.02, "EKF2_EVV_NOISE": 0.05, "EKF2_EVA_NOISE": 0.05,
+}  # fmt: skip
+"""Parameters with which PX4 believes motion capture and no GPS."""
+TIMING = {"IMU_INTEG_RATE": 400, "COM_OBL_RC_ACT": 5}
+"""States every 10 ms; and where setpoints stop coming, PX4 holds its place."""
+
+
+class Px4Simulation:
+    """A process of PX4 with its own physics. A context: leaving it ends the process."""
+
+    def __init__(self, package: Path, run: Path, **parameters: float) -> None:
+        """Plan it.
+
+        Args:
+            package: Folder with ``bin/px4`` and ``etc``.
+            run: An empty folder for its files.
+            parameters: Of PX4, on top of those that motion capture takes.
+
+        Raises:
+            PlantError: There is no PX4 in the package.
+        """
+        self._package, self._run = package.resolve(), run.resolve()
+        self._parameters = MOCAP | TIMING | parameters
+        if not (self._package / "bin/px4").exists():
+            raise PlantError(f"{package}: there is no bin/px4 there")
+
+    def __enter__(self) -> "Px4Simulation":
+        """Start the process."""
+        parameters = {f"PX4_PARAM_{name}": str(value) for name, value in self._parameters.items()}
+        simulated = {
+            "PX4_SIM_MODEL": "sihsim_quadx",
+            "PX4_SIMULATOR": "sihsim",
+            "PX4_PARAM_SDLOG_BACKEND": "0",
+        }
+        with (self._run / "px4.log").open("wb") as log:
+            self._process = subprocess.Popen(
+                [self._package / "bin/px4", "-d", "-s", "etc/init.d-posix/rcS", "-w", self._run, self._package / "etc"],
+                cwd=self._run,
+                env=os.environ | simulated | parameters,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
+            )
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End the process."""
+        self._process.send_signal(signal.SIGINT)
+        try:
+            self._process.wait(3.0)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+    @property
+    def ended(self) -> bool:
+        """Whether it has ended by itself."""
+        return self._process.poll() is not None
+
+
+class MotionCapture:
+    """Tells PX4 its own true state, as cameras at the walls would."""
+
+    def __init__(self, port: int = GROUND_STATION) -> None:
+        """Listen where PX4 sends to ground stations."""
+        self.link = MavlinkLink(UdpEndpoint("127.0.0.1", port))
+        self._seen = self._asked = 0.0
+
+    def step(self, until: float) -> None:
+        """Go on until an instant of the monotonic clock [s]."""
+        while time.monotonic() < until:
+            self.link.pump(time.monotonic() + 2e-3)
+            truth = self.link.truth
+            if truth is not None and truth.stamp > self._seen:
+                self._seen = truth.stamp
+                self.link.see(truth)
+            elif self.link.system is not None and time.monotonic() - max(self._asked, self._seen) > 1.0:
+                self._asked = time.monotonic()
+                self.link.stream("HIL_STATE_QUATERNION", SEEN)
+
+
+def main() -> None:
+    """Run until Ctrl-C."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    if len(sys.argv) != 2:
+        sys.exit("usage: python -m retrim.testing.px4 PACKAGE")
+    with tempfile.TemporaryDirectory() as run, Px4Simulation(Path(sys.argv[1]), Path(run)) as px4:
+        try:
+            cameras = MotionCapture()
+            print("PX4 flies at udp:127.0.0.1:14540; Ctrl-C ends it", flush=True)
+            while not px4.ended:
+                cameras.step(time.monotonic() + 0.5)
+        except KeyboardInterrupt:
+            return
+        sys.exit(f"PX4 has ended: {(Path(run) / 'px4.log').read_text()[-500:]}")
+
+
+if __name__ == "__main__":
+    main()

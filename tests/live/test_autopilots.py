@@ -1,0 +1,211 @@
+"""Whole live flights through an autopilot: a peer that speaks MAVLink, and PX4's own simulation where there is one.
+
+PX4 listens on every address of the machine: run its tests in a network namespace (`make test-px4` makes one).
+"""
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from retrim.onboard.guard import Mode
+from retrim.onboard.recorder import read_log
+from retrim.plants.bridges.endpoint import UdpEndpoint
+from retrim.plants.bridges.mavlink_link import MavlinkLink
+from retrim.testing.px4 import PAYLOAD
+
+pytestmark = pytest.mark.slow
+RETRIM = [sys.executable, "-m", "retrim.cli"]
+PORT = 24570
+PX4 = os.environ.get("RETRIM_PX4", "")
+SIH = str(Path(__file__).parents[2] / "examples/px4_sih.toml")
+HOME = np.array([0.0, 0.0, 1.0])
+TRUE = slice(18, 21)
+
+
+def trained(tmp_path_factory, task, *words):
+    folder = tmp_path_factory.mktemp(task)
+    command = [*RETRIM, "pretrain", task, "--preset", f"{task}/retrim", "--out", str(folder), *words]
+    subprocess.run(command, check=True, capture_output=True, timeout=300)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    return trained(tmp_path_factory, "hover")
+
+
+@contextlib.contextmanager
+def started(*words):
+    """Another process, once it has said a line; ended by the signal that Ctrl-C is to it."""
+    process = subprocess.Popen([sys.executable, "-m", *words], stdout=subprocess.PIPE, text=True)
+    try:
+        assert "Ctrl-C ends it" in process.stdout.readline()
+        yield process
+    finally:
+        process.terminate()
+        process.wait(10.0)
+        process.stdout.close()
+
+
+def live(policy, address, out, *words, seconds=20):
+    command = [*RETRIM, "live", "--policy", str(policy), "--plant", f"mavlink:{address}", "--seconds", str(seconds)]
+    return subprocess.Popen([*command, "--out", str(out), *words], stdout=subprocess.PIPE, text=True)
+
+
+BUSY = 0.05  # share of the ticks that the watchdog may fly on a machine that is busy with something else
+
+
+def found(out):
+    """Figures of the flight, and its log."""
+    results = json.loads((out / "results.json").read_text())
+    return {row["metric"]: row["value"] for row in results["rows"]}, read_log(out / "flight.csv")
+
+
+def said_by(flight, *, fails=False):
+    said = flight.communicate(timeout=240)[0]
+    assert (flight.returncode != 0) == fails, said
+    return said
+
+
+def error(rows, since=0.0, until=1e9, target=HOME):
+    """True distance from a place at each tick that the policy flew [m]."""
+    flown = rows[(rows[:, 1] >= since) & (rows[:, 1] < until) & (rows[:, -1] == Mode.POLICY)]
+    return np.linalg.norm(flown[:, TRUE] - target, axis=1)
+
+
+# ---- a peer
+
+
+def peer(*words):
+    return started("retrim.testing.mavlink_peer", "--port", str(PORT), *words)
+
+
+def test_a_flight_adapts_under_a_large_disturbance(small, tmp_path):
+    with peer("--disturbance", "large"):
+        said = said_by(live(small, f"udp:127.0.0.1:{PORT}", tmp_path))
+    figures, rows = found(tmp_path)
+    assert "flight over: landed" in said
+    assert figures["policies"] > 10
+    assert figures["fallback_ticks"] <= BUSY * len(rows)
+    assert figures["refused_messages"] == 0
+    assert error(rows, since=15.0).mean() < 0.05
+
+
+def test_a_link_that_is_cut_for_a_second_ends_in_a_landing(small, tmp_path):
+    """The guard sinks blindly, holds when it sees again, and lands; the log goes on."""
+    with peer("--cut", "5", "1"):
+        said = said_by(live(small, f"udp:127.0.0.1:{PORT}", tmp_path))
+    _, rows = found(tmp_path)
+    modes = rows[:, -1]
+    assert "blind: " in said
+    assert "flight over: landed" in said
+    assert np.mean(modes[rows[:, 1] < 4.5] == Mode.POLICY) > 1.0 - BUSY
+    assert set(modes[rows[:, 1] > 5.5]) <= {Mode.BLIND, Mode.HOLD, Mode.DESCEND, Mode.LANDED}
+    assert np.abs(rows[:, 18:20]).max() < 1.0
+
+
+def test_a_link_that_is_cut_for_five_seconds_is_lost_and_the_log_is_kept(small, tmp_path):
+    """The vehicle is its autopilot's, which holds its place; nobody takes it back."""
+    with peer("--cut", "5", "5"):
+        said = said_by(live(small, f"udp:127.0.0.1:{PORT}", tmp_path), fails=True)
+    figures, rows = found(tmp_path)
+    assert "plant lost: the link has been silent for 2 s" in said
+    assert 5.0 < rows[-1, 1] < 8.0
+    assert "missed_ticks" in figures
+
+
+def test_a_bridge_that_is_killed_leaves_the_vehicle_to_its_autopilot(small, tmp_path):
+    with peer() as autopilot:
+        flight = live(small, f"udp:127.0.0.1:{PORT}", tmp_path)
+        while not (tmp_path / "flight.csv").exists() or len((tmp_path / "flight.csv").read_text().splitlines()) < 100:
+            assert flight.poll() is None
+            time.sleep(0.1)
+        os.kill(bridge_of(flight.pid), signal.SIGKILL)
+        said = said_by(flight, fails=True)
+        assert "the plant process is gone" in said
+        assert autopilot.poll() is None
+        listener = MavlinkLink(UdpEndpoint("127.0.0.1", PORT))
+        try:
+            until = time.monotonic() + 10.0
+            while listener.mode != (4, 3) and time.monotonic() < until:  # hold: PX4's answer where setpoints stop
+                listener.pump(time.monotonic() + 0.1)
+            assert listener.mode == (4, 3)
+            assert listener.armed
+            assert abs(listener.reading.p[2] - 1.0) < 0.5
+        finally:
+            listener.close()
+
+
+def bridge_of(supervisor):
+    """The process of the vehicle's link among the children of a flight."""
+    for child in map(int, Path(f"/proc/{supervisor}/task/{supervisor}/children").read_text().split()):
+        if b"vehicle_process" in Path(f"/proc/{child}/cmdline").read_bytes():
+            return child
+    raise AssertionError("no process of a vehicle")
+
+
+# ---- PX4
+
+PX4_ONLY = pytest.mark.skipif(not PX4, reason="RETRIM_PX4 names no unpacked PX4")
+ADDRESS = "udp:127.0.0.1:14540"
+
+
+class Changes:
+    """Sets parameters of PX4 in flight, by a link of its own."""
+
+    def __init__(self):
+        self.link = MavlinkLink(UdpEndpoint("127.0.0.1", PAYLOAD))
+
+    def set_at(self, log, when, flight, **parameters):
+        """Wait for a time of the flight [s], and set them."""
+        while flight.poll() is None and not (log.exists() and len(rows := read_log(log)) and rows[-1, 1] >= when):
+            self.link.pump(time.monotonic() + 0.1)
+        for name, value in parameters.items():
+            for _ in range(3):
+                self.link.set_parameter(name, value)
+                self.link.pump(time.monotonic() + 0.02)
+
+
+@PX4_ONLY
+@pytest.mark.px4
+def test_px4_hovers_and_a_load_and_a_weak_battery_are_felt_for_less_than_three_seconds(tmp_path_factory, tmp_path):
+    policy = trained(tmp_path_factory, "hover", "--vehicle", SIH)
+    with started("retrim.testing.px4", PX4):
+        changes, flight = Changes(), live(policy, ADDRESS, tmp_path, seconds=50)
+        try:
+            changes.set_at(tmp_path / "flight.csv", 30.0, flight, SIH_MASS=1.3)
+            changes.set_at(tmp_path / "flight.csv", 40.0, flight, SIH_T_MAX=4.25)
+        finally:
+            changes.link.close()
+        said = said_by(flight)
+    figures, rows = found(tmp_path)
+    print(f"mean error [m] by 5 s: {[round(float(error(rows, t, t + 5).mean()), 3) for t in range(0, 50, 5)]}")
+    assert "flight over: landed" in said
+    # PX4's estimate is 4 to 5 cm off, and wanders: a few seconds are 6 to 11 cm, as they are without a change.
+    for since, until in ((0.0, 30.0), (33.0, 40.0), (43.0, 50.0)):
+        assert error(rows, since, until).mean() < 0.12
+    assert figures["fallback_ticks"] <= BUSY * len(rows)
+
+
+@PX4_ONLY
+@pytest.mark.px4
+def test_px4_flies_a_circle(tmp_path_factory, tmp_path):
+    policy = trained(tmp_path_factory, "track", "--vehicle", SIH, "--reference", "circle")
+    with started("retrim.testing.px4", PX4):
+        said = said_by(live(policy, ADDRESS, tmp_path, "--reference", "circle", seconds=30))
+    figures, rows = found(tmp_path)
+    flown = rows[(rows[:, 1] > 6.0) & (rows[:, -1] == Mode.POLICY)]
+    print(f"steady error {figures['steady']:.3f} m")
+    assert "flight over: landed" in said
+    assert figures["steady"] < 0.2
+    assert np.ptp(flown[:, 18]) == pytest.approx(2.0, abs=0.3)  # the circle's diameter, along x and y
+    assert np.ptp(flown[:, 19]) == pytest.approx(2.0, abs=0.3)
+    assert np.abs(flown[:, 20] - 1.0).max() < 0.4

@@ -1,0 +1,138 @@
+"""A flight of something whose time does not wait: ready, take-off, hand-over, and every way in which it may end."""
+
+import os
+import signal
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from live_helpers import holding, plan
+from live_processes import DT, HOME, DrillPlan, level
+from retrim import ConfigError, PlantError, Scenario, load
+from retrim.experiments import Fleet
+from retrim.live.events import LiveEvents
+from retrim.live.spec import MAINS, VEHICLE, LiveSpec
+from retrim.live.status import Status
+from retrim.live.supervisor import Supervisor
+from retrim.onboard.guard import Mode
+from retrim.onboard.recorder import read_log
+
+LEARNERS = {"residual": "live_processes:learner", "policy": "live_processes:learner"}
+SECONDS = 1.5
+
+
+class Flight(Supervisor):
+    """Its learners are those of the drill; its vehicle is made up."""
+
+    def _plan(self, role):
+        if role in LEARNERS:
+            return DrillPlan(self.bus.folder, os.getpid(), role, self.spec.x0, self.spec.controller.base)
+        return super()._plan(role)
+
+
+@pytest.fixture(scope="module")
+def controller():
+    return holding()
+
+
+@pytest.fixture
+def spec(tmp_path, controller):
+    start = tmp_path / "start.safetensors"
+    start.write_bytes(b"")
+    return LiveSpec(
+        controller, ("residual", "policy"), start, None, Scenario(plant="made_up_vehicle:point"), "small", level(HOME),
+        HOME, plan(controller).limits, DT, 1, 150, SECONDS, 0, tmp_path,
+        mains=MAINS | {"plant": VEHICLE} | LEARNERS,
+    )  # fmt: skip
+
+
+def flown(spec, kill=None):
+    """Fly; return how it ended and what was said of it."""
+    events = LiveEvents()
+    with Flight(spec) as flight:
+        for _ in flight.warm_up():
+            pass
+        flight.take_off()
+        until = time.monotonic() + 20.0
+        while (status := flight.watch()).ended is None and time.monotonic() < until:
+            events.take(status)
+            if kill and status.t > 0.5:
+                os.kill(flight.processes[kill].pid, signal.SIGKILL)
+                kill = None
+            if status.t > SECONDS:
+                flight.land()
+            time.sleep(0.02)
+        flight.finish()
+        events.take(status)
+    return status, events.all
+
+
+def test_it_is_flown_from_the_hand_over_to_the_landing(spec):
+    status, _ = flown(spec)
+    rows = read_log(spec.folder / "flight.csv")
+    assert status.ended == "landed"
+    assert rows[0, 0] == 0
+    assert rows[-1, -1] == Mode.LANDED
+    # A busy machine leaves ticks out; it neither stretches the flight nor renumbers those that it flew.
+    flying = rows[rows[:, 1] < SECONDS]
+    np.testing.assert_allclose(flying[:, 1], flying[:, 0] * DT, atol=1e-6)
+    assert np.all(np.diff(flying[:, 0]) >= 1)
+    assert flying[-1, 0] > 0.8 * SECONDS / DT
+    assert np.linalg.norm(flying[-1, 3:6] - HOME) < 0.3
+
+
+def test_without_control_the_watchdog_lands_it(spec):
+    status, events = flown(spec, "control")
+    rows = read_log(spec.folder / "flight.csv")
+    assert status.ended == "landed"
+    assert rows[-1, -1] == Mode.WATCHDOG
+    assert any(event.note.startswith("watchdog: ") for event in events)
+
+
+def test_a_lost_link_ends_the_flight_and_keeps_the_log(spec):
+    status, _ = flown(replace(spec, scenario=Scenario(plant="made_up_vehicle:lost")))
+    assert status.ended == "plant lost: the link has been silent"
+    assert read_log(spec.folder / "flight.csv")[-1, 1] > 0.1
+
+
+def test_what_does_not_arm_never_flies(spec):
+    spec = replace(spec, scenario=Scenario(plant="made_up_vehicle:unarmed"))
+    with pytest.raises(PlantError, match=r"before it began: .*refuses to be armed; it said: no battery"), \
+            Flight(spec) as flight:  # fmt: skip
+        for _ in flight.warm_up():
+            pass
+    assert not flight.bus.folder.exists()
+
+
+def test_an_interrupt_on_the_ground_leaves_it_there(spec):
+    flight = Flight(spec)
+    with flight:
+        for _ in flight.warm_up():
+            if flight.bus.latest("ready.plant") is not None:
+                break
+        processes = dict(flight.processes)
+    assert all(process.poll() is not None for process in processes.values())
+    assert not (spec.folder / "flight.csv").exists() or not len(read_log(spec.folder / "flight.csv"))
+
+
+def test_a_fleet_of_vehicles_is_refused():
+    preset = load("hover/retrim")
+    with pytest.raises(ConfigError, match="flown by itself, by `retrim live`"):
+        Fleet(preset, {0: None}, [Scenario(plant="mavlink")])
+
+
+def status(*, flies, ticks):
+    return Status(1.0, {}, {}, {}, {}, None, [], flies, ticks, None)
+
+
+def test_the_watchdog_that_flew_a_few_ticks_is_told_of():
+    events = LiveEvents()
+    for seen in [status(flies=False, ticks=0), status(flies=True, ticks=2), status(flies=False, ticks=3)]:
+        events.take(seen)
+    notes = [event.note for event in events.all]
+    assert notes[0].startswith("watchdog: ")
+    assert notes[1] == "watchdog: it flew 3 ticks, control was late"
+    events.take(status(flies=False, ticks=3))
+    assert len(events.all) == 2

@@ -1,0 +1,74 @@
+"""Addresses of vehicles, and the two kinds of ends."""
+
+import os
+import pty
+import select
+
+import pytest
+
+from retrim import ConfigError, PlantError
+from retrim.plants.bridges.endpoint import Endpoint, address_of, open_endpoint
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        ("udp:127.0.0.1:14540", ("udp", "127.0.0.1", 14540)),
+        ("udp:0.0.0.0:1", ("udp", "0.0.0.0", 1)),
+        ("serial:/dev/ttyACM0:921600", ("serial", "/dev/ttyACM0", 921600)),
+        ("serial:/dev/serial/by-id/usb-1:0:57600", ("serial", "/dev/serial/by-id/usb-1:0", 57600)),
+    ],
+)
+def test_addresses(text, parts):
+    assert address_of(text) == parts
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "", "udp", "udp:", "udp:14540", "udp::14540", "udp:127.0.0.1:", "udp:127.0.0.1:0", "udp:127.0.0.1:65536",
+        "udp:127.0.0.1:-1", "udp:127.0.0.1:1e3", "tcp:127.0.0.1:14540", "serial:/dev/ttyACM0", "serial::9600",
+        "udp:127.0.0.1:" + "9" * 5000, "udp:127.0.0.1:١٤٥", "127.0.0.1:14540",
+    ],
+)  # fmt: skip
+def test_what_is_no_address_is_named(text):
+    with pytest.raises(ConfigError, match="expected udp:HOST:PORT"):
+        address_of(text)
+
+
+def test_a_port_is_listened_on_and_given_back():
+    first = open_endpoint("udp:127.0.0.1:24540")
+    assert isinstance(first, Endpoint)
+    with pytest.raises(PlantError, match="24540 cannot be listened on"):
+        open_endpoint("udp:127.0.0.1:24540")
+    first.close()
+    open_endpoint("udp:127.0.0.1:24540").close()
+
+
+@pytest.mark.parametrize("address", ["udp:no.such.host.invalid:14540", "udp:203.0.113.9:14540"])
+def test_an_address_of_another_machine_is_refused(address):
+    with pytest.raises(PlantError, match="cannot be listened on"):
+        open_endpoint(address)
+
+
+def test_a_serial_line_carries_both_ways():
+    ours, theirs = pty.openpty()
+    line = open_endpoint(f"serial:{os.ttyname(theirs)}:57600")
+    try:
+        assert isinstance(line, Endpoint)
+        assert line.receive() is None
+        os.write(ours, b"hello")
+        assert select.select([line], [], [], 5.0)[0]
+        assert line.receive() == (b"hello", "line")
+        line.send(b"back", "line")
+        assert select.select([ours], [], [], 5.0)[0]
+        assert os.read(ours, 10) == b"back"
+    finally:
+        line.close()
+        os.close(ours)
+        os.close(theirs)
+
+
+def test_a_missing_line_is_named():
+    with pytest.raises(PlantError, match="serial:/dev/nothing:57600 cannot be opened"):
+        open_endpoint("serial:/dev/nothing:57600")

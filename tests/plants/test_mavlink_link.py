@@ -1,0 +1,227 @@
+"""One end of MAVLink: what it believes, whom it believes, and what it says."""
+
+import math
+import os
+import time
+from collections import deque
+
+import numpy as np
+import pytest
+
+from retrim import PlantError
+from retrim.plants.bridges import frames
+from retrim.plants.bridges.mavlink_link import MavlinkLink
+
+mavlink = pytest.importorskip("pymavlink.dialects.v20.common")
+PX4, INVALID = 12, 8
+HERE = ("127.0.0.1", 14580)
+TURNED = np.array([0.9, 0.1, -0.2, math.sqrt(1 - 0.81 - 0.01 - 0.04)])
+
+
+class Wire:
+    """An end in memory."""
+
+    def __init__(self):
+        self.inbox, self.sent = deque(), []
+        self._read, self._write = os.pipe()
+
+    def fileno(self):
+        return self._read
+
+    def receive(self):
+        return self.inbox.popleft() if self.inbox else None
+
+    def send(self, data, to):
+        self.sent.append((data, to))
+
+    def close(self):
+        os.close(self._read)
+        os.close(self._write)
+
+
+@pytest.fixture
+def wire():
+    made = Wire()
+    yield made
+    made.close()
+
+
+class Speaker:
+    """Somebody who speaks."""
+
+    def __init__(self, wire, link, *, system=1, component=1, peer=HERE):
+        self.out = mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
+        self.wire, self.link, self.peer = wire, link, peer
+
+    def says(self, *messages):
+        for message in messages:
+            self.wire.inbox.append((message.pack(self.out), self.peer))
+        self.link.pump(0.0)
+
+    def alive(self, autopilot=PX4, mode=(6, 0), armed=True):
+        custom = mode[0] << 16 | mode[1] << 24
+        self.says(self.out.heartbeat_encode(2, autopilot, 0x80 if armed else 0, custom, 4))
+
+    def odometry(self, p=(1.0, 2.0, -3.0), q=TURNED, v=(0.1, 0.2, 0.3), rates=(0.4, 0.5, 0.6), frame=1, child=1, us=0):
+        nan = [math.nan] * 21
+        self.says(self.out.odometry_encode(us, frame, child, *p, list(q), *v, *rates, nan, nan))
+
+
+@pytest.fixture
+def link(wire):
+    return MavlinkLink(wire)
+
+
+@pytest.fixture
+def px4(wire, link):
+    speaker = Speaker(wire, link)
+    speaker.alive()
+    return speaker
+
+
+def heard_back(wire):
+    """What was said, read by a parser of its own."""
+    parser = mavlink.MAVLink(None)
+    return [m for data, _ in wire.sent for m in parser.parse_buffer(data) or []]
+
+
+def said(wire, kind):
+    return [m for m in heard_back(wire) if m.get_type() == kind]
+
+
+def test_the_first_autopilot_is_the_one(wire, link):
+    Speaker(wire, link, system=255).alive(INVALID)  # a ground station
+    assert link.system is None
+    Speaker(wire, link, system=3).alive()
+    assert (link.system, link.autopilot, link.mode, link.armed) == ((3, 1), PX4, (6, 0), True)
+    Speaker(wire, link, system=4).alive(mode=(4, 6))
+    Speaker(wire, link, system=3, peer=("127.0.0.1", 9)).alive(mode=(4, 6))
+    assert (link.system, link.mode, link.ignored) == ((3, 1), (6, 0), 3)
+
+
+def test_a_state_is_told_in_our_frames(px4, link):
+    px4.odometry()
+    np.testing.assert_allclose(link.reading.p, [2.0, 1.0, 3.0], atol=1e-6)
+    np.testing.assert_allclose(link.reading.v, [0.2, 0.1, -0.3], atol=1e-6)
+    np.testing.assert_allclose(link.reading.omega, [0.4, -0.5, -0.6], atol=1e-6)
+    np.testing.assert_allclose(link.reading.R, frames.attitude_of(TURNED), atol=1e-6)
+
+
+def test_a_velocity_in_body_axes_is_the_same_velocity(px4, link):
+    px4.odometry()
+    world, R = link.reading.v, link.reading.R
+    px4.odometry(v=frames.turned_body(R.T @ world), child=12)
+    np.testing.assert_allclose(link.reading.v, world, atol=1e-6)
+
+
+def test_position_and_attitude_of_one_instant_do_for_a_state(px4, link):
+    place = px4.out.local_position_ned_encode(1000, 1.0, 2.0, -3.0, 0.1, 0.2, 0.3)
+    px4.says(place)
+    assert link.reading is None
+    px4.says(px4.out.attitude_quaternion_encode(900, *TURNED, 0.4, 0.5, 0.6), place)
+    assert link.reading is None  # a tenth of a second apart
+    px4.says(px4.out.attitude_quaternion_encode(1010, *TURNED, 0.4, 0.5, 0.6), place)
+    np.testing.assert_allclose(link.reading.p, [2.0, 1.0, 3.0], atol=1e-6)
+    np.testing.assert_allclose(link.reading.omega, [0.4, -0.5, -0.6], atol=1e-6)
+
+
+def test_a_frame_that_is_not_known_is_named(px4):
+    with pytest.raises(PlantError, match="ODOMETRY in frame 7"):
+        px4.odometry(frame=7)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"p": (math.nan, 0.0, 0.0)}, {"v": (0.0, math.inf, 0.0)}, {"q": (0.0, 0.0, 0.0, 0.0)}, {"q": (9, 0, 0, 0)}],
+)
+def test_a_state_that_makes_no_sense_is_ignored(px4, link, wrong):
+    px4.odometry()
+    before = link.reading
+    px4.odometry(**wrong)
+    assert link.reading is before
+    assert link.ignored == 1
+
+
+def test_stamps_are_of_our_clock(px4, wire, link):
+    began = time.monotonic()
+    for _ in range(12):
+        link.pump(time.monotonic() + 0.03)
+        for asked in said(wire, "TIMESYNC"):
+            if asked.tc1 == 0:
+                remote = 50.0 + 0.99 * (1e-9 * asked.ts1 - began)
+                px4.says(px4.out.timesync_encode(int(1e9 * remote), asked.ts1))
+        wire.sent.clear()
+    sent = time.monotonic()
+    px4.odometry(us=int(1e6 * (50.0 + 0.99 * (sent - 0.2 - began))))
+    assert link.reading.stamp == pytest.approx(sent - 0.2, abs=0.01)
+
+
+def test_it_says_that_it_is_there(px4, wire, link):
+    link.pump(time.monotonic() + 1.2)
+    assert 2 <= len(said(wire, "HEARTBEAT")) <= 4
+    assert len(said(wire, "TIMESYNC")) >= 8
+    assert {to for _, to in wire.sent} == {HERE}
+
+
+def test_nothing_is_said_to_nobody(wire, link):
+    link.pump(time.monotonic() + 0.1)
+    link.fly_rates(0.5, np.zeros(3))
+    link.fly_to(np.zeros(3), 0.0)
+    link.command(400, 1.0)
+    assert wire.sent == []
+
+
+def test_commands_are_told_in_its_frames(px4, wire, link):
+    link.fly_rates(0.4, np.array([0.1, 0.2, 0.3]))
+    (rates,) = said(wire, "SET_ATTITUDE_TARGET")
+    assert rates.type_mask == 128
+    told = [rates.thrust, rates.body_roll_rate, rates.body_pitch_rate, rates.body_yaw_rate]
+    assert told == pytest.approx([0.4, 0.1, -0.2, -0.3])
+    link.fly_to(np.array([1.0, 2.0, 3.0]), 0.0)
+    (place,) = said(wire, "SET_POSITION_TARGET_LOCAL_NED")
+    assert [place.x, place.y, place.z, place.yaw] == pytest.approx([2.0, 1.0, -3.0, math.pi / 2])
+
+
+def damaged(rng, whole, *, kinds=5):
+    """A packet that is not whole."""
+    kind = rng.integers(kinds)
+    packet = bytearray(whole[rng.integers(len(whole))])
+    if kind == 0:
+        return bytes(rng.integers(0, 256, rng.integers(0, 300), dtype=np.uint8))
+    if kind == 1:
+        return bytes(packet[: rng.integers(0, len(packet))])
+    if kind == 2:
+        return b"\xfd" + bytes(rng.integers(0, 256, rng.integers(0, 280), dtype=np.uint8))
+    if kind == 3:
+        packet[rng.integers(len(packet))] ^= 1 << rng.integers(8)
+        return bytes(packet)
+    return bytes(packet[rng.integers(1, len(packet)) :])  # on a line, the end of one that was cut before
+
+
+@pytest.mark.parametrize("datagrams", [True, False])
+def test_of_2000_damaged_packets_none_is_believed(wire, datagrams):
+    link, rng = MavlinkLink(wire, datagrams=datagrams), np.random.default_rng(0)
+    px4 = Speaker(wire, link)
+    px4.alive()
+    px4.odometry()
+    out = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+    nan = [math.nan] * 21
+    whole = [
+        m.pack(out)
+        for m in (
+            out.heartbeat_encode(2, PX4, 0, 4 << 16, 4),
+            out.odometry_encode(1, 1, 1, 7, 7, 7, [1.0, 0.0, 0.0, 0.0], 7, 7, 7, 7, 7, 7, nan, nan),
+            out.attitude_target_encode(1, 0, [1.0, 0.0, 0.0, 0.0], 0, 0, 0, 0.9),
+            out.statustext_encode(6, b"believe me"),
+        )
+    ]
+    before = link.reading
+    for _ in range(2000):
+        wire.inbox.append((damaged(rng, whole, kinds=5 if datagrams else 4), HERE))
+        link.pump(0.0)
+    assert link.reading is before
+    assert (link.mode, link.armed, list(link.thrusts), list(link.texts)) == ((6, 0), True, [], [])
+    assert link.ignored > 500
+    for _ in range(20 if not datagrams else 1):  # on a line, damage may swallow what follows it
+        px4.odometry(p=(4.0, 5.0, -6.0))
+    np.testing.assert_allclose(link.reading.p, [5.0, 4.0, 6.0], atol=1e-6)

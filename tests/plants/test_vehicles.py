@@ -1,0 +1,149 @@
+"""Conformance of links to vehicles, each flown against a peer that speaks its language. Time does not wait here."""
+
+import contextlib
+import importlib.util
+import subprocess
+import sys
+import time
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from retrim import Command, ConfigError, PlantError, Scenario, State, testing
+from retrim.config.plants import find_plant, is_vehicle
+from retrim.plants.bridges import mavlink
+from retrim.plants.bridges.mavlink_link import MavlinkLink
+
+PORT = 24560
+
+
+@contextlib.contextmanager
+def peer(*words, port=PORT):
+    """A process that stands in for an autopilot and its vehicle."""
+    if importlib.util.find_spec("pymavlink") is None:
+        pytest.skip("the extra mavlink is not installed")
+    command = [sys.executable, "-m", "retrim.testing.mavlink_peer", "--plant", "simple", "--port", str(port), *words]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    try:
+        assert "Ctrl-C ends it" in process.stdout.readline()
+        yield process
+    finally:
+        process.terminate()
+        process.wait()
+        process.stdout.close()
+
+
+def link(port=PORT, **changes):
+    return Scenario(plant=f"mavlink:udp:127.0.0.1:{port}", **changes).make("small")
+
+
+def test_mavlink_conforms():
+    with peer():
+        testing.check_vehicle(link)
+
+
+def test_another_vehicle_conforms():
+    testing.check_vehicle(lambda: Scenario(plant="made_up_vehicle:calm").make("small"))
+
+
+def hovering(plant):
+    """A plant that has just been handed over, a metre and a half above the ground."""
+    plant.reset(State.at(jnp.array([0.0, 0.0, 1.5])))
+    return plant
+
+
+def step_for(plant, seconds):
+    until = time.monotonic() + seconds
+    while time.monotonic() < until:
+        plant.step(Command.hover())
+
+
+def test_hover_thrust_is_learnt_and_a_pilot_who_takes_over_is_left_alone():
+    with peer("--takes-over", "1.0"):
+        plant = hovering(link())
+        vehicle = Scenario(plant="simple").make_vehicle("small")  # whose thrust is 3.5 % more than commanded
+        assert plant.hover == pytest.approx(float(9.81 * vehicle.mass / vehicle.thrust_max / 1.035), rel=0.02)
+        with pytest.raises(PlantError, match="left offboard mode"):
+            step_for(plant, 5.0)
+        began = time.monotonic()
+        plant.stop()
+        assert time.monotonic() - began < 1.0  # nothing was asked of it
+
+
+def test_silence_is_noticed():
+    with peer("--cut", "0.5", "60"):
+        plant = hovering(link())
+        with pytest.raises(PlantError, match="silent for 2 s"):
+            step_for(plant, 10.0)
+        plant.stop()
+
+
+def test_nobody_there_is_named(monkeypatch):
+    monkeypatch.setattr(mavlink, "HEARD_S", 0.3)
+    with link(PORT + 1) as plant, pytest.raises(PlantError, match=r"no autopilot was heard there in 0\.3 s"):
+        plant.connect()
+
+
+def test_a_port_that_is_taken_is_named():
+    pytest.importorskip("pymavlink")
+    plant, other = link(PORT + 2), mavlink.open_endpoint(f"udp:127.0.0.1:{PORT + 2}")
+    try:
+        with pytest.raises(PlantError, match="cannot be listened on"):
+            plant.connect()
+    finally:
+        other.close()
+
+
+@pytest.mark.parametrize("plant", ["mavlink", "mavlink:udp:127.0.0.1:14540", "mavlink:serial:/dev/ttyACM0:921600"])
+def test_a_vehicle_is_known_by_its_name_and_address(plant):
+    assert is_vehicle(plant)
+    assert find_plant(plant)[1] == plant.partition(":")[2]
+    assert Scenario(plant=plant).entry.is_vehicle
+
+
+@pytest.mark.parametrize("plant", ["bem", "simple", "made_up_vehicle:point"])
+def test_what_can_be_stopped_in_time_is_no_vehicle(plant):
+    assert is_vehicle(plant) == plant.startswith("made_up")
+
+
+@pytest.mark.parametrize(
+    ("asked", "why"),
+    [
+        ({"disturbance": "large"}, "a vehicle, whose world nobody can disturb by name"),
+        ({"sensors": "rough"}, "sensors 'rough' need bem or simple"),
+        ({"thrust_error": 0.1}, "its own thrust map"),
+        ({"delay": 0.05}, "its own command delay"),
+    ],
+)
+def test_what_a_vehicle_cannot_be_asked_is_refused_before_it_flies(asked, why):
+    with pytest.raises(ConfigError, match=why):
+        Scenario(plant="mavlink", **asked)
+
+
+@pytest.mark.parametrize("address", ["udp:nowhere", "14540", "tcp:127.0.0.1:5760"])
+def test_a_wrong_address_is_named_before_it_flies(address):
+    with pytest.raises(ConfigError, match="expected udp:HOST:PORT"):
+        Scenario(plant=f"mavlink:{address}")
+
+
+def test_a_rate_that_px4_does_not_take_is_refused():
+    with pytest.raises(ConfigError, match="10 to 250 Hz"):
+        Scenario(plant="mavlink").make("small", dt=0.2)
+
+
+def test_commands_stay_within_what_the_vehicle_takes():
+    plant = link()
+    plant.hover = 0.5
+
+    class Deaf(MavlinkLink):
+        def __init__(self):
+            self.sent = None
+
+        def fly_rates(self, thrust, omega):
+            self.sent = thrust, omega
+
+    plant._link = deaf = Deaf()
+    taken = plant.send(np.array([1e3, 99.0, -99.0, 0.0]))
+    assert deaf.sent[0] == 1.0
+    assert taken == pytest.approx([2 * 9.81, plant.high[1], plant.low[2], 0.0])
