@@ -1,0 +1,36 @@
+"""``retrim replay``."""
+
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import tyro
+
+from ..experiments.run import Run
+from ..replay.replay import Replay
+from ..replay.replay import replay as replayed
+from .console import RichReporter, show_paths, started
+
+LEFT = ("replay.md", "replay.png", "vehicle.toml", "adapted.safetensors", "delta.safetensors")
+
+
+def replay(
+    log: tyro.conf.Positional[Path],
+    asked: tyro.conf.OmitArgPrefixes[Replay] = Replay(),  # noqa: B008
+    out: Path | None = None,
+) -> Callable[[threading.Event], int]:
+    """Read a flight log: what the nominal model missed, and how well that is foretold; identify, adapt.
+
+    Args:
+        log: CSV, NPZ, ULog of PX4, bag of ROS 1 or 2, or MCAP; the last three need the extra `logs`.
+        asked: What to do with it.
+        out: Folder for the report, its picture, vehicle.toml and the policy; a new one under runs/ by default.
+    """
+
+    def ordered(stop: threading.Event) -> int:
+        run = started(Run("replay", out, stop=stop))
+        replayed(log, asked, run, RichReporter())
+        show_paths([path for name in LEFT if (path := run.folder / name).is_file()])
+        return run.exit_code
+
+    return ordered

@@ -1,0 +1,59 @@
+"""Attitudes of a log as rotation matrices."""
+
+from pathlib import Path
+
+import numpy as np
+
+from ...errors import LogError
+from .log_map import ANGLES, Attitude
+
+COLUMNS = {"xyzw": 4, "wxyz": 4, "matrix": 9, "roll pitch yaw": 3}
+OFF = 0.05  # by which the norm of a quaternion, or a product of columns, may miss its value
+RARE = 0.01  # share of samples that may miss it by more: these are left out
+
+
+def attitudes(values: np.ndarray, spec: Attitude, path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Return rotation matrices, (n, 3, 3), body to world in the frames of the log, and which samples are rotations.
+
+    Raises:
+        LogError: The numbers cannot be attitudes of this form.
+    """
+    from scipy.spatial.transform import Rotation  # here: it takes as long to import as all of retrim
+
+    if values.shape[1] != COLUMNS[spec.form]:
+        raise LogError(
+            f"{path}: attitude: form {spec.form!r} needs {COLUMNS[spec.form]} numbers, the fields hold "
+            f"{values.shape[1]}"
+        )
+    if spec.form == "roll pitch yaw":
+        angles = ANGLES[spec.unit] * values
+        if np.abs(angles).max() > 2.0 * np.pi + OFF:
+            raise LogError(
+                f"{path}: attitude: angles reach {np.abs(values).max():.4g} {spec.unit}; "
+                + ("are they in deg?" if spec.unit == "rad" else "no attitude is beyond a turn")
+            )
+        turned = Rotation.from_euler("ZYX", angles[:, ::-1])
+        good = np.ones(len(values), dtype=bool)
+    elif spec.form == "matrix":
+        R = values.reshape(-1, 3, 3)
+        off = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2))
+        good = _mostly(off < OFF, path, "matrices", "orthogonal")
+        if np.median(np.linalg.det(R)) < 0.0:
+            raise LogError(f"{path}: attitude: the matrices are mirrors, no rotations: an axis has the wrong sign")
+        turned = Rotation.from_matrix(np.where(good[:, None, None], R, np.eye(3)))
+    else:
+        norm = np.linalg.norm(values, axis=1)
+        good = _mostly(np.abs(norm - 1.0) < OFF, path, "quaternions", "of norm one")
+        ordered = values if spec.form == "xyzw" else np.roll(values, -1, axis=1)
+        turned = Rotation.from_quat(np.where(good[:, None], ordered, [0.0, 0.0, 0.0, 1.0]))
+    if spec.turns == "world to body":
+        turned = turned.inv()
+    return np.asarray(turned.as_matrix()), good
+
+
+def _mostly(good: np.ndarray, path: Path, what: str, right: str) -> np.ndarray:
+    if np.mean(~good) > RARE:
+        raise LogError(
+            f"{path}: attitude: {100 * np.mean(~good):.0f} % of the {what} are not {right}; are these the right fields?"
+        )
+    return good

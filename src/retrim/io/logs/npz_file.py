@@ -1,0 +1,52 @@
+"""Logs as NPZ: arrays whose first axis is time, as `retrim fly` writes them."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ...errors import LogError
+from .series import Clock, Series, missing_field
+
+
+def read_npz(
+    path: Path, wanted: Mapping[str, Sequence[str]], time: Clock | None
+) -> tuple[dict[str, Series], list[str]]:
+    """Read the arrays of an NPZ file; ``u[1:4]`` are columns of one. See :class:`~retrim.io.logs.series.LogReader`."""
+    if time is None:
+        raise LogError(f'{path}: an NPZ file needs a table [time] in the map, as field = "t" and unit = "s"')
+    try:
+        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
+            arrays = {name: np.asarray(file[name]) for name in file.files}
+    except Exception as error:  # whatever its parsers meet in bytes that are no NPZ
+        raise LogError(f"{path}: not a whole NPZ file ({error})") from error
+    t = _flat(path, time.field, arrays)[:, 0] * time.scale
+    found = dict[str, Series]()
+    for what, fields in wanted.items():
+        columns = [_flat(path, name, arrays) for name in fields]
+        for name, column in zip(fields, columns, strict=True):
+            if len(column) != len(t):
+                raise LogError(f"{path}: {name!r} has {len(column)} samples, but {time.field!r} has {len(t)}")
+        found[what] = Series(t, np.concatenate(columns, axis=1))
+    return found, []
+
+
+def _flat(path: Path, name: str, arrays: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return an array as samples x columns."""
+    base, _, part = name.partition("[")
+    if base not in arrays:
+        raise missing_field(path, base, list(arrays))
+    array = arrays[base]
+    if array.ndim == 0 or len(array) == 0 or array.dtype.kind not in "fiu":
+        raise LogError(f"{path}: {base!r} is no array of numbers over time")
+    columns = array.reshape(len(array), -1).astype(float)
+    if not part:
+        return columns
+    first, _, last = part.rstrip("]").partition(":")
+    try:
+        chosen = columns[:, int(first) : int(last) if last else int(first) + 1]
+    except ValueError as error:
+        raise LogError(f"{path}: field {name!r}: the columns must be as [0] or [0:3]") from error
+    if not chosen.size:
+        raise LogError(f"{path}: field {name!r}: {base!r} has {columns.shape[1]} columns")
+    return chosen

@@ -1,0 +1,148 @@
+"""What a map says of series: states and commands on one clock, in the frames and units of this package."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ...errors import LogError
+from ...physics.state import STANDARD_GRAVITY
+from ...plants.bridges.frames import BODY, WORLD
+from . import log_map as maps
+from .attitudes import attitudes
+from .log_map import LogMap
+from .resampling import around, derivative, held, held_mean, interpolated, known, period, turned
+from .series import Series
+
+ENU_OF = {"ENU": np.eye(3), "NED": WORLD}
+FLU_OF = {"FLU": np.eye(3), "FRD": np.diag(BODY)}
+UP = np.array([0.0, 0.0, STANDARD_GRAVITY])
+STATES = ("position", "velocity", "attitude")
+SLOWEST = 0.11  # [s]: states that come more rarely say nothing of accelerations
+ALIKE = 0.02  # share by which the periods of a log and of the control differ that count as the same
+COMMAND_HELD = 0.5  # [s]: some autopilots publish a command only when it changes
+
+
+@dataclass(frozen=True)
+class Ticks:
+    """A log on one clock; world ENU, body forward-left-up."""
+
+    t: np.ndarray
+    p: np.ndarray
+    R: np.ndarray
+    v: np.ndarray
+    a: np.ndarray
+    rates: np.ndarray
+    thrust: np.ndarray
+    """In the unit of the map; a share is still one; upwards."""
+    command: np.ndarray | None
+    known: np.ndarray
+    """Where all of these are."""
+    hover: np.ndarray | None
+    dt: float
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The clock."""
+
+    t: np.ndarray
+    dt: float
+    sampled: bool
+    """Whether these are the times of the states themselves."""
+
+
+def grid_of(path: Path, series: dict[str, Series], part: maps.Part, dt: float) -> Grid:
+    """Return the clock on which a log is read.
+
+    Raises:
+        LogError: States come too rarely, or the quantities have no time in common.
+    """
+    own = max(period(series[name]) for name in STATES)
+    slowest = max(STATES, key=lambda name: period(series[name]))
+    if own > SLOWEST:
+        raise LogError(
+            f"{path}: {slowest} comes every {own:.3g} s; accelerations need a sample every {SLOWEST:g} s at least"
+            + ("; is time in ms or us?" if own > 5.0 else "")
+        )
+    if own < 2e-5:
+        raise LogError(f"{path}: {slowest} comes every {own:.3g} s; is time in ms, us or ns?")
+    zero = min(each.t[0] for each in series.values())
+    first = max(max(each.t[0] for each in series.values()), zero + part.start)
+    last = min(min(series[name].t[-1] for name in STATES), np.inf if part.end is None else zero + part.end)
+    tick = dt if own <= (1.0 + ALIKE) * dt else own
+    if last - first < 4.0 * tick:
+        spans = "; ".join(f"{name} {s.t[0]:.2f} to {s.t[-1]:.2f} s" for name, s in series.items())
+        raise LogError(f"{path}: the quantities have no time in common: {spans}")
+    stamps = series["velocity"].t
+    alike = all(np.array_equal(series[name].t, stamps) for name in STATES)
+    steps = np.diff(stamps)
+    if alike and abs(own - tick) <= ALIKE * tick and np.all(np.abs(steps - own) < 0.25 * own):
+        return Grid(stamps[(stamps >= first) & (stamps <= last)], own, True)
+    return Grid(first + tick * np.arange(int((last - first) / tick + 1e-9) + 1), tick, False)
+
+
+def on_one_clock(path: Path, log_map: LogMap, series: dict[str, Series], grid: Grid) -> Ticks:
+    """Return what the map says of the series.
+
+    Raises:
+        LogError: A quantity has the wrong number of columns, or is no attitude.
+    """
+    W, B = ENU_OF[log_map.frames.world], FLU_OF[log_map.frames.body]
+    t, dt, of = grid.t, grid.dt, {name: _columns(path, name, series) for name in series}
+    there = np.all([known(each, t, dt) for name, each in of.items() if name in STATES], axis=0)
+    logged, rotations = attitudes(of["attitude"].values, log_map.attitude, path)
+    stamps = of["attitude"].t
+    R = logged[np.searchsorted(stamps, t)] if grid.sampled else turned(stamps[rotations], logged[rotations], t)
+    if not rotations.all():
+        there &= held(Series(stamps, rotations[:, None].astype(float)), t)[:, 0] > 0.5
+    R = W @ R @ B.T
+    p = maps.METRES[log_map.position.unit] * interpolated(of["position"], t) @ W.T
+    v = maps.SPEEDS[log_map.velocity.unit] * interpolated(of["velocity"], t)
+    v = v @ W.T if log_map.velocity.axes == "world" else np.einsum("nij,nj->ni", R, v @ B.T)
+    thrust = _told(of["thrust"], grid)[:, 0] * (1.0 if log_map.thrust.positive == "up" else -1.0)
+    there &= known(of["thrust"], t, dt, held=COMMAND_HELD)
+    command = measured = hover = None
+    if log_map.rates is not None:
+        command = maps.RATES[log_map.rates.unit] * _told(of["rates"], grid) @ B.T
+        there &= known(of["rates"], t, dt, held=COMMAND_HELD)
+    if log_map.measured_rates is not None:
+        measured = maps.RATES[log_map.measured_rates.unit] * interpolated(of["measured_rates"], t) @ B.T
+        there &= known(of["measured_rates"], t, dt)
+    if "hover" in of:
+        hover = held(of["hover"], t)[:, 0]
+    if log_map.acceleration is None:
+        a = derivative(v, dt)
+        there &= around(there, 2)
+    else:
+        a = maps.ACCELERATIONS[log_map.acceleration.unit] * interpolated(of["acceleration"], t)
+        a = a @ W.T if log_map.acceleration.axes == "world" else np.einsum("nij,nj->ni", R, a @ B.T)
+        a = a - UP * (log_map.acceleration.gravity == "felt")
+        there &= known(of["acceleration"], t, dt)
+    rates = turning(R, dt) if measured is None else measured
+    return Ticks(t, p, R, v, a, rates, thrust, command, there, hover, dt)
+
+
+def _told(command: Series, grid: Grid) -> np.ndarray:
+    """Return a command at each tick: its sample, or if it has times of its own the mean over the tick."""
+    sampled = grid.sampled and np.array_equal(np.intersect1d(command.t, grid.t), grid.t)
+    return held(command, grid.t) if sampled else held_mean(command, grid.t, grid.dt)
+
+
+def turning(R: np.ndarray, dt: float) -> np.ndarray:
+    """Return the body rates between attitudes on a grid, central, [rad/s]."""
+    from scipy.spatial.transform import Rotation  # here: it takes as long to import as all of retrim
+
+    before, after = np.concatenate([R[:1], R[:-1]]), np.concatenate([R[1:], R[-1:]])
+    span = np.full(len(R), 2.0 * dt)
+    span[[0, -1]] = dt
+    angle = Rotation.from_matrix(np.swapaxes(before, 1, 2) @ after).as_rotvec()
+    return np.asarray(angle / span[:, None])
+
+
+def _columns(path: Path, name: str, series: dict[str, Series]) -> Series:
+    """Return a series after a look at how many columns it has."""
+    wanted, found = {"thrust": 1, "hover": 1}.get(name, 3), series[name].values.shape[1]
+    if name != "attitude" and found != wanted:
+        raise LogError(f"{path}: {name} needs {wanted} number{'s' * (wanted > 1)}, its fields hold {found}")
+    return series[name]

@@ -1,0 +1,159 @@
+"""A flight as files for others: MCAP with messages of ROS 2, and the same as NPZ.
+
+Foxglove, PlotJuggler, rerun and ``ros2 bag`` open MCAP; it needs the extra ``mcap``. ``retrim replay`` reads both.
+"""
+
+import io
+import os
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...errors import ConfigError
+from ...runtime.events import Event
+from ..files import write_whole
+
+FRAME = "world"
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Ticks and events of a flight; states are p [m], R by rows, v [m/s], world."""
+
+    t: np.ndarray
+    """Times since the start [s], (n,)."""
+    measured: np.ndarray
+    """What the pilot was shown, (n, 15)."""
+    true: np.ndarray
+    """(n, 15)"""
+    age: np.ndarray
+    """How old what was shown is [s], (n,)."""
+    command: np.ndarray
+    """The command that follows: c [m/s^2], omega [rad/s], (n, 4)."""
+    error: np.ndarray
+    """The task's error [m], (n,)."""
+    target: np.ndarray | None = None
+    """Where the vehicle should have been, world [m], (n, 3)."""
+    flown_by: Sequence[str] | None = None
+    """Who flew, (n,)."""
+    policy_age: np.ndarray | None = None
+    """How old the flight is that the policy was learnt from [s], (n,)."""
+    events: Sequence[Event] = ()
+    terminated: bool = False
+
+
+def check_recording(path: Path) -> Path:
+    """Return where a recording goes, before anything is flown.
+
+    Raises:
+        ConfigError: It cannot be written there, or what writes it is not installed.
+    """
+    if path.suffix != ".mcap":
+        raise ConfigError(f"--record {path}: the name must end with .mcap")
+    if not can_record():
+        raise ConfigError("--record needs rosbags: pip install 'retrim[mcap]'")
+    if path.is_dir():
+        raise ConfigError(f"--record {path}: it is a folder")
+    if not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
+        raise ConfigError(f"--record {path}: nothing can be written in {path.parent}")
+    return path
+
+
+def can_record() -> bool:
+    """Return whether what writes MCAP is installed."""
+    return find_spec("rosbags") is not None
+
+
+def write_npz(path: Path, flight: Recording) -> None:
+    """Write arrays over time; the file appears when it is whole."""
+    arrays = {"t": flight.t, "u": flight.command, "age": flight.age, "error": flight.error}
+    for end, x in (("", flight.true), ("_measured", flight.measured)):
+        arrays |= {f"p{end}": x[:, :3], f"R{end}": x[:, 3:12].reshape(-1, 3, 3), f"v{end}": x[:, 12:15]}
+    if flight.target is not None:
+        arrays["target"] = flight.target
+    data = io.BytesIO()
+    np.savez_compressed(data, allow_pickle=False, terminated=flight.terminated, **arrays)
+    write_whole(path, data.getvalue())
+
+
+def write_mcap(path: Path, flight: Recording) -> None:
+    """Write messages of ROS 2; the file appears when it is whole."""
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+    from scipy.spatial.transform import Rotation  # here: it takes as long to import as all of retrim
+
+    types = get_typestore(Stores.ROS2_JAZZY)
+    make = _Messages(types.types)
+    quaternions = [Rotation.from_matrix(x[:, 3:12].reshape(-1, 3, 3)).as_quat() for x in (flight.measured, flight.true)]
+    with tempfile.TemporaryDirectory(dir=path.parent) as place:
+        bag = Path(place) / "flight"
+        with Writer(bag, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+            topics: dict[str, Any] = {}
+
+            def add(topic: str, t: float, message: Any) -> None:
+                if topic not in topics:
+                    topics[topic] = writer.add_connection(topic, message.__msgtype__, typestore=types)
+                writer.write(topics[topic], _ns(t), types.serialize_cdr(message, message.__msgtype__))
+
+            for k, t in enumerate(flight.t.tolist()):
+                x, truth, u = flight.measured[k], flight.true[k], flight.command[k]
+                seen = t - float(flight.age[k])  # the header says when a state was true, the log when it came
+                add("/measured/pose", t, make.pose(seen, x, quaternions[0][k]))
+                add("/measured/velocity", t, make.twist(seen, x[12:15], np.zeros(3)))
+                add("/true/pose", t, make.pose(t, truth, quaternions[1][k]))
+                add("/true/velocity", t, make.twist(t, truth[12:15], np.zeros(3)))
+                add("/command", t, make.twist(t, np.array([0.0, 0.0, u[0]]), u[1:]))
+                add("/error", t, make.number(float(flight.error[k])))
+                if flight.target is not None:
+                    add("/reference", t, make.point(t, flight.target[k]))
+                if flight.flown_by is not None:
+                    add("/flown_by", t, make.text(flight.flown_by[k]))
+                if flight.policy_age is not None:
+                    add("/age/policy", t, make.number(float(flight.policy_age[k])))
+            for event in sorted(flight.events, key=lambda event: event.t):
+                add("/events", max(0.0, event.t), make.text(f"{event.kind}: {event.note}"))
+        next(bag.glob("*.mcap")).replace(path)
+
+
+class _Messages:
+    """Messages of ROS 2; thrust is in linear.z of a command [m/s^2], body rates are its angular part [rad/s]."""
+
+    def __init__(self, types: Any) -> None:
+        self._types = types
+
+    def pose(self, t: float, x: np.ndarray, q: np.ndarray) -> Any:
+        orientation = self._of("geometry_msgs/msg/Quaternion", *map(float, q))
+        pose = self._of("geometry_msgs/msg/Pose", self._xyz("Point", x[:3]), orientation)
+        return self._of("geometry_msgs/msg/PoseStamped", self._header(t), pose)
+
+    def twist(self, t: float, linear: np.ndarray, angular: np.ndarray) -> Any:
+        twist = self._of("geometry_msgs/msg/Twist", self._xyz("Vector3", linear), self._xyz("Vector3", angular))
+        return self._of("geometry_msgs/msg/TwistStamped", self._header(t), twist)
+
+    def point(self, t: float, p: np.ndarray) -> Any:
+        return self._of("geometry_msgs/msg/PointStamped", self._header(t), self._xyz("Point", p))
+
+    def number(self, value: float) -> Any:
+        return self._of("std_msgs/msg/Float64", value)
+
+    def text(self, value: str) -> Any:
+        return self._of("std_msgs/msg/String", value)
+
+    def _header(self, t: float) -> Any:
+        stamp = self._of("builtin_interfaces/msg/Time", *divmod(_ns(t), 10**9))
+        return self._of("std_msgs/msg/Header", stamp, FRAME)
+
+    def _xyz(self, kind: str, a: np.ndarray) -> Any:
+        return self._of(f"geometry_msgs/msg/{kind}", *map(float, a))
+
+    def _of(self, kind: str, *values: Any) -> Any:
+        return self._types[kind](*values)
+
+
+def _ns(t: float) -> int:
+    return round(1e9 * max(t, 0.0))

@@ -1,0 +1,77 @@
+"""Series on one clock: states between samples by interpolation, commands held until the next."""
+
+import numpy as np
+
+from .series import Series
+
+GAP = 2.5  # periods without a sample after which a quantity is not known
+
+
+def period(series: Series) -> float:
+    """Return the median time between samples [s]."""
+    return float(np.median(np.diff(series.t)))
+
+
+def known(series: Series, grid: np.ndarray, dt: float, *, held: float = 0.0) -> np.ndarray:
+    """Return where on a grid a series is known: between samples that are not far apart.
+
+    Args:
+        series: Samples.
+        grid: Times [s].
+        dt: Period of the grid [s].
+        held: For a command: how long it holds at least without a new one [s].
+    """
+    longest = max(GAP * max(period(series), dt), held)
+    after = np.searchsorted(series.t, grid, side="right")
+    inside = (grid >= series.t[0]) & (grid <= series.t[-1])
+    left, right = np.clip(after - 1, 0, len(series.t) - 1), np.clip(after, 0, len(series.t) - 1)
+    at_sample = series.t[left] == grid
+    found: np.ndarray = inside & (at_sample | (series.t[right] - series.t[left] <= longest))
+    return found
+
+
+def interpolated(series: Series, grid: np.ndarray) -> np.ndarray:
+    """Return the values at the times of a grid, linear between samples."""
+    return np.stack([np.interp(grid, series.t, column) for column in series.values.T], axis=1)
+
+
+def held(series: Series, grid: np.ndarray) -> np.ndarray:
+    """Return the last value before or at each time of a grid."""
+    return series.values[np.clip(np.searchsorted(series.t, grid, side="right") - 1, 0, None)]
+
+
+def held_mean(series: Series, grid: np.ndarray, dt: float) -> np.ndarray:
+    """Return the mean of a command over each tick that begins at a time of a grid; each value holds until the next."""
+    steps = np.diff(series.t)[:, None]
+    total = np.concatenate([np.zeros((1, series.values.shape[1])), np.cumsum(series.values[:-1] * steps, axis=0)])
+    end = series.t[-1] + 2.0 * dt
+    t = np.concatenate([series.t, [end]])
+    total = np.concatenate([total, total[-1:] + series.values[-1:] * (end - series.t[-1])])
+    both = [np.stack([np.interp(at, t, column) for column in total.T], axis=1) for at in (grid, grid + dt)]
+    return np.asarray((both[1] - both[0]) / dt)
+
+
+def turned(t: np.ndarray, R: np.ndarray, grid: np.ndarray) -> np.ndarray:
+    """Return attitudes at the times of a grid, on the shortest way between samples."""
+    from scipy.spatial.transform import Rotation, Slerp  # here: it takes as long to import as all of retrim
+
+    inside = np.clip(grid, t[0], t[-1])
+    return np.asarray(Slerp(t, Rotation.from_matrix(R))(inside).as_matrix())
+
+
+def derivative(values: np.ndarray, dt: float) -> np.ndarray:
+    """Return the derivative of columns on a grid, by five points; two rows at each end repeat their neighbour."""
+    inner = (values[:-4] - 8.0 * values[1:-3] + 8.0 * values[3:-1] - values[4:]) / (12.0 * dt)
+    return np.concatenate([inner[:1], inner[:1], inner, inner[-1:], inner[-1:]])
+
+
+def smoothed(x: np.ndarray, rows: int) -> np.ndarray:
+    """Return the mean of a column over about ``rows`` rows around each; fewer at the ends."""
+    kernel = np.ones(min(rows, len(x)))
+    return np.asarray(np.convolve(x, kernel, mode="same") / np.convolve(np.ones(len(x)), kernel, mode="same"))
+
+
+def around(valid: np.ndarray, reach: int) -> np.ndarray:
+    """Return where all rows up to ``reach`` before and after are valid."""
+    padded = np.concatenate([np.zeros(reach, bool), valid, np.zeros(reach, bool)])
+    return np.asarray(np.all([padded[k : k + len(valid)] for k in range(2 * reach + 1)], axis=0))

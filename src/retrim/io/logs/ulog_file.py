@@ -1,0 +1,74 @@
+"""Logs of PX4 (ULog). Needs the extra ``logs``.
+
+A field is ``topic.field``, as ``vehicle_local_position.vx``; ``vehicle_attitude.q`` is the whole array, and
+``topic#1.field`` the second instance of a topic.
+"""
+
+import contextlib
+import io
+import re
+from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...errors import LogError
+from .series import Clock, Series, missing_field
+
+MICROSECOND = 1e-6
+
+
+def read_ulog(
+    path: Path, wanted: Mapping[str, Sequence[str]], time: Clock | None
+) -> tuple[dict[str, Series], list[str]]:
+    """Read topics of a ULog; see :class:`~retrim.io.logs.series.LogReader`. Times are the topics' own."""
+    if find_spec("pyulog") is None:
+        raise LogError(f"{path}: a ULog needs pyulog: pip install 'retrim[logs]'")
+    log = _parsed(path)
+    topics = {f"{d.name}#{d.multi_id}" if d.multi_id else d.name: d for d in log.data_list}
+    notes = ["the file is damaged; what could be read is used"] if log.file_corruption else []
+    if log.dropouts:
+        lost = sum(each.duration for each in log.dropouts) / 1000.0
+        notes.append(f"the logger dropped out {len(log.dropouts)} times, for {lost:.2f} s in all")
+    found = dict[str, Series]()
+    for what, fields in wanted.items():
+        parts = [_field(path, name, topics) for name in fields]
+        if len({id(topic) for topic, _ in parts}) > 1:
+            raise LogError(f"{path}: the fields of {what} come from several topics: {', '.join(fields)}")
+        topic = parts[0][0]
+        stamp = "timestamp_sample" if "timestamp_sample" in topic.data else "timestamp"
+        if stamp not in topic.data:
+            raise LogError(f"{path}: topic {topic.name!r} has no time")
+        t = MICROSECOND * topic.data[stamp].astype(float)
+        columns = [topic.data[key].astype(float) for _, keys in parts for key in keys]
+        found[what] = Series(t, np.stack(columns, axis=1))
+    return found, notes
+
+
+def _parsed(path: Path) -> Any:
+    from pyulog import ULog
+
+    try:
+        with path.open("rb") as file, contextlib.redirect_stdout(io.StringIO()):  # it prints what it finds wrong
+            log = ULog(file)
+    except Exception as error:  # whatever its parser meets in bytes that are no ULog
+        raise LogError(f"{path}: cannot be read as ULog ({type(error).__name__}: {error})") from error
+    if not log.data_list:
+        raise LogError(f"{path}: this ULog holds no topic")
+    return log
+
+
+def _field(path: Path, name: str, topics: Mapping[str, Any]) -> tuple[Any, list[str]]:
+    """Return the topic of a field, and its columns."""
+    topic, _, field = name.partition(".")
+    if topic not in topics:
+        raise missing_field(path, topic, sorted(topics))
+    data = topics[topic].data
+    if field in data:
+        return topics[topic], [field]
+    elements = [key for key in data if re.fullmatch(re.escape(field) + r"\[\d+\]", key)]
+    if not elements:
+        raise missing_field(path, name, [f"{topic}.{key}" for key in data])
+    return topics[topic], sorted(elements, key=lambda key: int(key[len(field) + 1 : -1]))

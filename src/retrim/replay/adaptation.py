@@ -1,0 +1,103 @@
+"""A policy that is re-trained in the model that a log has corrected."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import random
+from jaxtyping import Array, Key
+
+from ..adapt.gate import all_finite
+from ..adapt.learner import LearnerState
+from ..config.setup import Setup
+from ..control.policy import Policy
+from ..errors import LogError
+from ..experiments.reporter import Reporter
+from ..experiments.training import model_error
+from ..learn.residuals.model import FittedResidual
+from ..learn.residuals.targets import Targets
+from ..learn.window import Window
+from ..physics.state import Command
+
+SETTLED = 5  # refused updates in a row after which nothing more is to be gained
+ENOUGH = 0.5  # share of a window that must be valid
+
+
+class Adapted(NamedTuple):
+    """Result of adapting to a log."""
+
+    state: LearnerState
+    admitted: int
+    """Updates that the gate let through."""
+    tried: int
+    before: float
+    """Error of the policy as it was, in the corrected model [m]."""
+    after: float
+    """Error of the policy as it is."""
+
+
+def adapt_to(
+    rows: Targets, setup: Setup, policy: Policy, *, low_rank: bool, updates: int, seed: int, reporter: Reporter
+) -> Adapted:
+    """Fit the residual to a log, window by window as in flight, and re-train the policy in the corrected model.
+
+    Updates start where the task says: a log's places are not those of the task. Each passes the gate, or is dropped.
+
+    Args:
+        rows: Of the log, one tick of the preset apart.
+        setup: Of the policy.
+        policy: What is re-trained.
+        low_rank: Whether only a low-rank delta is.
+        updates: How many updates at most.
+        seed: Of the learners.
+        reporter: Receives the progress.
+
+    Raises:
+        LogError: No window of the log has enough of a flight.
+    """
+    k_init, k_delta, k_starts, k_learn = random.split(random.key(seed), 4)
+    learner = setup.learner
+    state = learner.init(setup.low_rank(policy, k_delta) if low_rank else policy, k_init)
+    residual, trained, window = _fitted(rows, setup, state.residual), state.policy, _starts(setup, k_starts)
+    admitted = refused = tried = 0
+    with reporter.progress("re-training") as advance:
+        advance(0.0, "compiling")
+        for key in random.split(k_learn, updates):
+            candidate, verdict = learner.update_policy(trained, residual, window, key)
+            tried, refused = tried + 1, refused + 1
+            if bool(verdict.admitted):
+                trained, admitted, refused = candidate, admitted + 1, 0
+            advance(tried / updates, verdict.reason())
+            if refused == SETTLED:
+                break
+        advance(1.0, f"{admitted} of {tried} updates were better")
+    known = FittedResidual(learner.residual_model, residual)
+    before, after = (model_error(setup, each.policy.merged(), known) for each in (state.policy, trained))
+    return Adapted(LearnerState(trained, residual), admitted, tried, before, after)
+
+
+def _fitted(rows: Targets, setup: Setup, state: Any) -> Any:
+    """Return the state of the residual model after the last whole window."""
+    a, dt = setup.preset.adapt, setup.preset.dt
+    fit = eqx.filter_jit(lambda state, rows: setup.learner.residual_model.fit(state, rows))
+    fitted = 0
+    for last in range(a.window, rows.valid.shape[0] + 1, max(1, round(a.fit_every / dt))):
+        part: Targets = jax.tree.map(lambda leaf, last=last: leaf[last - a.window : last], rows)
+        if float(np.mean(part.valid)) < ENOUGH:
+            continue
+        new, _ = fit(state, part)
+        if bool(all_finite(new)):
+            state, fitted = new, fitted + 1
+    if not fitted:
+        raise LogError(f"the log has no {a.window * dt:g} s of flight in one piece, which the learner's window takes")
+    return state
+
+
+def _starts(setup: Setup, key: Key[Array, ""]) -> Window:
+    """Return starts of the task in the place of states of the flight."""
+    n = setup.preset.adapt.window
+    starts = jax.vmap(setup.learner.env.task.reset)(random.split(key, n))
+    hover = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n, *leaf.shape)), Command.hover(starts.x.p.dtype))
+    return Window(starts.t, starts.x, hover, jnp.ones(n, dtype=bool))

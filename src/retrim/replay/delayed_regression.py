@@ -1,0 +1,124 @@
+"""Linear least squares on commands that come late and act behind a lag, for a grid of both, block by block."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+DELAYS = np.arange(0.0, 0.1601, 0.005)  # [s]
+LAGS = np.concatenate([[0.0], np.geomspace(0.005, 1.0, 33)])  # [s]
+EXPLAINED = 0.6  # share that commands must explain; see Channel.told
+POOLS = (1, 5)  # rows of which the mean is explained
+PIECES = 3.0  # blocks, at least, from which it comes
+
+Features = Callable[[float, float], np.ndarray]
+"""From a delay and a lag [s] to the features of each row, (n, outputs, k)."""
+
+
+class Sums(NamedTuple):
+    """Sums of squares of each block, for every pair of delay and lag."""
+
+    xx: np.ndarray
+    """(delays, lags, blocks, k, k)"""
+    xy: np.ndarray
+    """(delays, lags, blocks, k)"""
+    yy: np.ndarray
+    """(blocks,)"""
+    n: np.ndarray
+    """(blocks,)"""
+
+    @classmethod
+    def of(
+        cls, features: Features, y: np.ndarray, blocks: np.ndarray, delays: np.ndarray, lags: np.ndarray, pool: int
+    ) -> "Sums":
+        """Add up ``y`` (n, outputs) and its features over the rows of each block, in means of ``pool`` of them."""
+
+        def pooled(rows: np.ndarray) -> np.ndarray:
+            parts = rows[blocks.reshape(len(blocks), -1, pool)].mean(axis=2)
+            return np.asarray(parts.reshape(len(blocks), -1, *parts.shape[3:]))
+
+        xx, xy = [], []
+        Y = pooled(y[..., None])[..., 0].reshape(len(blocks), -1)
+        for delay in delays:
+            for lag in lags:
+                X = pooled(features(float(delay), float(lag)).reshape(len(y), y.shape[1], -1))
+                X = X.reshape(len(blocks), -1, X.shape[-1])
+                xx.append(np.swapaxes(X, 1, 2) @ X)
+                xy.append((np.swapaxes(X, 1, 2) @ Y[:, :, None])[:, :, 0])
+        shape, k = (len(delays), len(lags), len(blocks)), np.shape(xy)[-1]
+        squares = np.sum(Y**2, axis=1)
+        count = np.full(len(blocks), float(Y.shape[1]))
+        return cls(np.reshape(xx, (*shape, k, k)), np.reshape(xy, (*shape, k)), squares, count)
+
+    def fit(self, draw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the misfit of each pair, n log(mean square), and its parameters, where blocks count so often."""
+        xx, xy = np.einsum("dlbij,b->dlij", self.xx, draw), np.einsum("dlbi,b->dli", self.xy, draw)
+        size = np.sqrt(np.einsum("dlii->dli", xx) + 1e-12)
+        scaled = xx / size[..., :, None] / size[..., None, :] + 1e-9 * np.eye(xx.shape[-1])
+        theta = np.linalg.solve(scaled, (xy / size)[..., None])[..., 0] / size
+        left = np.maximum(self.yy @ draw - np.einsum("dli,dli->dl", theta, xy), 1e-12)
+        count = self.n @ draw
+        return count * np.log(left / count), theta
+
+    def left(self) -> np.ndarray:
+        """Return what the best pair leaves of each block."""
+        misfit, theta = self.fit(np.ones(len(self.yy)))
+        best = np.unravel_index(np.argmin(misfit), misfit.shape)
+        t, xx, xy = theta[best], self.xx[best], self.xy[best]
+        return np.asarray(self.yy - 2.0 * xy @ t + np.einsum("i,bij,j->b", t, xx, t))
+
+
+class Channel(NamedTuple):
+    """One output of a vehicle behind its command."""
+
+    sums: Sums
+    still: Sums
+    """With the command at its mean."""
+
+    @classmethod
+    def of(
+        cls,
+        features: Callable[[np.ndarray], np.ndarray],
+        acting: Features,
+        y: np.ndarray,
+        blocks: np.ndarray,
+    ) -> "Channel":
+        """Build a channel; where single rows are too noisy to tell, of means of a few.
+
+        Args:
+            features: From the acting command to the features of each row.
+            acting: From a delay and a lag to the acting command.
+            y: What is explained, (n, outputs).
+            blocks: Rows of each block, a multiple of ten.
+        """
+        rest, none = acting(0.0, 0.0), np.zeros(1)
+        mean = np.broadcast_to(rest[blocks].mean(axis=(0, 1)), rest.shape)
+        for pool in POOLS:
+            made = cls(
+                Sums.of(lambda delay, lag: features(acting(delay, lag)), y, blocks, DELAYS, LAGS, pool),
+                Sums.of(lambda delay, lag: features(mean), y, blocks, none, none, pool),
+            )
+            if made.told():
+                break
+        return made
+
+    def told(self) -> bool:
+        """Whether the log says how the output follows: its changes are explained by those of the command.
+
+        Where a controller answers the noise of a measurement, the noise of the next difference of measurements looks
+        as if it followed at once, and up to half of it is explained by that. So more than half must be.
+        """
+        before, after = self.still.left(), self.sums.left()
+        won = np.clip(before - after, 0.0, None)
+        pieces = won.sum() ** 2 / max(float(np.sum(won**2)), 1e-12)
+        return bool(1.0 - after.sum() / max(float(before.sum()), 1e-12) > EXPLAINED and pieces > PIECES)
+
+
+def lowest(grid: np.ndarray, misfit: np.ndarray, k: int) -> float:
+    """Return the minimum of a parabola through the lowest point of a grid and its neighbours."""
+    if not 0 < k < len(grid) - 1:
+        return float(grid[k])
+    curvature, slope, _ = np.polyfit(grid[k - 1 : k + 2] - grid[k], misfit[k - 1 : k + 2], 2)
+    if curvature <= 0.0:
+        return float(grid[k])
+    return float(np.clip(grid[k] - 0.5 * slope / curvature, grid[k - 1], grid[k + 1]))

@@ -1,0 +1,94 @@
+"""How well the next seconds of a log are foretold from the last ones."""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+
+import jax
+import numpy as np
+
+from ..errors import LogError
+from ..learn.residuals.targets import Targets
+from .predictors import Predictor
+
+EVERY = 3.0  # [s] between fits, as in the paper
+ENOUGH = 0.5  # share of a buffer or a horizon that must be valid
+
+
+@dataclass(frozen=True)
+class Foretold:
+    """One predictor on one log."""
+
+    name: str
+    rmse: float
+    """Root of the sum over axes of the mean over windows of the mean squared error [m/s^2]."""
+    per_axis: tuple[float, float, float]
+    """World x, y, z [m/s^2]."""
+    per_window: tuple[float, ...]
+    """Root of the sum over axes of each window [m/s^2]."""
+    times: tuple[float, ...]
+    """When each was foretold, since the beginning of the log [s]."""
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """What is fitted and foretold."""
+
+    buffer: float = 5.0
+    """[s]"""
+    horizon: float = 5.0
+    """[s]"""
+    every: float = EVERY
+    """Time between fits [s]."""
+
+    def windows(self, valid: np.ndarray, dt: float) -> list[tuple[int, int, int]]:
+        """Return first tick, fit and last tick of each window that has enough of a flight.
+
+        Raises:
+            LogError: There is none.
+        """
+        buffer, horizon, every = (max(1, round(x / dt)) for x in (self.buffer, self.horizon, self.every))
+        found = []
+        for now in range(buffer, len(valid) - horizon + 1, every):
+            before, after = valid[now - buffer : now], valid[now : now + horizon]
+            if before.mean() >= ENOUGH and after.mean() >= ENOUGH:
+                found.append((now - buffer, now, now + horizon))
+        if not found:
+            raise LogError(
+                f"the log has {np.sum(valid) * dt:.1f} s of flight, and no {self.buffer + self.horizon:g} s of it in "
+                f"one piece; choose a shorter --buffer or --horizon"
+            )
+        return found
+
+
+def foretell(
+    rows: Targets, dt: float, predictors: Mapping[str, Callable[[], Predictor]], protocol: Protocol
+) -> Iterator[Foretold]:
+    """Fit and foretell window by window, predictor by predictor.
+
+    Args:
+        rows: Of the whole log.
+        dt: Tick [s].
+        predictors: How to begin each anew.
+        protocol: Buffer, horizon, time between fits.
+
+    Raises:
+        LogError: The log is too short.
+    """
+    windows = protocol.windows(np.asarray(rows.valid), dt)
+    parts = [(_part(rows, first, now), _part(rows, now, last)) for first, now, last in windows]
+    for name, begin in predictors.items():
+        predictor, squares = begin(), []
+        for buffer, ahead in parts:
+            valid = np.asarray(ahead.valid)
+            missed = (np.asarray(ahead.a_res) - predictor(buffer)(ahead))[valid]
+            squares.append(np.mean(missed**2, axis=0))
+        mean = np.mean(squares, axis=0)
+        x, y, z = np.sqrt(mean)
+        per_window = tuple(float(np.sqrt(square.sum())) for square in squares)
+        times = tuple(round(now * dt, 6) for _, now, _ in windows)
+        yield Foretold(name, float(np.sqrt(mean.sum())), (float(x), float(y), float(z)), per_window, times)
+
+
+def _part(rows: Targets, first: int, last: int) -> Targets:
+    found: Targets = jax.tree.map(lambda leaf: leaf[first:last], rows)
+    return found

@@ -1,0 +1,164 @@
+"""What a log says of the vehicle: thrust map, drag, command delay, and the lags of thrust and body rates.
+
+Over each tick the mean acceleration is the difference of velocities, and the mean body rate that of attitudes; both are
+compared with commands that come late and act behind a first-order lag, for a grid of delays and lags. Given these, the
+rest is linear least squares. Intervals are those of a bootstrap over blocks of two seconds, since what one tick misses
+the next one misses too.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from ..errors import LogError
+from ..io.logs import FlightLog
+from ..io.logs.on_one_clock import UP
+from .delayed_regression import DELAYS, LAGS, Channel, lowest
+from .rows import acting
+
+BLOCK, DRAWS = 2.0, 200  # [s] of a block, and how many samples the bootstrap draws
+INSIDE = (5.0, 95.0)  # percentiles of an interval
+WARM = 0.3  # [s] at the beginning of a piece of flight in which a lag remembers what was not seen
+SLOW = 0.3  # [m/s], root mean square of the velocity along an axis, below which drag is not seen
+
+
+class Estimate(NamedTuple):
+    """A number, and the interval that holds it with 90 %."""
+
+    value: float
+    low: float
+    high: float
+
+    def text(self, unit: str, scale: float = 1.0) -> str:
+        """Return it in words."""
+        value, low, high = (scale * x for x in self)
+        return f"{value:.3g}{unit and ' '}{unit} ({low:.3g} to {high:.3g})"
+
+
+@dataclass(frozen=True)
+class Identified:
+    """What is known of a vehicle. None: the log does not say."""
+
+    delay: Estimate | None
+    """Of commands [s]."""
+    thrust_gain: Estimate | None
+    """Thrust per commanded thrust [-]."""
+    thrust_offset: Estimate | None
+    """Acceleration upwards that is there without a command [m/s^2]."""
+    full_thrust: Estimate | None
+    """For a thrust that is a share: what all of it gives [m/s^2]."""
+    thrust_lag: Estimate | None
+    """[s]"""
+    rate_lag: Estimate | None
+    """Of roll and pitch, which have one [s]."""
+    rate_gain: Estimate | None
+    """Body rate per commanded body rate [-]."""
+    yaw_lag: Estimate | None
+    """[s]"""
+    yaw_gain: Estimate | None
+    drag: tuple[Estimate | None, Estimate | None, Estimate | None]
+    """Linear drag along the body axes [1/s]."""
+    unexplained: float
+    """Root mean square of the acceleration that is left, three axes [m/s^2]."""
+
+
+def identify(log: FlightLog, *, seed: int = 0) -> Identified:
+    """Identify a vehicle from a flight.
+
+    Args:
+        log: The flight; the more it moves and turns the more is known.
+        seed: Of the bootstrap.
+
+    Raises:
+        LogError: The flight is too short.
+    """
+    blocks = _blocks(log)
+    if len(blocks) < 4:
+        raise LogError(f"{len(blocks) * BLOCK:g} s of flight in one piece are left; identification needs 8 s at least")
+    thrust = _thrust(log, blocks)
+    rates = {} if log.command is None else {
+        name: _rates(log, log.command, blocks, axes) for name, axes in (("rates", [0, 1]), ("yaw", [2]))
+    }  # fmt: skip
+    told = {name: channel for name, channel in {"thrust": thrust, **rates}.items() if channel.told()}
+    random = np.random.default_rng(seed)
+    chosen = [random.integers(0, len(blocks), len(blocks)) for _ in range(DRAWS)]
+    draws = [np.ones(len(blocks)), *(np.bincount(draw, minlength=len(blocks)).astype(float) for draw in chosen)]
+    found = [_solved(told, thrust, draw) for draw in draws]
+
+    for each in found:
+        each["full"] = each["thrust gain"] * (log.full_thrust or 0.0) + each["offset"]
+
+    def of(name: str, known: bool) -> Estimate | None:
+        values = [each[name] for each in found] if known else []
+        return Estimate(values[0], *(float(q) for q in np.percentile(values[1:], INSIDE))) if known else None
+
+    moved = np.sqrt(np.mean(np.einsum("nji,nj->ni", log.R, log.v)[log.valid] ** 2, axis=0))
+    x, y, z = (of(f"drag {axis}", bool(told) and bool(fast > SLOW)) for axis, fast in zip("xyz", moved, strict=True))
+    lift, turn, yaw = (name in told for name in ("thrust", "rates", "yaw"))
+    return Identified(
+        of("delay", bool(told)), of("thrust gain", lift), of("offset", lift),
+        of("full", lift and log.full_thrust is not None), of("thrust lag", lift), of("rates lag", turn),
+        of("rates gain", turn), of("yaw lag", yaw), of("yaw gain", yaw), (x, y, z), found[0]["left"],
+    )  # fmt: skip
+
+
+def _solved(told: dict[str, Channel], thrust: Channel, draw: np.ndarray) -> dict[str, float]:
+    """Return the delay that all channels have, and each one's lag and parameters, between the points of the grid."""
+    fits = {name: channel.sums.fit(draw) for name, channel in told.items()}
+    late = np.sum([misfit.min(axis=1) for misfit, _ in fits.values()], axis=0) if fits else np.zeros(len(DELAYS))
+    d = int(np.argmin(late))
+    found = {"delay": lowest(DELAYS, late, d)}
+    for name, (misfit, theta) in {"thrust": thrust.sums.fit(draw), **fits}.items():
+        k = int(np.argmin(misfit[d]))
+        lag = lowest(LAGS, misfit[d], k)
+        slopes = (np.gradient(theta[:, k], DELAYS, axis=0)[d], np.gradient(theta[d], LAGS, axis=0)[k])
+        between = theta[d, k] + (found["delay"] - DELAYS[d]) * slopes[0] + (lag - LAGS[k]) * slopes[1]
+        found |= {f"{name} lag": lag, f"{name} gain": float(between[0])}
+        if name == "thrust":
+            found |= {f"drag {axis}": float(between[1 + i]) for i, axis in enumerate("xyz")}
+            count = thrust.sums.n @ draw
+            found |= {"offset": float(between[6]), "left": float(np.sqrt(3.0 * np.exp(misfit[d, k] / count)))}
+    return found
+
+
+def _blocks(log: FlightLog) -> np.ndarray:
+    """Return the ticks of each block that is whole: two seconds of flight, after some to settle."""
+    size, warm = 10 * max(1, round(0.1 * BLOCK / log.dt)), round(WARM / log.dt)
+    good = log.valid[:-1] & log.valid[1:]
+    settled = np.convolve(good, np.ones(warm + 1), mode="full")[: len(good)] > warm
+    found, run = [], 0
+    for k, fine in enumerate(settled):
+        run = run + 1 if fine else 0
+        if run == size:
+            found.append(np.arange(k - size + 1, k + 1))
+            run = 0
+    return np.array(found)
+
+
+def _thrust(log: FlightLog, blocks: np.ndarray) -> Channel:
+    """a + g e3 = k c R e3 - R D R^T v + d, over each tick."""
+    R, v = log.R[:-1], 0.5 * (log.v[1:] + log.v[:-1])
+    axis = 0.5 * (log.R[1:] + log.R[:-1])[:, :, 2]
+    drag = -R * np.einsum("nji,nj->ni", R, v)[:, None, :]
+    push = np.broadcast_to(np.eye(3), R.shape)
+
+    def features(c: np.ndarray) -> np.ndarray:
+        return np.concatenate([(c[:, None] * axis)[:, :, None], drag, push], axis=2)
+
+    a = np.diff(log.v, axis=0) / log.dt + UP
+    return Channel.of(features, lambda delay, lag: acting(log.c, log.dt, delay, lag)[:-1], a, blocks)
+
+
+def _rates(log: FlightLog, command: np.ndarray, blocks: np.ndarray, axes: list[int]) -> Channel:
+    """omega = k omega_cmd + bias, over each tick; the axes share the lag and the gain."""
+    from scipy.spatial.transform import Rotation  # here: it takes as long to import as all of retrim
+
+    turned = Rotation.from_matrix(np.swapaxes(log.R[:-1], 1, 2) @ log.R[1:]).as_rotvec() / log.dt
+    bias = np.broadcast_to(np.eye(len(axes)), (len(turned), len(axes), len(axes)))
+
+    def features(told: np.ndarray) -> np.ndarray:
+        return np.concatenate([told[:, :, None], bias], axis=2)
+
+    chosen = command[:, axes]
+    return Channel.of(features, lambda delay, lag: acting(chosen, log.dt, delay, lag)[:-1], turned[:, axes], blocks)

@@ -1,0 +1,166 @@
+"""`retrim replay`: a log read, foretold, identified, adapted to; files in the folder of a run."""
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jax import tree
+
+from ..config.loading import changed, load
+from ..config.setup import Setup
+from ..control.policy import Policy
+from ..errors import ConfigError, LogError
+from ..experiments.outputs import write_state
+from ..experiments.reporter import Reporter
+from ..experiments.run import Run
+from ..experiments.tables.document import Document, TableSection
+from ..io.logs import FlightLog, read_flight_log, read_map
+from ..io.trained import load_policy
+from ..learn.residuals.targets import Targets
+from .adaptation import adapt_to
+from .foretelling import Foretold, Protocol, foretell
+from .identification import identify
+from .predictors import learnt, yardsticks
+from .report import foretold_section, identified_section, picture, residual_section
+from .rows import rows_of
+from .vehicle import vehicle_toml
+
+SHOWN = ("regression", "ensemble", "linear")  # residual models beside the yardsticks
+ENSEMBLE_RATE = 1e-3  # learning rate: with that of hover/paper an ensemble learns the noise of a real log
+DEFAULT = "hover/retrim"
+SPANS = {"buffer": (0.2, 600.0), "horizon": (0.1, 600.0), "delay": (0.0, 1.0), "lag": (0.0, 5.0)}  # [s]
+
+
+@dataclass(frozen=True)
+class Replay:
+    """What is asked of a log."""
+
+    map: str | None = None
+    """TOML file that says which field is what, in which unit and frame; or one that is known: retrim-csv, retrim-npz,
+    retrim-mcap, px4, mavros. By default what this package or the usual autopilot of the format writes."""
+    buffer: float = 5.0
+    """Residual models are fitted to the last so many seconds."""
+    horizon: float = 5.0
+    """They foretell so many seconds."""
+    residual: str = "linear"
+    """Residual model beside regression, ensemble and linear, and that of --adapt; or module:name."""
+    delay: float = 0.0
+    """The thrust comes so much behind its command [s]; --identify finds it."""
+    lag: float = 0.0
+    """Time constant of the thrust after that [s]."""
+    identify: bool = False
+    """Find thrust map, drag, command delay and lags, with intervals, and write a vehicle file."""
+    vehicle: str | None = None
+    """What is not identified is taken from this vehicle: small, large, kingfisher, a vehicle file or module:name; by
+    default that of the policy."""
+    policy: Path | None = None
+    """A policy to adapt, or the folder that holds one."""
+    adapt: str = "none"
+    """full, lora: re-train the policy in the model that the log corrects, all weights or a few; none."""
+    updates: int = 60
+    """How many updates at most."""
+    seed: int = 0
+    """Of fresh networks, of updates and of the bootstrap."""
+
+    def __post_init__(self) -> None:
+        """Raise ``ConfigError`` for what cannot be."""
+        for name, least, most in (
+            ("buffer", 0.2, 600.0),
+            ("horizon", 0.1, 600.0),
+            ("delay", 0.0, 1.0),
+            ("lag", 0.0, 5.0),
+        ):
+            if not least <= getattr(self, name) <= most:
+                raise ConfigError(f"--{name} {getattr(self, name):g}: must be {least:g} to {most:g} s")
+        if self.adapt not in ("none", "full", "lora"):
+            raise ConfigError(f"--adapt {self.adapt}: must be full, lora or none")
+        if (self.adapt == "none") != (self.policy is None):
+            raise ConfigError("--adapt and --policy go together; `retrim pretrain hover --out h` makes a policy")
+        if not 1 <= self.updates <= 10_000:
+            raise ConfigError(f"--updates {self.updates}: must be 1 to 10000")
+
+
+def replay(path: Path, asked: Replay, run: Run, reporter: Reporter) -> Document:
+    """Report on a log, into ``replay.md``, ``replay.json`` and a picture; identify and adapt, if that is asked for.
+
+    Args:
+        path: The log.
+        asked: What to do with it.
+        run: Where to.
+        reporter: Receives the tables and the progress.
+
+    Raises:
+        LogError: The log cannot be used.
+        ConfigError: A name does not exist, or does not fit.
+    """
+    policy, preset = load_policy(asked.policy) if asked.policy else (None, load(DEFAULT))
+    if asked.vehicle is not None:
+        preset = changed(preset, vehicle=asked.vehicle)
+    setup = Setup.of(changed(preset, adapt={"residual": asked.residual}))
+    log = read_flight_log(path, None if asked.map is None else read_map(asked.map), dt=preset.dt)
+    rows, protocol = rows_of(log, delay=asked.delay, lag=asked.lag), Protocol(asked.buffer, asked.horizon)
+    late = f" Thrust acts {1000 * asked.delay:g} ms late, with a lag of {1000 * asked.lag:g} ms."
+    intro = "Residual a - (c R e3 - g e3), world frame." + late * bool(asked.delay or asked.lag)
+    document = Document(run, "replay", f"Replay of {path.name}", intro,
+                        [asked.seed], reporter)  # fmt: skip
+    document.add(residual_section(log, rows))
+    found = _foretold(asked, protocol, setup, log, rows, reporter, run)
+    if found:
+        drawn = picture(log, rows, found, protocol, run.folder)[0]
+        section = dataclasses.replace(foretold_section(found, protocol), picture=drawn)
+        document.add(section, [dataclasses.asdict(each) for each in found])
+    if asked.identify and not run.interrupted:
+        with reporter.progress("identifying") as advance:
+            advance(0.0, "delays and lags")
+            vehicle = identify(log, seed=asked.seed)
+            advance(1.0, "done")
+        document.more["identified"] = tree.map(float, dataclasses.asdict(vehicle))
+        document.add(identified_section(vehicle))
+        run.write_text("vehicle.toml", vehicle_toml(vehicle, setup, path.name))
+    if policy is not None and not run.interrupted:
+        document.add(_adapted(asked, setup, policy, log, rows, run, reporter))
+    document.write()
+    return document
+
+
+def _foretold(
+    asked: Replay, protocol: Protocol, setup: Setup, log: FlightLog, rows: Targets, reporter: Reporter, run: Run
+) -> list[Foretold]:
+    found = list[Foretold]()
+    home = np.mean(log.p[log.valid], axis=0)
+    goal = tuple(float(x) for x in home)
+    preset = changed(setup.preset, goal=goal, dt=max(0.001, round(log.dt, 3)))
+    adapt: dict[str, Any] = {"window": round(protocol.buffer / log.dt), "fit_every": protocol.every}
+    names = dict.fromkeys([*SHOWN, asked.residual])
+    predictors = yardsticks(log.dt)
+    for name in names:
+        more = {"fit_learning_rate": ENSEMBLE_RATE} if name == "ensemble" else {}
+        predictors[name] = learnt(name, preset, setup.vehicle, asked.seed, **adapt, **more)
+    with reporter.progress("foretelling") as advance, run.interruptible():
+        advance(0.0, next(iter(predictors)))
+        for each in foretell(rows, log.dt, predictors, protocol):
+            found.append(each)
+            advance(len(found) / len(predictors), f"{each.name}: {each.rmse:.3f} m/s^2")
+    return found
+
+
+def _adapted(
+    asked: Replay, setup: Setup, policy: Policy, log: FlightLog, rows: Targets, run: Run, reporter: Reporter
+) -> TableSection:
+    preset = setup.preset
+    if abs(log.dt - preset.dt) > 0.02 * preset.dt:
+        raise LogError(
+            f"the log has a sample every {1000 * log.dt:.3g} ms, but the policy's tick is {1000 * preset.dt:g} ms; "
+            f"log states at least that often to adapt to them"
+        )
+    low_rank = asked.adapt == "lora"
+    result = adapt_to(rows, setup, policy, low_rank=low_rank, updates=asked.updates, seed=asked.seed, reporter=reporter)
+    write_state(result.state, preset, run.folder)
+    lines = (("as it was", f"{result.before:.3f}"), ("adapted", f"{result.after:.3f}"))
+    about = (
+        f"{result.admitted} of {result.tried} updates passed the gate, residual `{preset.adapt.residual}`. Error over "
+        f"the last half second of 6 s in the model that the log has corrected, 64 starts of the task."
+    )
+    return TableSection(("policy", "error [m]"), lines, "A policy adapted to the log", about)

@@ -1,0 +1,89 @@
+"""The report on a log: tables and a picture."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ..experiments.tables.document import TableSection
+from ..io.logs import FlightLog
+from ..learn.residuals.targets import Targets
+from .foretelling import Foretold, Protocol
+from .identification import Estimate, Identified
+
+SMOOTH = 0.3  # [s] over which curves of the picture are averaged
+
+
+def residual_section(log: FlightLog, rows: Targets) -> TableSection:
+    """Return what the nominal model missed, axis by axis."""
+    missed = np.asarray(rows.a_res)[log.valid]
+    slow = np.linalg.norm(log.v[log.valid], axis=1)
+    parts = [("mean", missed.mean(axis=0)), ("standard deviation", missed.std(axis=0)),
+             ("root mean square", np.sqrt(np.mean(missed**2, axis=0)))]  # fmt: skip
+    lines = tuple((name, *(f"{x:.2f}" for x in values), f"{np.linalg.norm(values):.2f}") for name, values in parts)
+    about = (
+        f"{log.seconds:.1f} s of flight, a tick of {1000 * log.dt:.4g} ms; speed {slow.mean():.2f} m/s on average, "
+        f"{slow.max():.2f} m/s at most."
+    )
+    said = "".join(f" {note[0].upper()}{note[1:]}." for note in log.notes)
+    return TableSection(("residual [m/s^2]", "x", "y", "z", "all"), lines, "What the point mass missed", about + said)
+
+
+def foretold_section(found: Sequence[Foretold], protocol: Protocol) -> TableSection:
+    """Return how well the next seconds were foretold."""
+    least = min(each.rmse for each in found)
+    none = next((each.rmse for each in found if each.name == "zero"), None)
+    lines = []
+    for each in found:
+        error = f"{each.rmse:.3f}"
+        share = "" if not none else f"{100 * (1.0 - (each.rmse / none) ** 2):.0f} %"
+        lines.append((each.name, f"**{error}**" if each.rmse == least else error, *(f"{x:.2f}" for x in each.per_axis),
+                      share))  # fmt: skip
+    about = (
+        f"Fitted every {protocol.every:g} s to the last {protocol.buffer:g} s, the error over the next "
+        f"{protocol.horizon:g} s; {len(found[0].per_window)} windows. Raw: noise of the derivative of velocity is in "
+        f"every figure. `regression` is that of flight, made for the next second."
+    )
+    title = "How well the next seconds are foretold"
+    return TableSection(("predictor", "error [m/s^2]", "x", "y", "z", "explained"), tuple(lines), title, about)
+
+
+def identified_section(found: Identified) -> TableSection:
+    """Return what the log says of the vehicle."""
+
+    def line(name: str, what: Estimate | None, unit: str, scale: float = 1.0) -> tuple[str, str]:
+        return name, "the log does not say" if what is None else what.text(unit, scale)
+
+    lines = (
+        line("command delay", found.delay, "ms", 1000.0),
+        line("thrust per commanded thrust", found.thrust_gain, ""),
+        line("acceleration upwards without a command", found.thrust_offset, "m/s^2"),
+        *((line("full thrust", found.full_thrust, "m/s^2"),) if found.full_thrust else ()),
+        line("lag of thrust", found.thrust_lag, "ms", 1000.0),
+        line("lag of roll and pitch rates", found.rate_lag, "ms", 1000.0),
+        line("roll and pitch rate per command", found.rate_gain, ""),
+        line("lag of yaw rate", found.yaw_lag, "ms", 1000.0),
+        line("yaw rate per command", found.yaw_gain, ""),
+        *(line(f"linear drag along body {axis}", each, "1/s") for axis, each in zip("xyz", found.drag, strict=True)),
+        ("acceleration left unexplained", f"{found.unexplained:.2f} m/s^2"),
+    )
+    about = "Estimates with intervals of 90 %, of a bootstrap over blocks of 2 s of the log."
+    return TableSection(("", "estimate"), lines, "What the vehicle is", about)
+
+
+def picture(log: FlightLog, rows: Targets, found: Sequence[Foretold], protocol: Protocol, folder: Path) -> list[Path]:
+    """Draw the residual over time, and the errors of the predictions."""
+    from ..viz.panels import Curve, Panel, panel_figure
+    from ..viz.plots import save
+
+    k = max(1, round(SMOOTH / log.dt))
+    kernel = np.ones(k) / k
+    missed = np.where(log.valid[:, None], np.asarray(rows.a_res), np.nan)
+    curves = [Curve(log.t, np.convolve(missed[:, i], kernel, mode="same"), "xyz"[i]) for i in range(3)]
+    shown = [each for each in found if each.name != "zero"]
+    errors = [Curve(np.array(each.times), np.array(each.per_window), each.name) for each in shown]
+    panels = [
+        Panel("what the point mass missed", "time [s]", "residual acceleration [m/s^2]", curves, 3),
+        Panel(f"error over the next {protocol.horizon:g} s", "time of the prediction [s]", "[m/s^2]", errors, 2),
+    ]
+    return save(panel_figure("What the model missed, and what was foretold of it", panels, across=2), folder, "replay")

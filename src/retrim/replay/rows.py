@@ -1,0 +1,56 @@
+"""What the nominal model missed at each tick of a log."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..io.logs import FlightLog
+from ..io.logs.on_one_clock import UP
+from ..learn.residuals.targets import Targets
+from ..physics.state import Command, State
+
+
+def acting(command: np.ndarray, dt: float, delay: float, lag: float) -> np.ndarray:
+    """Return the mean over each tick of a command as it acts: late, and behind a first-order lag.
+
+    Args:
+        command: At each tick, (n,) or (n, columns).
+        dt: Tick [s].
+        delay: [s], not negative.
+        lag: Time constant [s]; zero for none.
+    """
+    late = int(np.ceil(delay / dt - 1e-6))
+    share = max(0.0, late - delay / dt)  # of a tick in which the newer command acts already
+    ticks = np.arange(len(command)) - late
+    old, new = (command[np.clip(ticks + k, 0, len(command) - 1)] for k in (0, 1))
+    if lag <= 0.0:
+        return np.asarray((1.0 - share) * old + share * new)
+    from scipy.signal import lfilter  # here: it takes as long to import as all of retrim
+
+    first, second = np.exp(-(1.0 - share) * dt / lag), np.exp(-share * dt / lag)
+    pulled = (1.0 - first) * second * old + (1.0 - second) * new
+    end = lfilter([1.0], [1.0, -first * second], pulled, axis=0, zi=first * second * command[:1])[0]
+    begin = np.concatenate([command[:1], end[:-1]])
+    between = old + (begin - old) * first
+    flown = (1.0 - share) * old + share * new
+    left = (begin - old) * (1.0 - first) + (between - new) * (1.0 - second)
+    return np.asarray(flown + left * lag / dt)
+
+
+def rows_of(log: FlightLog, *, delay: float = 0.0, lag: float = 0.0) -> Targets:
+    """Return the rows of a residual fit: a_res = a - (c R e3 - g e3), the acceleration that the point mass missed.
+
+    Args:
+        log: A flight. Without commanded body rates the measured ones stand for them.
+        delay: Of the thrust behind its command [s].
+        lag: Time constant of the thrust after that [s].
+
+    Returns:
+        One row for each tick.
+    """
+    c = acting(log.c, log.dt, delay, lag)
+    told = log.rates if log.command is None else log.command
+    missed = log.a + UP - c[:, None] * log.R[:, :, 2]
+    x = jax.vmap(State)(jnp.asarray(log.p), jnp.asarray(log.R), jnp.asarray(log.v))
+    u = jax.vmap(Command)(jnp.asarray(c), jnp.asarray(told))
+    return Targets(x, u, jnp.asarray(missed), jnp.asarray(log.rates), jnp.asarray(log.valid))

@@ -1,0 +1,69 @@
+"""What was identified as a vehicle file, to pretrain for."""
+
+import tomllib
+
+from ..config.setup import Setup
+from ..config.vehicle_file import VehicleSpec
+from ..config.vehicles import name_of
+from .identification import Estimate, Identified
+
+SHORTEST, LONGEST = 0.002, 0.5  # [s] that a lag of a vehicle file may have
+MOST = 0.2  # [s] that a delay may have
+
+
+def vehicle_toml(found: Identified, setup: Setup, log: str) -> str:
+    """Return a vehicle file: what the log says, and for the rest the vehicle that the preset has.
+
+    Args:
+        found: What was identified.
+        setup: Of the preset.
+        log: Name of the log.
+    """
+    base, spec = setup.vehicle, setup.preset.vehicle
+    keep = spec if isinstance(spec, VehicleSpec) else None
+    mass = float(base.mass)
+    lines = [
+        f"# Identified from {log}; what no line says so of is that of {name_of(spec)!r}. Intervals hold 90 %.",
+        *([] if found.thrust_gain is None else [f"# Thrust per commanded thrust: {found.thrust_gain.text('')}."]),
+        *(f"# Linear drag along body {a}: {d.text('1/s')}." for a, d in zip("xyz", found.drag, strict=True) if d),
+        f'name = "{name_of(spec)}-identified"',
+        f"mass = {mass:.6g}  # [kg]",
+        f"inertia = {_row(base.inertia.tolist())}  # [kg m^2]",
+        f"arm = {_row(base.arm.tolist())}  # [m]",
+    ]
+    if found.full_thrust is None:
+        lines.append(f"thrust_max = {float(base.thrust_max):.6g}  # [N]")
+    else:
+        newton = Estimate(*(mass * x for x in found.full_thrust))
+        lines.append(f"thrust_max = {newton.value:.6g}  # [N], identified: {newton.text('N')}")
+    lines.append(f"rates_max = {_row(base.omega_max.tolist())}  # [rad/s]")
+    if found.thrust_lag is None:
+        lines.append(f"motor_tau = {float(base.motor_tau):.6g}  # [s]")
+    else:
+        lag = found.thrust_lag
+        lines.append(f"motor_tau = {_bounded(lag.value):.4g}  # [s], identified: {lag.text('ms', 1000.0)}")
+    if (level := found.rate_lag) is not None:
+        yaw = found.yaw_lag
+        said = (
+            f"roll and pitch {level.text('ms', 1000.0)}, yaw {yaw.text('ms', 1000.0) if yaw else 'taken for the same'}"
+        )
+        lags = [_bounded(each.value) for each in (level, level, yaw or level)]
+        lines.append(f"rate_lag = {_row(lags)}  # [s], identified: {said}")
+    if (delay := found.delay) is not None:
+        said = delay.text("ms", 1000.0)
+        lines.append(f"command_delay = {min(max(delay.value, 0.0), MOST):.4g}  # [s], identified: {said}")
+    if keep is not None:
+        lines += [] if keep.propeller is None else [f'propeller = "{keep.propeller}"']
+        lines += [] if keep.propeller_diameter is None else [f"propeller_diameter = {keep.propeller_diameter:.6g}"]
+        lines += [] if keep.drag_area is None else [f"drag_area = {_row(list(keep.drag_area))}"]
+    text = "\n".join([*lines, ""])
+    tomllib.loads(text)
+    return text
+
+
+def _bounded(lag: float) -> float:
+    return min(max(lag, SHORTEST), LONGEST)
+
+
+def _row(values: list[float]) -> str:
+    return "[" + ", ".join(f"{x:.6g}" for x in values) + "]"

@@ -1,0 +1,194 @@
+"""The same flight from every format: bags of ROS 1 and 2, MCAP, NPZ, and a ULog written byte by byte."""
+
+import contextlib
+import struct
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from made_up_log import G, flown, turned_frames
+from retrim.errors import LogError, RetrimError
+from retrim.io.logs import read_flight_log, read_map
+from retrim.io.logs.recording import Recording, write_mcap, write_npz
+
+FLIGHT = flown(6.0)
+N = len(FLIGHT.t)
+
+
+def agrees(log, places=1e-6):
+    shift = round((log.t[0] - 0.0) / 0.02)
+    for found, true in ((log.p, FLIGHT.p), (log.R, FLIGHT.R), (log.v, FLIGHT.v), (log.c, FLIGHT.c)):
+        np.testing.assert_allclose(found, true[shift : shift + len(found)], atol=places)
+    np.testing.assert_allclose(log.command, FLIGHT.omega[: len(log.command)], atol=places)
+    assert log.valid[3:-3].all()
+
+
+@pytest.fixture(scope="module")
+def recording():
+    states = np.concatenate([FLIGHT.p, FLIGHT.R.reshape(N, 9), FLIGHT.v], axis=1)
+    command = np.concatenate([FLIGHT.c[:, None], FLIGHT.omega], axis=1)
+    return Recording(FLIGHT.t, states, states, np.zeros(N), command, np.zeros(N))
+
+
+def test_our_own_arrays(recording, tmp_path):
+    write_npz(tmp_path / "flight.npz", recording)
+    agrees(read_flight_log(tmp_path / "flight.npz"))
+
+
+def test_our_own_recording(recording, tmp_path):
+    pytest.importorskip("rosbags")
+    write_mcap(tmp_path / "flight.mcap", recording)
+    agrees(read_flight_log(tmp_path / "flight.mcap"))
+
+
+@pytest.mark.parametrize("name", ["flight.bag", "flight.db3", "flight"])
+def test_bags_of_ros(name, tmp_path):
+    """Odometry as MAVROS publishes it, velocities in body axes, thrust as a share."""
+    rosbags = pytest.importorskip("rosbags.typesys")
+    from rosbags.rosbag1 import Writer as Writer1
+    from rosbags.rosbag2 import StoragePlugin
+    from rosbags.rosbag2 import Writer as Writer2
+
+    one = name.endswith(".bag")
+    types = rosbags.get_typestore(rosbags.Stores.ROS1_NOETIC if one else rosbags.Stores.ROS2_JAZZY)
+    name_of = "mavros_msgs/msg/AttitudeTarget"
+    definition = "std_msgs/Header header\ngeometry_msgs/Vector3 body_rate\nfloat32 thrust"
+    types.register(rosbags.get_types_from_msg(definition, name_of))
+    make = types.types
+    vector = make["geometry_msgs/msg/Vector3"]
+    path = tmp_path / name
+    writer = Writer1(path) if one else Writer2(tmp_path / "whole", version=9, storage_plugin=StoragePlugin.SQLITE3)
+    body = np.einsum("nji,nj->ni", FLIGHT.R, FLIGHT.v)
+    q = Rotation.from_matrix(FLIGHT.R).as_quat()
+
+    def header(t):
+        stamp = make["builtin_interfaces/msg/Time"](*divmod(round(1e9 * (t + 5.0)), 10**9))
+        return make["std_msgs/msg/Header"](*((0, stamp, "map") if one else (stamp, "map")))
+
+    def odometry(k):
+        pose = make["geometry_msgs/msg/Pose"](
+            make["geometry_msgs/msg/Point"](*FLIGHT.p[k]), make["geometry_msgs/msg/Quaternion"](*q[k])
+        )
+        twist = make["geometry_msgs/msg/Twist"](vector(*body[k]), vector(*FLIGHT.omega[k]))
+        nothing = np.zeros(36)
+        return make["nav_msgs/msg/Odometry"](
+            header(FLIGHT.t[k]), "base_link",
+            make["geometry_msgs/msg/PoseWithCovariance"](pose, nothing),
+            make["geometry_msgs/msg/TwistWithCovariance"](twist, nothing),
+        )  # fmt: skip
+
+    def told(k):
+        fields = {
+            "header": header(FLIGHT.t[k]),
+            "body_rate": vector(*FLIGHT.omega[k]),
+            "thrust": 0.45 * FLIGHT.c[k] / G[2],
+        }
+        return make[name_of](**fields)
+
+    serialise = types.serialize_ros1 if one else types.serialize_cdr
+    with writer:
+        topics = [
+            (writer.add_connection(topic, kind, typestore=types), kind, message)
+            for topic, kind, message in (
+                ("/mavros/local_position/odom", "nav_msgs/msg/Odometry", odometry),
+                ("/mavros/setpoint_raw/attitude", name_of, told),
+            )
+        ]
+        for k in range(N):
+            for connection, kind, message in topics:
+                writer.write(connection, round(1e9 * (FLIGHT.t[k] + 5.0)), serialise(message(k), kind))
+    if name == "flight.db3":
+        path = next((tmp_path / "whole").glob("*.db3"))
+    elif not one:
+        path = tmp_path / "whole"
+    log = read_flight_log(path, read_map("mavros"))
+    agrees(log, 3e-3)
+    assert log.full_thrust == pytest.approx(G[2] / 0.45, rel=1e-3)
+    with pytest.raises(LogError, match=r"no field '/odom'; there are /mavros/local_position/odom"):
+        read_flight_log(path, read_map_with(tmp_path, "/odom.pose.pose.position"))
+    with pytest.raises(LogError, match=r"no field '/mavros/local_position/odom.pose.positon'; "):
+        read_flight_log(path, read_map_with(tmp_path, "/mavros/local_position/odom.pose.positon"))
+    with pytest.raises(LogError, match="holds no numbers; it has pose, covariance"):
+        read_flight_log(path, read_map_with(tmp_path, "/mavros/local_position/odom.pose"))
+
+
+def read_map_with(folder, position):
+    text = f"""
+    position.fields = ["{position}"]
+    velocity = {{ fields = ["/mavros/local_position/odom.twist.twist.linear"], axes = "body" }}
+    attitude = {{ fields = ["/mavros/local_position/odom.pose.pose.orientation"], form = "xyzw" }}
+    thrust = {{ fields = ["/mavros/setpoint_raw/attitude.thrust"], unit = "share" }}
+    """
+    (folder / "other.toml").write_text(text)
+    return read_map(folder / "other.toml")
+
+
+def ulog(flight):
+    """A ULog as PX4 writes it: NED, forward-right-down, each topic at its own rate."""
+    ned = turned_frames(flight)
+    q = np.roll(Rotation.from_matrix(ned.R).as_quat(), 1, axis=1)
+    thrust = -0.5 * flight.c / G[2]
+    topics = [
+        ("vehicle_local_position", "uint64_t timestamp_sample;float x;float y;float z;float vx;float vy;float vz",
+         np.concatenate([ned.p, ned.v], axis=1), 1),
+        ("vehicle_attitude", "uint64_t timestamp_sample;float[4] q", q, 1),
+        ("vehicle_rates_setpoint", "float roll;float pitch;float yaw;float[3] thrust_body",
+         np.concatenate([ned.omega, 0 * ned.p[:, :2], thrust[:, None]], axis=1), 1),
+        ("vehicle_angular_velocity", "uint64_t timestamp_sample;float[3] xyz", ned.omega, 1),
+    ]  # fmt: skip
+
+    def message(kind, data):
+        return struct.pack("<HB", len(data), ord(kind)) + data
+
+    out = [b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0), message("B", bytes(40))]
+    out += [message("F", f"{name}:uint64_t timestamp;{fields};".encode()) for name, fields, _, _ in topics]
+    out += [message("A", struct.pack("<BH", 0, i) + name.encode()) for i, (name, _, _, _) in enumerate(topics)]
+    for k, t in enumerate(flight.t):
+        stamp = round(1e6 * (t + 3.0))
+        for i, (_, fields, values, _) in enumerate(topics):
+            head = struct.pack("<HQ", i, stamp + 700) + struct.pack("<Q", stamp) * ("timestamp_sample" in fields)
+            if i == 2:
+                head = struct.pack("<HQ", i, stamp)
+            out.append(message("D", head + values[k].astype("<f4").tobytes()))
+    return b"".join(out)
+
+
+def test_a_log_of_px4(tmp_path):
+    pytest.importorskip("pyulog")
+    path = tmp_path / "flight.ulg"
+    path.write_bytes(ulog(FLIGHT))
+    log = read_flight_log(path)
+    agrees(log, 1e-2)
+    np.testing.assert_allclose(log.rates, FLIGHT.omega, atol=1e-5)
+    assert log.full_thrust == pytest.approx(2.0 * G[2], rel=1e-3)
+
+
+def test_a_ulog_that_is_cut_or_spoilt_gives_a_flight_or_one_line(tmp_path):
+    pytest.importorskip("pyulog")
+    whole, rng = ulog(FLIGHT), np.random.default_rng(0)
+    path = tmp_path / "flight.ulg"
+    for k in range(25):
+        data = bytearray(whole[: int(rng.integers(20, len(whole)))])
+        for place in rng.integers(16, len(data), k % 4):
+            data[place] ^= 0xFF
+        path.write_bytes(bytes(data))
+        with contextlib.suppress(RetrimError):
+            log = read_flight_log(path)
+            assert np.isfinite(log.p[log.valid]).all()
+
+
+@pytest.mark.parametrize("kind", ["mcap", "npz"])
+def test_a_recording_that_is_cut_or_spoilt_gives_a_flight_or_one_line(recording, kind, tmp_path):
+    pytest.importorskip("rosbags")
+    path, rng = tmp_path / f"flight.{kind}", np.random.default_rng(0)
+    (write_mcap if kind == "mcap" else write_npz)(path, recording)
+    whole = path.read_bytes()
+    for k in range(20):
+        data = bytearray(whole[: int(rng.integers(8, len(whole)))] if k % 2 else whole)
+        for place in rng.integers(0, len(data), 3):
+            data[place] ^= 0xFF
+        path.write_bytes(bytes(data))
+        with contextlib.suppress(RetrimError):
+            log = read_flight_log(path)
+            assert np.isfinite(log.p[log.valid]).all()

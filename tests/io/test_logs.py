@@ -1,0 +1,371 @@
+"""A log in any units and frames is the same flight; damage of every kind is named, and never a crash."""
+
+import contextlib
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from made_up_log import MAP, G, columns, flown, turned_frames, write_csv, write_map
+from retrim.errors import ConfigError, LogError, RetrimError
+from retrim.io.logs import read_flight_log, read_map
+from retrim.io.logs.flight_log import ENDS
+
+FLIGHT = flown(12.0)
+
+
+def read(tmp_path, table, text=MAP, **changes):
+    path = write_csv(tmp_path / "log.csv", table)
+    return read_flight_log(path, read_map(write_map(tmp_path / "map.toml", text, **changes)))
+
+
+def agrees(log, flight, places=1e-6):
+    """The log is the flight, but for the two ticks at each end that have no derivative."""
+    assert len(log.t) == len(flight.t)
+    for found, true in ((log.p, flight.p), (log.R, flight.R), (log.v, flight.v), (log.c, flight.c)):
+        np.testing.assert_allclose(found, true, atol=places)
+    np.testing.assert_allclose(log.command, flight.omega, atol=places)
+    np.testing.assert_allclose(log.a[2:-2], flight.a[2:-2], atol=1e-3)
+    assert log.valid[2:-2].all()
+
+
+def test_a_plain_log_is_the_flight(tmp_path):
+    log = read(tmp_path, columns(FLIGHT))
+    agrees(log, FLIGHT)
+    assert log.dt == pytest.approx(0.02)
+    assert log.notes == ()
+    np.testing.assert_allclose(log.rates[1:-1], 0.5 * (FLIGHT.omega[1:-1] + FLIGHT.omega[:-2]), atol=0.05)
+
+
+def in_other_units(table):
+    q = Rotation.from_quat(np.stack([table[f"q{a}"] for a in "xyzw"], axis=1))
+    changed = dict(table, t=1e6 * table["t"], c=table["c"] / 9.80665)
+    changed |= {f"p{a}": 1000.0 * table[f"p{a}"] for a in "xyz"} | {f"v{a}": 3.6 * table[f"v{a}"] for a in "xyz"}
+    changed |= {f"w{a}": np.degrees(table[f"w{a}"]) for a in "xyz"}
+    angles = q.as_euler("ZYX", degrees=True)
+    return changed | {"roll": angles[:, 2], "pitch": angles[:, 1], "yaw": angles[:, 0]}
+
+
+def test_units_are_converted(tmp_path):
+    log = read(
+        tmp_path, in_other_units(columns(FLIGHT)), time__unit='"us"', position__unit='"mm"', velocity__unit='"km/h"',
+        attitude__fields='["roll", "pitch", "yaw"]', attitude__form='"roll pitch yaw"', attitude__unit='"deg"',
+        thrust__unit='"g"', rates__unit='"deg/s"',
+    )  # fmt: skip
+    agrees(log, FLIGHT, 1e-5)
+
+
+def test_frames_are_turned(tmp_path):
+    log = read(tmp_path, columns(turned_frames(FLIGHT)), frames__world='"NED"', frames__body='"FRD"')
+    agrees(log, FLIGHT)
+
+
+def test_velocities_in_body_axes_and_inverse_attitudes(tmp_path):
+    body = np.einsum("nji,nj->ni", FLIGHT.R, FLIGHT.v)
+    table = columns(dataclasses.replace(FLIGHT, v=body, R=np.swapaxes(FLIGHT.R, 1, 2)))
+    agrees(read(tmp_path, table, velocity__axes='"body"', attitude__turns='"world to body"'), FLIGHT)
+
+
+def test_a_share_of_the_thrust_is_found_from_the_flight_or_told(tmp_path):
+    table = columns(FLIGHT)
+    table["c"] = -0.5 * table["c"] / G[2]
+    found = read(tmp_path, table, thrust__unit='"share"', thrust__positive='"down"')
+    assert found.full_thrust == pytest.approx(2 * G[2], rel=1e-3)
+    np.testing.assert_allclose(found.c, FLIGHT.c, rtol=1e-3)
+    told = read(tmp_path, table, thrust__unit='"share"', thrust__positive='"down"', thrust__hover="0.5")
+    np.testing.assert_allclose(told.c, FLIGHT.c, rtol=1e-6)
+    newton = columns(FLIGHT) | {"c": 1.3 * FLIGHT.c}
+    np.testing.assert_allclose(read(tmp_path, newton, thrust__unit='"N"', thrust__mass="1.3").c, FLIGHT.c, rtol=1e-6)
+
+
+def test_an_accelerometer_is_the_derivative_of_the_velocity(tmp_path):
+    felt = np.einsum("nji,nj->ni", FLIGHT.R, FLIGHT.a + G)
+    table = columns(FLIGHT) | {f"f{a}": felt[:, i] for i, a in enumerate("xyz")}
+    log = read(tmp_path, table, acceleration__fields='["fx", "fy", "fz"]')
+    np.testing.assert_allclose(log.a, FLIGHT.a, atol=1e-5)
+
+
+def test_a_faster_log_is_interpolated_and_a_slower_one_has_its_own_tick(tmp_path):
+    fast = read(tmp_path, columns(flown(6.0, dt=0.004)))
+    slow = flown(6.0, dt=0.02)
+    assert fast.dt == 0.02
+    np.testing.assert_allclose(fast.p[: len(slow.p)], slow.p, atol=1e-4)
+    np.testing.assert_allclose(fast.R[: len(slow.p)], slow.R, atol=1e-4)
+    rare = read(tmp_path, columns(flown(12.0, dt=0.05)))
+    assert rare.dt == pytest.approx(0.05)
+
+
+def test_samples_that_are_missing_are_left_out(tmp_path):
+    table = {name: np.delete(x, np.s_[200:260]) for name, x in columns(FLIGHT).items()}
+    table["px"][100] = np.nan
+    log = read(tmp_path, table)
+    assert any("1 of" in note and "not finite" in note for note in log.notes)
+    assert any("gaps" in note for note in log.notes)
+    inside = (log.t > 3.98) & (log.t < 5.18)
+    assert not log.valid[inside].any()
+    assert log.valid[(log.t > 0.1) & (log.t < 3.9)].mean() > 0.9
+    np.testing.assert_allclose(log.p[log.valid], np.stack(
+        [np.interp(log.t[log.valid], FLIGHT.t, FLIGHT.p[:, i]) for i in range(3)], axis=1), atol=1e-3)  # fmt: skip
+
+
+def test_ages_bring_states_to_their_own_time(tmp_path):
+    table = columns(FLIGHT) | {"age": np.full(len(FLIGHT.t), 0.04)}
+    log = read(tmp_path, table, time__age='"age"')
+    np.testing.assert_allclose(log.c[:100], FLIGHT.c[:100], atol=1e-6)
+    np.testing.assert_allclose(log.p[:100], FLIGHT.p[2:102], atol=1e-6)
+
+
+WINDY = flown(12.0, wind=(6.0, -2.0, 1.0))
+"""Pushed so hard that it does not accelerate along its thrust axis: every other map is tried, and none is better."""
+
+
+@pytest.mark.parametrize(
+    ("factor", "changes"),
+    [
+        (1.0, {}),
+        (0.45 / G[2], {"thrust__unit": '"share"', "thrust__hover": "0.45"}),
+        (0.45 / G[2], {"thrust__unit": '"share"'}),
+        (1.3, {"thrust__unit": '"N"', "thrust__mass": "1.3"}),
+        (1.0 / 9.80665, {"thrust__unit": '"g"'}),
+    ],
+)
+def test_a_strong_wind_is_no_mistake_of_the_map(factor, changes, tmp_path):
+    table = columns(WINDY) | {"c": factor * WINDY.c}
+    log = read(tmp_path, table, **changes)
+    assert log.valid[2:-2].all()
+
+
+@pytest.mark.parametrize("form", ["matrix", "roll pitch yaw"])
+def test_a_strong_wind_is_no_mistake_of_other_attitudes(form, tmp_path):
+    turned, table = Rotation.from_matrix(WINDY.R), columns(WINDY)
+    values = WINDY.R.reshape(-1, 9) if form == "matrix" else turned.as_euler("ZYX")[:, ::-1]
+    table |= {f"r{i}": values[:, i] for i in range(values.shape[1])}
+    fields = str([f"r{i}" for i in range(values.shape[1])]).replace("'", '"')
+    log = read(
+        tmp_path,
+        table,
+        attitude__fields=fields,
+        attitude__form=f'"{form}"',
+        measured_rates__fields='["wx", "wy", "wz"]',
+    )
+    np.testing.assert_allclose(log.R, WINDY.R, atol=1e-6)
+
+
+# ---- damage
+
+
+def spoil(name, change):
+    def spoilt(table):
+        return table | {name: change(table[name].copy())}
+
+    return spoilt
+
+
+def with_nan(x):
+    x[:] = np.nan
+    return x
+
+
+def back(x):
+    x[300:] -= 4.0
+    return x
+
+
+def negated(*names):
+    return lambda table: table | {name: -table[name] for name in names}
+
+
+def scaled(factor, *names):
+    return lambda table: table | {name: factor * table[name] for name in names}
+
+
+def swapped(table):
+    return table | {"qx": table["qw"], "qy": table["qx"], "qz": table["qy"], "qw": table["qz"]}
+
+
+def inverse(table):
+    return negated("qx", "qy", "qz")(table)
+
+
+def in_body_axes(table):
+    body = np.einsum("nji,nj->ni", FLIGHT.R, FLIGHT.v)
+    return table | {f"v{a}": body[:, i] for i, a in enumerate("xyz")}
+
+
+def still(table):
+    return table | {name: np.full_like(table[name], table[name][0]) for name in ("px", "py", "pz")}
+
+
+def other_time(table):
+    rng = np.random.default_rng(0)
+    order = rng.permutation(len(table["px"]))
+    return table | {name: table[name][order] for name in ("px", "py", "pz")}
+
+
+def ned(table):
+    return columns(turned_frames(FLIGHT))
+
+
+def frd(table):
+    turned = turned_frames(FLIGHT)
+    return columns(dataclasses.replace(FLIGHT, R=FLIGHT.R @ np.diag([1.0, -1.0, -1.0]), omega=turned.omega))
+
+
+DAMAGED_TABLES = {
+    "no column": (lambda table: {n: x for n, x in table.items() if n != "pz"}, "no field 'pz'; there are t, px"),
+    "nothing finite": (spoil("vx", with_nan), "velocity has no finite sample"),
+    "time stands still": (spoil("t", lambda t: 0 * t), "all at one time"),
+    "time goes back": (spoil("t", back), "goes back 1 times.*several flights"),
+    "time in ms": (scaled(1000.0, "t"), "every 20 s.*is time in ms"),
+    "time too fine": (scaled(1e-6, "t"), "is time in ms, us or ns"),
+    "too short": (lambda table: {n: x[:20] for n, x in table.items()}, "of flight are left, at least 1 s"),
+    "one sample": (lambda table: {n: x[:1] for n, x in table.items()}, "1 samples, all at one time"),
+    "too rare": (lambda table: {n: x[::20] for n, x in table.items()}, "every 0.4 s; accelerations need"),
+    "quaternions not of norm one": (scaled(0.7, "qx", "qy", "qz", "qw"), "not of norm one"),
+    "quaternions in another order": (swapped, 'with attitude.form = "wxyz" they would'),
+    "inverse attitudes": (inverse, 'attitude.turns = "world to body" they would'),
+    "NED and FRD": (ned, 'frames.world = "NED" and frames.body = "FRD"'),
+    "FRD": (frd, 'frames.body = "FRD" they would'),
+    "velocity in body axes": (in_body_axes, 'velocity.axes = "body" they would'),
+    "velocity in km/h": (scaled(3.6, "vx", "vy", "vz"), 'velocity.unit = "km/h" they would'),
+    "position in mm": (scaled(1000.0, "px", "py", "pz"), "position.*units"),
+    "rates in deg/s": (scaled(57.3, "wx", "wy", "wz"), 'rates.unit = "deg/s" they would'),
+    "rates against": (negated("wx", "wy", "wz"), "does not turn as it is told"),
+    "thrust downwards": (negated("c"), 'thrust is never above zero.*positive = "down"'),
+    "thrust in g": (scaled(1 / 9.80665, "c"), 'thrust.unit = "g" they would'),
+    "thrust of nothing": (scaled(0.0, "c"), "thrust is never above zero"),
+    "position does not change": (still, "position"),
+    "positions of another time": (other_time, "position"),
+}
+
+
+@pytest.mark.parametrize("kind", DAMAGED_TABLES)
+def test_damaged_tables_are_named(kind, tmp_path):
+    damage, said = DAMAGED_TABLES[kind]
+    with pytest.raises(LogError, match=f"(?s)log.csv.*{said}") as caught:
+        read(tmp_path, damage(columns(FLIGHT)))
+    assert "\n" not in str(caught.value)
+
+
+WHOLE = None
+
+
+def text_of(tmp_path):
+    return write_csv(tmp_path / "whole.csv", columns(flown(3.0))).read_text()
+
+
+def cut_line(text, number, line):
+    lines = text.splitlines()
+    lines[number] = line
+    return "\n".join(lines)
+
+
+DAMAGED_FILES = {
+    "empty": (lambda text: "", "it is empty"),
+    "header only": (lambda text: text.splitlines()[0] + "\n", "a header and no sample"),
+    "no header": (lambda text: "\n".join(text.splitlines()[1:]), "first line must name the columns"),
+    "a word": (lambda text: cut_line(text, 7, "0.1,oops" + ",0" * 13), "line 8, column 'px': 'oops' is no number"),
+    "a short line": (lambda text: cut_line(text, 7, "0.1,0,0"), "line 8: 3 cells, but the header has 15"),
+    "twice a column": (lambda text: text.replace("px,py", "px,px"), "two columns are named 'px'"),
+    "an open list": (lambda text: cut_line(text, 3, "0.1,[1" + ",0" * 13), "is no number"),
+    "blanks only": (lambda text: "\n \n\n", "."),
+}
+
+
+@pytest.mark.parametrize("kind", DAMAGED_FILES)
+def test_damaged_files_are_named(kind, tmp_path):
+    damage, said = DAMAGED_FILES[kind]
+    path = tmp_path / "log.csv"
+    path.write_text(damage(text_of(tmp_path)))
+    with pytest.raises(LogError, match=said):
+        read_flight_log(path, read_map(write_map(tmp_path / "map.toml")))
+
+
+def test_a_torn_last_line_is_left_out(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text(text_of(tmp_path)[:-30])
+    log = read_flight_log(path, read_map(write_map(tmp_path / "map.toml")))
+    assert any("torn" in note for note in log.notes)
+
+
+def test_positions_that_jump_or_freeze_are_left_out(tmp_path):
+    table = columns(FLIGHT)
+    table["px"][200:] += 3.0
+    for name in ("px", "py", "pz"):
+        table[name][400:430] = table[name][400]
+    log = read(tmp_path, table)
+    assert any("jumps 1 times" in note or "jumps 2 times" in note for note in log.notes)
+    assert any("does not change" in note for note in log.notes)
+    assert not log.valid[[200, 415]].any()
+    assert log.valid.mean() > 0.9
+
+
+def test_time_on_the_ground_is_left_out(tmp_path):
+    n, table = 200, columns(FLIGHT)
+    before = {name: np.full(n, x[0]) for name, x in table.items()}
+    before |= {"t": 0.02 * np.arange(-n, 0), "c": np.zeros(n)} | {f"v{a}": np.zeros(n) for a in "xyz"}
+    joined = {name: np.concatenate([before[name], x]) for name, x in table.items()}
+    joined["px"] += 1e-9 * np.arange(len(joined["px"]))
+    log = read(tmp_path, joined)
+    assert any("on the ground" in note for note in log.notes)
+    assert not log.valid[: n - 50].any()
+    assert log.valid[n + 50 : -ENDS].all()
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"position__unit": '"furlong"'}, "position.unit"),
+        ({"position__feilds": '["x"]'}, "unknown key; did you mean 'fields'"),
+        ({"thrust__unit": '"N"'}, "mass .* goes with"),
+        ({"thrust__hover": "0.5"}, "hover goes with"),
+        ({"attitude__form": '"euler"'}, "attitude.form"),
+        ({"part__start": "5.0", "part__end": "4.0"}, "part.end = 4.0 s must be after"),
+        ({"altitude__fields": '["z"]'}, "unknown key; "),
+    ],
+)
+def test_wrong_maps_are_named(change, said, tmp_path):
+    with pytest.raises(ConfigError, match=said):
+        read_map(write_map(tmp_path / "map.toml", **change))
+
+
+def test_what_is_no_log_is_named(tmp_path):
+    for name, data, said in (
+        ("log.xyz", b"1", "no log that is known"),
+        ("log.npz", b"PK junk", "not a whole NPZ"),
+        ("log.csv", bytes(range(256)), "not a text file|no field|header"),
+        ("log.ulg", b"ULog junk", "ULog"),
+        ("log.mcap", b"\x89MCAP0\r\n junk", "bag"),
+        ("log.bag", b"#ROSBAG V2.0\n junk", "bag"),
+        ("log.db3", b"SQLite format 3\x00", "bag"),
+    ):
+        path = tmp_path / name
+        path.write_bytes(data)
+        named = "retrim-mcap" if "bag" in said else "px4" if name == "log.ulg" else "retrim-npz"
+        with pytest.raises(LogError, match=said):
+            read_flight_log(path, read_map(named))
+    path = write_csv(tmp_path / "log.csv", columns(flown(2.0)))
+    with pytest.raises(LogError, match=r"no field 'x0'.*without a map it is read as 'retrim-csv': give --map"):
+        read_flight_log(path)
+    with pytest.raises(LogError, match="no such file"):
+        read_flight_log(tmp_path / "nowhere.csv")
+    with pytest.raises(LogError, match="say what is where"):
+        read_flight_log(tmp_path)
+    with pytest.raises(LogError, match="cannot be read as a bag"):
+        read_flight_log(tmp_path, read_map("retrim-mcap"))
+
+
+def test_noise_is_never_a_flight(tmp_path):
+    """Any bytes in any format give one line, and no other error."""
+    rng, chosen = np.random.default_rng(0), read_map(write_map(tmp_path / "map.toml"))
+    whole = text_of(tmp_path).encode()
+    for k in range(60):
+        data = bytearray(whole)
+        for place in rng.integers(0, len(data), 5):
+            data[place] = rng.integers(0, 256)
+        path = tmp_path / f"log{['.csv', '.npz', '.ulg', '.mcap', '.bag', '.db3'][k % 6 if k > 30 else 0]}"
+        path.write_bytes(bytes(data[: rng.integers(1, len(data))]))
+        with contextlib.suppress(RetrimError):
+            log = read_flight_log(path, chosen)
+            assert np.isfinite(np.concatenate([log.p, log.v, log.c[:, None]], axis=1)).all()

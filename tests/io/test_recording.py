@@ -1,0 +1,71 @@
+"""A recording is the flight: an independent reader finds every tick, in the form in which other viewers expect it."""
+
+import numpy as np
+import pytest
+
+from retrim.errors import ConfigError
+from retrim.io.logs.recording import Recording, check_recording, write_mcap, write_npz
+from retrim.runtime.events import Event
+
+N = 40
+
+
+def recording():
+    rng = np.random.default_rng(0)
+    turned = np.linalg.qr(rng.normal(size=(2, N, 3, 3)))[0]
+    turned *= np.linalg.det(turned)[..., None, None]
+    states = [np.concatenate([rng.normal(size=(N, 3)), R.reshape(N, 9), rng.normal(size=(N, 3))], 1) for R in turned]
+    events = [Event(0.3, "policy", "version 1"), Event(0.1, "knobs", "push 1 0 0")]
+    return Recording(
+        0.02 * np.arange(N), *states, np.full(N, 0.01), rng.normal(size=(N, 4)), rng.uniform(size=N),
+        rng.normal(size=(N, 3)), ["policy"] * N, rng.uniform(size=N), events,
+    )  # fmt: skip
+
+
+def test_what_is_written_is_read_by_another_reader(tmp_path):
+    pytest.importorskip("rosbags")
+    make_reader = pytest.importorskip("mcap.reader").make_reader
+    decoders = [pytest.importorskip("mcap_ros2.decoder").DecoderFactory()]
+    flight, path = recording(), tmp_path / "flight.mcap"
+    write_mcap(path, flight)
+    assert [p.name for p in tmp_path.iterdir()] == ["flight.mcap"]
+    found, schemas = {}, {}
+    with path.open("rb") as file:
+        for schema, channel, message, decoded in make_reader(file, decoder_factories=decoders).iter_decoded_messages():
+            found.setdefault(channel.topic, []).append((1e-9 * message.log_time, decoded))
+            schemas[channel.topic] = schema.name
+    poses = found["/measured/pose"]
+    assert schemas["/measured/pose"] == "geometry_msgs/msg/PoseStamped"
+    np.testing.assert_allclose([t for t, _ in poses], flight.t, atol=1e-9)
+    stamps = [m.header.stamp.sec + 1e-9 * m.header.stamp.nanosec for _, m in poses]
+    np.testing.assert_allclose(stamps[1:], flight.t[1:] - 0.01, atol=1e-9)
+    shown = [[m.pose.position.x, m.pose.position.y, m.pose.position.z] for _, m in poses]
+    np.testing.assert_allclose(shown, flight.measured[:, :3])
+    for (_, m), row in zip(poses, flight.measured, strict=True):
+        q = m.pose.orientation
+        z = [2 * (q.x * q.z + q.w * q.y), 2 * (q.y * q.z - q.w * q.x), 1 - 2 * (q.x**2 + q.y**2)]
+        np.testing.assert_allclose(z, row[3:12].reshape(3, 3)[:, 2], atol=1e-9)
+    np.testing.assert_allclose([m.twist.linear.z for _, m in found["/command"]], flight.command[:, 0])
+    np.testing.assert_allclose([m.twist.angular.y for _, m in found["/command"]], flight.command[:, 2])
+    np.testing.assert_allclose([m.data for _, m in found["/error"]], flight.error)
+    assert [m.data for _, m in found["/events"]] == ["knobs: push 1 0 0", "policy: version 1"]
+    assert {m.data for _, m in found["/flown_by"]} == {"policy"}
+
+
+def test_arrays_are_the_flight(tmp_path):
+    flight, path = recording(), tmp_path / "flight.npz"
+    write_npz(path, flight)
+    assert [p.name for p in tmp_path.iterdir()] == ["flight.npz"]
+    with np.load(path) as file:
+        np.testing.assert_array_equal(file["R_measured"].reshape(N, 9), flight.measured[:, 3:12])
+        np.testing.assert_array_equal(file["v"], flight.true[:, 12:])
+        np.testing.assert_array_equal(file["u"], flight.command)
+
+
+def test_where_nothing_can_be_recorded_is_named(tmp_path):
+    with pytest.raises(ConfigError, match=r"must end with \.mcap"):
+        check_recording(tmp_path / "flight.bag")
+    pytest.importorskip("rosbags")
+    with pytest.raises(ConfigError, match="nothing can be written in"):
+        check_recording(tmp_path / "nowhere" / "flight.mcap")
+    assert check_recording(tmp_path / "flight.mcap") == tmp_path / "flight.mcap"

@@ -1,0 +1,128 @@
+"""What is put into a flight is found in it, within the interval that is stated; what is not in it is not made up."""
+
+import dataclasses
+import tomllib
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from retrim.config.loading import load
+from retrim.config.setup import Setup
+from retrim.config.validation import validated
+from retrim.config.vehicle_file import VehicleSpec
+from retrim.errors import LogError
+from retrim.io.logs import FlightLog
+from retrim.replay.identification import identify
+from retrim.replay.rows import acting
+from retrim.replay.vehicle import vehicle_toml
+
+DT, SUB = 0.02, 20
+
+
+def wander(rng, n, size, tau):
+    """A random walk that returns."""
+    x = np.zeros(n)
+    for i in range(1, n):
+        x[i] = x[i - 1] * np.exp(-DT / tau) + size * np.sqrt(1 - np.exp(-2 * DT / tau)) * rng.normal()
+    return x
+
+
+def driven(seed, *, delay, lag, rate_lag, gain, drag, n=1200, noise=1.0, size=1.0):
+    """A vehicle that follows random commands, integrated in steps of a millisecond; mild noise on what is logged."""
+    rng, h = np.random.default_rng(seed), DT / SUB
+    c = 9.81 / gain + size * wander(rng, n, 1.5, 0.3)
+    w = size * np.stack([wander(rng, n, 0.8, 0.2), wander(rng, n, 0.8, 0.2), wander(rng, n, 0.5, 0.5)], axis=1)
+    R, v, p, thrust, omega = np.eye(3), np.zeros(3), np.zeros(3), 9.81 / gain, np.zeros(3)
+    places, turns, speeds = [], [], []
+    for i in range(n * SUB):
+        if i % SUB == 0:
+            places.append(p.copy()), turns.append(R.copy()), speeds.append(v.copy())
+        j = max(0, i - round(delay / h)) // SUB
+        thrust += (c[j] - thrust) * (1 - np.exp(-h / lag))
+        omega = omega + (w[j] - omega) * (1 - np.exp(-h / np.array(rate_lag)))
+        a = gain * thrust * R[:, 2] - np.array([0, 0, 9.81]) - R @ (np.array(drag) * (R.T @ v))
+        p, v, R = p + h * v, v + h * a, R @ _turn(h * omega)
+    p, v, R = (np.array(x) for x in (places, speeds, turns))
+    R = R @ Rotation.from_rotvec(1e-3 * noise * rng.normal(size=(n, 3))).as_matrix()
+    v = v + 3e-3 * noise * rng.normal(size=v.shape)
+    valid = np.ones(n, dtype=bool)
+    return FlightLog(DT * np.arange(n), p, R, v, np.zeros_like(v), c, np.zeros((n, 3)), w, valid, DT, None, ())
+
+
+def _turn(phi):
+    K = np.array([[0, -phi[2], phi[1]], [phi[2], 0, -phi[0]], [-phi[1], phi[0], 0]])
+    return np.eye(3) + K + 0.5 * K @ K
+
+
+@pytest.mark.parametrize(
+    ("seed", "truth"),
+    [
+        (0, {"delay": 0.03, "lag": 0.06, "rate_lag": (0.08, 0.08, 0.3), "gain": 0.9, "drag": (0.3, 0.3, 0.1)}),
+        (1, {"delay": 0.0, "lag": 0.03, "rate_lag": (0.03, 0.03, 0.03), "gain": 1.1, "drag": (0.1, 0.4, 0.0)}),
+    ],
+)
+def test_what_was_put_in_is_found(seed, truth):
+    found = identify(driven(seed, **truth))
+    assert found.delay.value == pytest.approx(truth["delay"], abs=0.003)
+    assert found.thrust_lag.value == pytest.approx(truth["lag"], abs=0.004)
+    assert found.thrust_gain.value == pytest.approx(truth["gain"], abs=0.01)
+    assert found.rate_lag.value == pytest.approx(truth["rate_lag"][0], abs=0.004)
+    assert found.yaw_lag.value == pytest.approx(truth["rate_lag"][2], rel=0.1)
+    assert found.rate_gain.value == pytest.approx(1.0, abs=0.02)
+    np.testing.assert_allclose([d.value for d in found.drag], truth["drag"], atol=0.02)
+    for each in (found.delay, found.thrust_lag, found.thrust_gain, found.rate_lag, *found.drag):
+        assert each.low <= each.value <= each.high
+    gain = found.thrust_gain
+    assert gain.low - 0.005 <= truth["gain"] <= gain.high + 0.005
+
+
+def test_a_controller_that_answers_noise_is_no_vehicle_that_follows():
+    """At rest all that moves is noise, and the command answers it: the next difference seems to follow at once."""
+    rng, n = np.random.default_rng(0), 1200
+    tilt = 2e-3 * rng.normal(size=(n, 3))
+    v = 6e-3 * rng.normal(size=(n, 3))
+    R = Rotation.from_rotvec(tilt).as_matrix()
+    command, c = -8.0 * tilt, 9.81 - 4.0 * v[:, 2]
+    log = FlightLog(DT * np.arange(n), v * 0, R, v, v * 0, c, v * 0, command, np.ones(n, bool), DT, None, ())
+    found = identify(log)
+    assert found.delay is found.thrust_gain is found.rate_lag is found.yaw_lag is None
+    assert found.drag == (None, None, None)
+
+
+def test_without_commanded_rates_the_thrust_is_still_known():
+    truth = {"delay": 0.03, "lag": 0.06, "rate_lag": (0.05, 0.05, 0.2), "gain": 0.9, "drag": (0.3, 0.3, 0.1)}
+    found = identify(dataclasses.replace(driven(2, **truth), command=None))
+    assert found.rate_lag is None
+    assert found.thrust_gain.value == pytest.approx(0.9, abs=0.01)
+    assert found.delay.value + found.thrust_lag.value == pytest.approx(0.09, abs=0.01)
+
+
+def test_a_short_flight_is_refused():
+    log = driven(0, delay=0.0, lag=0.03, rate_lag=(0.03,) * 3, gain=1.0, drag=(0.0,) * 3, n=300)
+    with pytest.raises(LogError, match="needs 8 s at least"):
+        identify(log)
+
+
+def test_what_is_found_is_a_vehicle_file():
+    truth = {"delay": 0.02, "lag": 0.05, "rate_lag": (0.08, 0.08, 0.3), "gain": 1.0, "drag": (0.3, 0.3, 0.1)}
+    log = dataclasses.replace(driven(0, **truth), full_thrust=25.0)
+    text = vehicle_toml(identify(log), Setup.of(load("hover/retrim")), "a flight.csv")
+    spec = validated(VehicleSpec, tomllib.loads(text), source="vehicle")
+    assert spec.motor_tau == pytest.approx(0.05, abs=0.01)
+    assert spec.rate_lag == pytest.approx((0.08, 0.08, 0.3), rel=0.1)
+    assert spec.thrust_max == pytest.approx(25.0 * spec.mass, rel=0.05)
+    assert spec.build().rate_lag is not None
+    assert spec.command_delay == pytest.approx(0.02, abs=0.003)
+
+
+@pytest.mark.parametrize(("delay", "lag"), [(0.0, 0.0), (0.02, 0.0), (0.013, 0.04), (0.05, 0.3)])
+def test_an_acting_command_is_what_a_fine_integration_gives(delay, lag):
+    rng, fine = np.random.default_rng(3), 400
+    command = rng.normal(size=60)
+    h, y, means = DT / fine, command[0], np.zeros(60)
+    for i in range(60 * fine):
+        k = max(0, i - round(delay / h)) // fine
+        y = y + (command[k] - y) * (1 - np.exp(-h / lag)) if lag else command[k]
+        means[i // fine] += y / fine
+    np.testing.assert_allclose(acting(command, DT, delay, lag)[5:], means[5:], atol=0.01)

@@ -1,0 +1,131 @@
+"""Replaying a log: what is foretold, by whom, and what a policy learns from it."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from helpers import tiny_preset
+from made_up_log import MAP, columns, flown, write_csv, write_map
+from retrim.config.loading import load
+from retrim.config.setup import Setup
+from retrim.config.vehicles import make_vehicle
+from retrim.errors import ConfigError, LogError
+from retrim.experiments.reporter import Silent
+from retrim.experiments.run import Run
+from retrim.io.logs import read_flight_log, read_map
+from retrim.io.trained import save_policy
+from retrim.replay.adaptation import adapt_to
+from retrim.replay.foretelling import Protocol, foretell
+from retrim.replay.predictors import learnt, mean_of, ridge, yardsticks
+from retrim.replay.replay import Replay, replay
+from retrim.replay.rows import rows_of
+
+pytestmark = pytest.mark.usefixtures("optax_promotion")
+
+PUSH = (1.0, -0.5, 0.3)
+SHORT = Protocol(buffer=2.0, horizon=1.0, every=1.0)
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("log")
+    return write_csv(folder / "log.csv", columns(flown(14.0, wind=PUSH))), write_map(folder / "map.toml", MAP)
+
+
+@pytest.fixture(scope="module")
+def log(files):
+    return read_flight_log(files[0], read_map(files[1]))
+
+
+def test_the_residual_of_a_push_is_the_push(log):
+    rows = rows_of(log)
+    assert rows.a_res[np.asarray(rows.valid)] == pytest.approx(
+        np.broadcast_to(PUSH, (int(rows.valid.sum()), 3)), abs=2e-3
+    )
+
+
+def test_a_push_is_foretold_and_zero_misses_all_of_it(log):
+    found = {each.name: each for each in foretell(rows_of(log), log.dt, yardsticks(log.dt), SHORT)}
+    assert found["zero"].rmse == pytest.approx(np.linalg.norm(PUSH), rel=1e-2)
+    for name in ("last second", "mean of the buffer", "ridge"):
+        assert found[name].rmse < 0.02
+    assert found["zero"].per_axis == pytest.approx(np.abs(PUSH), abs=0.01)
+    assert found["zero"].times == tuple(np.arange(2.0, 13.5, 1.0)[: len(found["zero"].times)])
+
+
+@pytest.mark.parametrize("name", ["regression", "linear", "ensemble"])
+def test_residual_models_foretell_a_push(log, name):
+    preset = load("hover/retrim")
+    begin = learnt(name, preset, make_vehicle("small"), 0, window=100, fit_every=1.0, fit_steps=100)
+    (found,) = foretell(rows_of(log), log.dt, {name: begin}, SHORT)
+    assert found.rmse < 0.35
+
+
+def test_only_valid_rows_count(log):
+    rows = rows_of(log)
+    spoilt = jnp.arange(rows.valid.shape[0]) % 7 == 0
+    damaged = type(rows)(rows.x, rows.u, jnp.where(spoilt[:, None], 99.0, rows.a_res), rows.omega, rows.valid & ~spoilt)
+    for name, begin in (("mean", lambda: mean_of), ("ridge", lambda: ridge)):
+        (a,) = foretell(damaged, log.dt, {name: begin}, SHORT)
+        assert a.rmse < 0.02
+
+
+def test_a_log_that_is_too_short_says_what_to_choose(log):
+    with pytest.raises(LogError, match="choose a shorter --buffer or --horizon"):
+        list(foretell(rows_of(log), log.dt, yardsticks(log.dt), Protocol(10.0, 10.0)))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"buffer": 0.0}, "--buffer 0"),
+        ({"delay": 2.0}, "--delay 2"),
+        ({"adapt": "full"}, "--adapt and --policy go together"),
+        ({"adapt": "some"}, "must be full, lora or none"),
+        ({"updates": 0}, "--updates 0"),
+    ],
+)
+def test_what_cannot_be_asked_is_named(wrong, said):
+    with pytest.raises(ConfigError, match=said):
+        Replay(**wrong)
+
+
+def test_a_report_is_a_table_a_picture_and_json(files, tmp_path):
+    path, chosen = files
+    run = Run("replay", tmp_path)
+    replay(path, Replay(map=str(chosen), buffer=2.0, horizon=1.0, identify=True), run, Silent())
+    text = (tmp_path / "replay.md").read_text()
+    assert "What the point mass missed" in text
+    assert "| linear |" in text
+    assert (tmp_path / "replay.png").stat().st_size > 10_000
+    found = json.loads((tmp_path / "replay.json").read_text())
+    assert {row["name"] for row in found["rows"]} >= {"zero", "ridge", "regression", "ensemble", "linear"}
+    assert found["identified"]["thrust_gain"][0] == pytest.approx(1.0, abs=0.02)
+    assert "# Identified from log.csv" in (tmp_path / "vehicle.toml").read_text()
+
+
+def test_a_slower_log_has_its_own_tick_and_no_policy_adapts_to_it(tmp_path):
+    path = write_csv(tmp_path / "log.csv", columns(flown(14.0, dt=1 / 30, wind=PUSH)))
+    chosen = write_map(tmp_path / "map.toml")
+    document = replay(path, Replay(map=str(chosen), buffer=2.0, horizon=1.0), Run("replay", tmp_path), Silent())
+    assert "a tick of 33.33 ms" in document.sections[0].about
+    save_policy(tmp_path / "p.safetensors", Setup.of(tiny_preset()).new_policy(jax.random.key(0)), tiny_preset())
+    asked = Replay(map=str(chosen), buffer=2.0, horizon=1.0, adapt="full", policy=tmp_path / "p.safetensors")
+    with pytest.raises(LogError, match=r"a sample every 33.3 ms, but the policy's tick is 20 ms"):
+        replay(path, asked, Run("replay", tmp_path), Silent())
+
+
+def test_a_policy_learns_the_push_of_a_log(files, tmp_path):
+    """The gate lets through what is better in the model that the log corrected."""
+    preset = tiny_preset(adapt={"residual": "linear", "window": 100, "fit_every": 1.0, "learning_rate": 1e-3})
+    setup = Setup.of(preset)
+    policy = setup.new_policy(jax.random.key(0))
+    log = read_flight_log(files[0], read_map(files[1]), dt=preset.dt)
+    result = adapt_to(rows_of(log), setup, policy, low_rank=False, updates=4, seed=0, reporter=Silent())
+    assert 0 <= result.admitted <= result.tried == 4
+    model = setup.learner.residual_model
+    x, u = jax.tree.map(lambda leaf: leaf[100], (rows_of(log).x, rows_of(log).u))
+    np.testing.assert_allclose(model.predict(result.state.residual, x, u), PUSH, atol=0.1)
