@@ -1,0 +1,30 @@
+"""``retrim export``."""
+
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import tyro
+
+from ..export.export import export as exported
+from .console import RichReporter, show_paths
+
+
+def export(
+    policy: tyro.conf.Positional[Path], to: str = "npz", delta: Path | None = None, out: Path | None = None
+) -> Callable[[threading.Event], int]:
+    """Write a policy for a computer without JAX, run it there, and compare it with JAX on 10,000 observations.
+
+    Args:
+        policy: A policy.safetensors, or the folder that holds one.
+        to: npz: arrays, with a runner that needs NumPy only; onnx; c: one header of C99, without allocation; delta: a
+            low-rank delta alone, for the runner.
+        delta: A low-rank delta.safetensors, to put on the policy.
+        out: The file; by default policy.npz, policy.onnx, policy.h or delta.npz in the current folder.
+    """
+
+    def ordered(stop: threading.Event) -> int:
+        show_paths(exported(policy, to, out, delta, RichReporter()))
+        return 0
+
+    return ordered

@@ -1,0 +1,107 @@
+"""Does an exported policy compute what JAX does? It is run, on 10,000 observations, and its steps are timed."""
+
+import shutil
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import ConfigError
+from .c_header import name_of
+from .portable import Portable
+from .runner import Runner
+
+ROWS = 10_000
+STEPS = 2_000  # of one observation at a time, for the time of one
+FLAGS = ("-std=c99", "-O3", "-Wall", "-Wextra", "-Werror")
+LONGEST = 300.0  # [s] that a compiler or a program of it may take
+MAIN = """#include <stdio.h>
+#include <time.h>
+#include "{header}"
+int main(void)
+{{
+    static float o[{rows}][{size}], u[{rows}][4];
+    struct timespec a, b;
+    if (fread(o, sizeof o, 1, stdin) != 1) return 1;
+    clock_gettime(CLOCK_MONOTONIC, &a);
+    for (int k = 0; k < {rows}; ++k) {name}_command(o[k], u[k]);
+    clock_gettime(CLOCK_MONOTONIC, &b);
+    fprintf(stderr, "%.9g %.9g", (double)(b.tv_sec - a.tv_sec) + 1e-9 * (double)(b.tv_nsec - a.tv_nsec),
+            (double){name}_check());
+    return fwrite(u, sizeof u, 1, stdout) != 1;
+}}
+"""
+
+
+@dataclass(frozen=True)
+class Parity:
+    """What a run of an exported policy showed."""
+
+    by: str
+    """What ran it."""
+    worst: float
+    """Largest difference to JAX, as a share of the range of commands."""
+    step_s: float
+    """Time of one step [s]: the median, or for C the mean of all."""
+
+
+def check_npz(path: Path, policy: Portable, rows: np.ndarray, wanted: np.ndarray) -> Parity | None:
+    """Run the runner."""
+    runner = Runner(path)
+    return Parity("NumPy", _worst(policy, runner.command(rows), wanted), _timed(lambda o: runner.command(o), rows))
+
+
+def check_onnx(path: Path, policy: Portable, rows: np.ndarray, wanted: np.ndarray) -> Parity | None:
+    """Run ONNX Runtime, if it is installed."""
+    if find_spec("onnxruntime") is None:
+        return None
+    import onnxruntime
+
+    session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    found = session.run(["command"], {"observation": rows})[0]
+    step = _timed(lambda o: session.run(["command"], {"observation": o[None]}), rows)
+    return Parity("ONNX Runtime", _worst(policy, np.asarray(found), wanted), step)
+
+
+def check_c(path: Path, policy: Portable, rows: np.ndarray, wanted: np.ndarray) -> Parity | None:
+    """Compile the header and run it, if there is a compiler.
+
+    Raises:
+        ConfigError: It does not compile.
+    """
+    compiler = next((found for name in ("gcc", "cc", "clang") if (found := shutil.which(name))), None)
+    if compiler is None:
+        return None
+    with tempfile.TemporaryDirectory() as folder:
+        place = Path(folder)
+        header = place / path.name
+        shutil.copy(path, header)
+        text = MAIN.format(header=header.name, rows=len(rows), size=rows.shape[1], name=name_of(path))
+        (place / "main.c").write_text("#define _POSIX_C_SOURCE 199309L\n" + text)
+        words = [compiler, *FLAGS, "main.c", "-o", "main", "-lm"]
+        built = subprocess.run(words, cwd=place, capture_output=True, text=True, timeout=LONGEST)
+        if built.returncode != 0:
+            raise ConfigError(f"{path}: does not compile: {built.stderr[:300]}")
+        ran = subprocess.run([str(place / "main")], input=rows.tobytes(), capture_output=True, timeout=LONGEST)
+    seconds, own = (float(word) for word in ran.stderr.split())
+    given = np.frombuffer(ran.stdout, dtype=np.float32).reshape(-1, 4)
+    return Parity(Path(compiler).name, max(own, _worst(policy, given, wanted)), seconds / len(rows))
+
+
+def _worst(policy: Portable, found: np.ndarray, wanted: np.ndarray) -> float:
+    return float(np.max(np.abs(found - wanted) / (policy.high - policy.low)))
+
+
+def _timed(step: Callable[[np.ndarray], Any], rows: np.ndarray) -> float:
+    taken = []
+    for row in rows[:STEPS]:
+        began = time.perf_counter()
+        step(row)
+        taken.append(time.perf_counter() - began)
+    return float(np.median(taken))

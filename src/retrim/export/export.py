@@ -1,0 +1,88 @@
+"""`retrim export`: a policy in another format, run there and compared with JAX."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..config.setup import Setup
+from ..errors import ConfigError
+from ..experiments.reporter import Reporter
+from ..io.checkpoint import load_delta
+from ..io.trained import load_policy
+from .c_header import write_c
+from .checking import ROWS, Parity, check_c, check_npz, check_onnx
+from .npz_file import write_delta, write_npz
+from .onnx_file import write_onnx
+from .portable import Portable, commands, observations, portable_of
+
+PARITY = 1e-5  # share of the range of commands that an exported policy may miss
+SPREAD = 1.5  # of the observations at which it is compared, in units of their usual size
+
+
+@dataclass(frozen=True)
+class Format:
+    """One format."""
+
+    suffix: str
+    write: Callable[[Path, Portable], list[Path]]
+    check: Callable[[Path, Portable, np.ndarray, np.ndarray], Parity | None]
+
+
+FORMATS = {
+    "npz": Format(".npz", write_npz, check_npz),
+    "onnx": Format(".onnx", write_onnx, check_onnx),
+    "c": Format(".h", write_c, check_c),
+}
+
+
+def export(policy: Path, to: str, out: Path | None, delta: Path | None, reporter: Reporter) -> list[Path]:
+    """Write a policy in another format, and say how well it computes there.
+
+    Args:
+        policy: A policy, or the folder that holds one.
+        to: A format; or ``delta``, for a low-rank delta alone.
+        out: The file; by default ``policy`` or ``delta`` and the suffix of the format, in the current folder.
+        delta: A low-rank delta to put on the policy.
+        reporter: Receives what is found.
+
+    Returns:
+        The files.
+
+    Raises:
+        ConfigError: There is no such format, or the result does not compute what JAX does.
+        CheckpointError: A file cannot be used.
+    """
+    if to not in (*FORMATS, "delta"):
+        raise ConfigError(f"--to {to}: must be {', '.join(FORMATS)} or delta")
+    if to == "delta" and delta is None:
+        raise ConfigError("--to delta writes a low-rank delta: give it as --delta delta.safetensors")
+    suffix = ".npz" if to == "delta" else FORMATS[to].suffix
+    path = out or Path(f"{'delta' if to == 'delta' else 'policy'}{suffix}")
+    if path.suffix != suffix:
+        raise ConfigError(f"--out {path}: the name must end with {suffix}")
+    weights, preset = load_policy(policy)
+    if to == "delta":
+        assert delta is not None
+        return write_delta(path, load_delta(delta, weights))
+    if delta is not None:
+        weights = load_delta(delta, weights).merged()
+    portable = portable_of(weights, Setup.of(preset))
+    written = FORMATS[to].write(path, portable)
+    rows = SPREAD * observations(portable.sizes[0], ROWS, seed=1)
+    found = FORMATS[to].check(path, portable, rows, commands(weights, rows))
+    if found is None:
+        reporter.say(f"{path} was not run: there is nothing here that runs it")
+        return written
+    if not found.worst <= PARITY:
+        for each in written:
+            each.unlink(missing_ok=True)
+        raise ConfigError(f"{path}: {found.by} misses JAX by {found.worst:.1e} of the command range; nothing was kept")
+    reporter.say(
+        f"{found.by} and JAX: {found.worst:.1e} of the command range at most, on {len(rows)} observations; "
+        f"{1e6 * found.step_s:.1f} µs a step"
+    )
+    if portable.observation is None:
+        reporter.say(f"a {preset.task} policy does not see the state alone: its observation is yours to compute")
+    return written

@@ -1,0 +1,43 @@
+"""NPZ: arrays of a policy, or of a low-rank delta alone, with the runner beside."""
+
+import io
+import json
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+
+from ..control.lora import LoraPolicy
+from ..io.checkpoint import fingerprint
+from ..io.files import write_whole
+from .portable import Portable
+
+RUNNER = "runner.py"
+
+
+def write_npz(path: Path, policy: Portable) -> list[Path]:
+    """Write a policy and, beside it, the runner; return both paths."""
+    about = {**policy.about, "layers": len(policy.layers), "observation": policy.observation}
+    arrays = {f"w{i}": w for i, (w, _) in enumerate(policy.layers)} | {
+        f"b{i}": b for i, (_, b) in enumerate(policy.layers)
+    }
+    arrays |= {name: getattr(policy, name) for name in ("low", "high", "y0", "test_observations", "test_commands")}
+    _write(path, arrays, about)
+    runner = path.with_name(RUNNER)
+    write_whole(runner, files(__package__).joinpath(RUNNER).read_text())
+    return [path, runner]
+
+
+def write_delta(path: Path, policy: LoraPolicy) -> list[Path]:
+    """Write what a low-rank policy has learnt, without its base; return the path."""
+    arrays = {f"down{i}": np.asarray(thin.down, np.float32) for i, thin in enumerate(policy.delta)}
+    arrays |= {f"up{i}": np.asarray(thin.up, np.float32) for i, thin in enumerate(policy.delta)}
+    _write(path, arrays | {"shift": np.asarray(policy.shift, np.float32)},
+           {"base": fingerprint(policy.base), "scale": float(policy.scale)})  # fmt: skip
+    return [path]
+
+
+def _write(path: Path, arrays: dict[str, np.ndarray], about: dict[str, object]) -> None:
+    data = io.BytesIO()
+    np.savez(data, about=np.array(json.dumps(about)), allow_pickle=False, **arrays)
+    write_whole(path, data.getvalue())

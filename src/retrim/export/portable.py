@@ -1,0 +1,87 @@
+"""What of a policy leaves JAX: weights in single precision, limits, the observation, and test vectors."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import random
+from jaxtyping import Array, Float
+
+from ..config.setup import Setup
+from ..control.policy import Policy
+from ..io.checkpoint import fingerprint
+from ..physics.state import STANDARD_GRAVITY
+from ..tasks.observation import POSITION_SCALE, VELOCITY_SCALE, StateObs
+
+TESTS = 4
+
+
+@dataclass(frozen=True)
+class Portable:
+    """A policy as NumPy arrays in single precision. u = low + (high - low) / (1 + exp(-(y + y0)))."""
+
+    layers: tuple[tuple[np.ndarray, np.ndarray], ...]
+    """Weights (inputs, outputs) and biases; all but the last are followed by ReLU."""
+    low: np.ndarray
+    """Smallest command: c [m/s^2], omega [rad/s]."""
+    high: np.ndarray
+    y0: np.ndarray
+    """Output that commands hover."""
+    observation: dict[str, Any] | None
+    """How a state is observed; None for what is not made of the state alone."""
+    about: dict[str, Any]
+    """Preset, task, control tick [s], a hash of the weights."""
+    test_observations: np.ndarray
+    test_commands: np.ndarray
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Sizes of the layers, from the observation to the command."""
+        return (self.layers[0][0].shape[0], *(w.shape[1] for w, _ in self.layers))
+
+
+def portable_of(policy: Policy, setup: Setup) -> Portable:
+    """Return a policy as it travels.
+
+    Args:
+        policy: What flies; a low-rank one, merged.
+        setup: Its preset, vehicle and task.
+    """
+    single = [(_single(l.weight.T), _single(l.bias)) for l in policy.layers]
+    low, high, hover = (_single(u.vector()) for u in (policy.u_min, policy.u_max, policy.u_hover))
+    preset, seen = setup.preset, setup.env.task.observation
+    observation = None
+    if isinstance(seen, StateObs):
+        observation = {
+            "origin": seen.origin.tolist(), "rates_max": seen.omega_max.tolist(), "history": seen.history,
+            "position_scale": POSITION_SCALE, "velocity_scale": VELOCITY_SCALE, "gravity": STANDARD_GRAVITY,
+        }  # fmt: skip
+    about = {"preset": preset.name, "task": preset.task, "dt": preset.dt, "weights": fingerprint(policy)}
+    tests = observations(single[0][0].shape[0], TESTS, seed=0)
+    return Portable(
+        tuple(single), low, high, np.log((hover - low) / (high - hover)), observation, about, tests,
+        commands(policy, tests),
+    )  # fmt: skip
+
+
+def observations(size: int, n: int, seed: int) -> np.ndarray:
+    """Return ``n`` random observations: standard normal, single precision."""
+    return np.asarray(random.normal(random.key(seed), (n, size), dtype=jnp.float32))
+
+
+def commands(policy: Policy, rows: np.ndarray) -> np.ndarray:
+    """Return what JAX commands for rows of observations, in single precision."""
+    single: Policy = jax.tree.map(lambda leaf: leaf.astype(jnp.float32) if eqx.is_array(leaf) else leaf, policy)
+    return np.asarray(_commands(single, jnp.asarray(rows)))
+
+
+@eqx.filter_jit
+def _commands(policy: Policy, rows: Float[Array, "n o"]) -> Float[Array, "n 4"]:
+    return jax.vmap(lambda o: policy(o).vector())(rows)
+
+
+def _single(leaf: Any) -> np.ndarray:
+    return np.ascontiguousarray(np.asarray(leaf), dtype=np.float32)

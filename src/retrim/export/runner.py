@@ -1,0 +1,99 @@
+"""Flies an exported policy with NumPy alone. This file needs nothing else of its package: copy it with the NPZ.
+
+    policy = Runner("policy.npz")
+    policy.reset()
+    c, *omega = policy.step(p, R, v)      # at every control tick
+
+World ENU, body forward-left-up; the command is the collective thrust, mass-normalised [m/s^2], and body rates [rad/s].
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+TOLERANCE = 1e-5  # of the command range, by which the test vectors in the file may be missed
+
+
+class Runner:
+    """A policy from an NPZ file. It checks itself against the test vectors in the file when it is made."""
+
+    def __init__(self, path: str | Path, delta: str | Path | None = None) -> None:
+        """Read a policy.
+
+        Args:
+            path: The NPZ file.
+            delta: An NPZ file with what a low-rank policy has learnt, to put on it.
+
+        Raises:
+            ValueError: The file does not compute what it says, or the delta is another policy's.
+        """
+        with np.load(path, allow_pickle=False) as file:
+            self._arrays = {name: file[name] for name in file.files}
+        self.about: dict[str, Any] = json.loads(str(self._arrays["about"]))
+        self._layers = [(self._arrays[f"w{i}"], self._arrays[f"b{i}"]) for i in range(self.about["layers"])]
+        found = self.command(self._arrays["test_observations"])
+        missed = np.abs(found - self._arrays["test_commands"]) / (self._arrays["high"] - self._arrays["low"])
+        if not missed.max() <= TOLERANCE:
+            raise ValueError(f"{path}: its test vectors are missed by {missed.max():.1e} of the command range")
+        if delta is not None:
+            self._apply(delta)
+        self.reset()
+
+    @property
+    def dt(self) -> float:
+        """Control tick [s]."""
+        return float(self.about["dt"])
+
+    def command(self, observation: np.ndarray) -> np.ndarray:
+        """Return the command [c, omega] for an observation, or for rows of them."""
+        h = np.asarray(observation, dtype=np.float32)
+        for w, b in self._layers[:-1]:
+            h = np.maximum(h @ w + b, np.float32(0.0))
+        w, b = self._layers[-1]
+        y = h @ w + b + self._arrays["y0"]
+        low, high = self._arrays["low"], self._arrays["high"]
+        return np.asarray(low + (high - low) / (np.float32(1.0) + np.exp(-y)))
+
+    def reset(self) -> None:
+        """Forget the last commands: the vehicle hovers."""
+        seen = self.about["observation"]
+        self._past = np.zeros((0 if seen is None else seen["history"], 4), dtype=np.float32)
+        self._last = np.array([0.0, 0.0, 0.0, 0.0] if seen is None else [seen["gravity"], 0.0, 0.0, 0.0])
+
+    def step(self, p: np.ndarray, R: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Return the command for a state, once per control tick.
+
+        Args:
+            p: Position, world [m].
+            R: Attitude, body to world, 3 x 3.
+            v: Velocity, world [m/s].
+        """
+        o = self.observe(p, R, v)
+        self._last = self.command(o)
+        return self._last
+
+    def observe(self, p: np.ndarray, R: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Return the observation of a state, after the last command that :meth:`step` gave."""
+        seen = self.about["observation"]
+        if seen is None:
+            raise ValueError("this policy does not see the state alone; call command() with its observation")
+        past = np.concatenate([[self._last[0] / seen["gravity"] - 1.0], self._last[1:] / np.array(seen["rates_max"])])
+        self._past = np.concatenate([self._past, past[None].astype(np.float32)])[1:]
+        near = (np.asarray(p) - np.array(seen["origin"])) / seen["position_scale"]
+        parts = [near, np.asarray(R).reshape(9), np.asarray(v) / seen["velocity_scale"], self._past.reshape(-1)]
+        return np.concatenate(parts).astype(np.float32)
+
+    def _apply(self, path: str | Path) -> None:
+        with np.load(path, allow_pickle=False) as file:
+            delta = {name: file[name] for name in file.files}
+        about = json.loads(str(delta["about"]))
+        if about["base"] != self.about["weights"]:
+            raise ValueError(
+                f"{path}: made for another policy, {about['base'][:12]}..., not {self.about['weights'][:12]}..."
+            )
+        for i, (w, b) in enumerate(self._layers):
+            self._layers[i] = (w + np.float32(about["scale"]) * (delta[f"up{i}"] @ delta[f"down{i}"]).T, b)
+        w, b = self._layers[-1]
+        self._layers[-1] = (w, b + delta["shift"])

@@ -1,0 +1,199 @@
+"""An exported policy computes what JAX computes, in every format, and says so; one that does not is refused."""
+
+import ast
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import random
+
+from helpers import tiny_preset
+from retrim.config.setup import Setup
+from retrim.control.controller import PolicyController
+from retrim.control.lora import LoraPolicy
+from retrim.errors import CheckpointError, ConfigError
+from retrim.experiments.reporter import Silent
+from retrim.export import runner
+from retrim.export.checking import FLAGS
+from retrim.export.export import FORMATS, PARITY, export
+from retrim.export.portable import commands, observations, portable_of
+from retrim.export.runner import Runner
+from retrim.io.checkpoint import save_delta
+from retrim.io.trained import save_policy
+from retrim.physics import Command, State
+from retrim.physics.so3 import exp
+
+HAS_C = pytest.mark.skipif(shutil.which("gcc") is None, reason="there is no C compiler")
+NEEDS = {"npz": (), "onnx": ("onnx", "onnxruntime"), "c": ()}
+
+
+@pytest.fixture(scope="module")
+def setup():
+    return Setup.of(tiny_preset(command_history=2))
+
+
+@pytest.fixture(scope="module")
+def policy(setup):
+    """Weights large enough that commands reach their limits."""
+    fresh = setup.new_policy(random.key(0))
+    grown = jax.tree.map(lambda leaf: 6.0 * leaf, fresh.layers)
+    return fresh.with_params(grown)
+
+
+@pytest.fixture(scope="module")
+def saved(policy, setup, tmp_path_factory):
+    path = tmp_path_factory.mktemp("policy") / "policy.safetensors"
+    save_policy(path, policy, setup.preset)
+    return path
+
+
+class Said(Silent):
+    def __init__(self):
+        self.lines = []
+
+    def say(self, text):
+        self.lines.append(text)
+
+
+@pytest.mark.parametrize("to", FORMATS)
+def test_every_format_computes_what_jax_computes(to, policy, setup, saved, tmp_path):
+    for name in NEEDS[to]:
+        pytest.importorskip(name)
+    if to == "c" and shutil.which("gcc") is None:
+        pytest.skip("there is no C compiler")
+    said = Said()
+    written = export(saved, to, tmp_path / f"p{FORMATS[to].suffix}", None, said)
+    assert "µs a step" in said.lines[0]
+    portable = portable_of(policy, setup)
+    rows = 2.0 * observations(portable.sizes[0], 500, seed=3)
+    wanted = commands(policy, rows)
+    assert np.all(np.ptp(wanted, axis=0) > 0.1 * (portable.high - portable.low))  # commands of all sizes
+    found = FORMATS[to].check(written[0], portable, rows, wanted)
+    assert found.worst <= PARITY
+    shifted = FORMATS[to].check(written[0], portable, rows, wanted + 1e-3 * (portable.high - portable.low))
+    assert shifted.worst > 9e-4
+
+
+def test_a_file_that_computes_something_else_is_refused(saved, tmp_path):
+    export(saved, "npz", tmp_path / "p.npz", None, Silent())
+    with np.load(tmp_path / "p.npz") as file:
+        arrays = dict(file)
+    arrays["w1"] = arrays["w1"] * 1.01
+    np.savez(tmp_path / "spoilt.npz", **arrays)
+    with pytest.raises(ValueError, match="test vectors are missed by"):
+        Runner(tmp_path / "spoilt.npz")
+
+
+def states(n):
+    keys = random.split(random.key(5), 3)
+    p, v, phi = (0.5 * random.normal(k, (n, 3)) for k in keys)
+    return p + jnp.array([[0.0, 0.0, 1.0]]), jax.vmap(exp)(phi), v
+
+
+def flown(policy, setup, n=12):
+    """What the controller of a flight commands, tick by tick."""
+    controller = PolicyController(setup.env.task.observation, policy)
+    p, R, v = states(n)
+    memory, out = controller.init(State(p[0], R[0], v[0])), []
+    for k in range(n):
+        u, memory = controller(memory, jnp.array(0.02 * k), State(p[k], R[k], v[k]))
+        out.append(u.vector())
+    return np.asarray(jnp.stack(out))
+
+
+def test_the_runner_flies_as_the_controller_does(policy, setup, saved, tmp_path):
+    export(saved, "npz", tmp_path / "p.npz", None, Silent())
+    loaded = Runner(tmp_path / "p.npz")
+    wanted = flown(policy, setup)
+    for _ in range(2):  # the second flight begins as the first
+        found = np.array([loaded.step(*(np.asarray(x[k]) for x in states(12))) for k in range(12)])
+        np.testing.assert_allclose(found, wanted, atol=2e-4)
+        loaded.reset()
+    assert loaded.dt == setup.preset.dt
+
+
+@HAS_C
+def test_c_flies_as_the_controller_does(policy, setup, saved, tmp_path):
+    export(saved, "c", tmp_path / "my-quad.h", None, Silent())
+    p, R, v = (np.asarray(x, dtype=np.float32) for x in states(12))
+    rows = np.concatenate([p, R.reshape(12, 9), v], axis=1)
+    (tmp_path / "main.c").write_text("""
+#include <stdio.h>
+#include "my-quad.h"
+int main(void) {
+    my_quad_memory memory; float x[15], u[4];
+    if (my_quad_check() > 1e-5f) return 2;
+    my_quad_reset(&memory);
+    while (fread(x, sizeof x, 1, stdin) == 1) {
+        my_quad_step(&memory, x, x + 3, x + 12, u);
+        fwrite(u, sizeof u, 1, stdout);
+    }
+    return 0;
+}
+""")
+    subprocess.run(["gcc", *FLAGS, "main.c", "-o", "main", "-lm"], cwd=tmp_path, check=True)
+    ran = subprocess.run([tmp_path / "main"], input=rows.tobytes(), capture_output=True, check=True)
+    found = np.frombuffer(ran.stdout, np.float32).reshape(-1, 4)
+    np.testing.assert_allclose(found, flown(policy, setup), atol=2e-4)
+    text = (tmp_path / "my-quad.h").read_text()
+    assert not any(word in text for word in ("malloc", "double", "static float"))
+
+
+def test_the_runner_needs_numpy_only(saved, tmp_path):
+    tree = ast.parse(Path(runner.__file__).read_text())
+    imported = {name.name for node in ast.walk(tree) if isinstance(node, ast.Import) for name in node.names}
+    imported |= {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
+    assert imported == {"json", "numpy", "pathlib", "typing"}
+    export(saved, "npz", tmp_path / "p.npz", None, Silent())
+    code = "import sys; sys.modules['jax'] = sys.modules['retrim'] = None; import runner, numpy as np\n" \
+        "print(*runner.Runner('p.npz').step(np.zeros(3), np.eye(3), np.zeros(3)))"  # fmt: skip
+    ran = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert len(ran.stdout.split()) == 4
+
+
+def test_a_delta_travels_alone(policy, setup, saved, tmp_path):
+    low = LoraPolicy.of(policy, key=random.key(1), ranks=(2, 2, 1))
+    low = low.with_params(jax.tree.map(lambda leaf: leaf + 0.1, low.delta)).shifted(jnp.array([0.1, 0.0, -0.1, 0.0]))
+    save_delta(tmp_path / "delta.safetensors", low)
+    export(saved, "npz", tmp_path / "p.npz", None, Silent())
+    export(saved, "delta", tmp_path / "d.npz", tmp_path / "delta.safetensors", Silent())
+    rows = observations(portable_of(policy, setup).sizes[0], 200, seed=2)
+    wanted = commands(low.merged(), rows)
+    np.testing.assert_allclose(Runner(tmp_path / "p.npz", tmp_path / "d.npz").command(rows), wanted, atol=5e-4)
+    assert np.abs(Runner(tmp_path / "p.npz").command(rows) - wanted).max() > 0.1
+    export(saved, "npz", tmp_path / "merged.npz", tmp_path / "delta.safetensors", Silent())
+    np.testing.assert_allclose(Runner(tmp_path / "merged.npz").command(rows), wanted, atol=5e-4)
+    with pytest.raises(ValueError, match="made for another policy"):
+        Runner(tmp_path / "merged.npz", tmp_path / "d.npz")
+
+
+@pytest.mark.parametrize(
+    ("to", "out", "delta", "said"),
+    [
+        ("rust", None, None, "must be npz, onnx, c or delta"),
+        ("c", "policy.txt", None, "must end with .h"),
+        ("delta", None, None, "give it as --delta"),
+    ],
+)
+def test_what_cannot_be_asked_is_named(to, out, delta, said, saved, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match=said):
+        export(saved, to, out and Path(out), delta, Silent())
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_missing_policy_is_named(tmp_path):
+    with pytest.raises(CheckpointError, match="no such file"):
+        export(tmp_path / "nowhere.safetensors", "c", None, None, Silent())
+
+
+def test_hover_is_what_the_first_command_remembers(saved, tmp_path):
+    export(saved, "npz", tmp_path / "p.npz", None, Silent())
+    loaded = Runner(tmp_path / "p.npz")
+    np.testing.assert_array_equal(loaded.observe(np.zeros(3), np.eye(3), np.zeros(3))[15:], 0.0)
+    assert Command.hover().vector()[0] == pytest.approx(loaded._last[0])
