@@ -27,7 +27,8 @@ def test_an_example_runs(path, capsys, monkeypatch, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_every_file_of_the_folder_is_an_example_or_belongs_to_one():
+def test_every_file_of_the_folder_is_an_example_or_belongs_to_one_or_to_a_page():
     assert [path.stem[:2] for path in EXAMPLES] == [f"0{i}" for i in range(1, 9)]
-    text = "".join(path.read_text() for path in EXAMPLES)
+    pages = (FOLDER.parent / "docs/how-to").glob("*.md")
+    text = "".join(path.read_text() for path in (*EXAMPLES, *pages))
     assert all(path.name in text for path in FOLDER.iterdir() if path.is_file() and path.suffix != ".py")

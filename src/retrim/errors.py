@@ -23,3 +23,7 @@ class MessageError(RetrimError, ValueError):
 
 class CheckpointError(RetrimError, ValueError):
     """A file with a policy or with what was learnt that must not be flown."""
+
+
+class LogError(RetrimError, ValueError):
+    """A flight log that cannot be read, or whose columns cannot be what the map says that they are."""

@@ -17,6 +17,7 @@ from retrim.adapt.trim import RestTrim, Untrimmed
 from retrim.adapt.views import GravityView, RestView, WorldView
 from retrim.config import PRESETS, Scenario, Setup, changed, load, setup
 from retrim.config.learners import check_frame
+from retrim.config.vehicle_file import VehicleSpec
 from retrim.config.vehicles import make_vehicle
 from retrim.control.controller import PolicyController
 from retrim.control.gravity_frame import GravityFrame, SeenFrame
@@ -58,7 +59,8 @@ def test_the_model_has_the_presets_delay_and_lag(built):
         assert env.delay_ticks == preset.delay_ticks
         if preset.name in ("track/preview", "track/retrim", "track/fast", "vision/retrim"):
             assert isinstance(env.dynamics, Lagged)
-            assert float(env.dynamics.tau) == preset.actuator_tau == 0.033
+            assert preset.actuator_tau == 0.033
+            assert {float(tau) for tau in env.dynamics.tau.vector()} == {float(jnp.array(0.033))}
             assert isinstance(env.dynamics.base, PointMass)
         else:
             assert preset.actuator_tau is None
@@ -363,3 +365,21 @@ def test_a_hundred_hertz_trains_flies_and_adapts():
     np.testing.assert_allclose([e.t for e in log.events if e.kind in ("policy", "rejected")], [1.05])
     before, after = np.linalg.norm(log.p[[0, -1]] - np.array(preset.goal), axis=1)
     assert after < 0.7 * before
+
+
+def test_a_vehicle_whose_lag_is_known_is_modelled_with_it():
+    spec = VehicleSpec("made_up", 1.0, (0.02, 0.02, 0.03), (0.2, 0.2), 20.0, (4.0, 4.0, 3.0), 0.05, (0.07, 0.08, 0.4))
+    for name in ("hover/retrim", "track/retrim"):
+        made = Setup.of(changed(load(name), vehicle=spec))
+        np.testing.assert_allclose(made.env.dynamics.tau.vector(), [0.05, 0.07, 0.08, 0.4])
+        prior = made.learner.residual_model.init(jax.random.key(0))
+        rates = prior.rates if name == "hover/retrim" else prior.first.rates
+        np.testing.assert_allclose(rates.tau, [0.07, 0.08, 0.4])
+
+
+@pytest.mark.parametrize(("delay", "ticks"), [(0.041, 2), (0.0, 0), (None, 1)])
+def test_a_vehicle_whose_delay_is_known_is_trained_with_it(delay, ticks):
+    body = ("made_up", 1.0, (0.02, 0.02, 0.03), (0.2, 0.2), 20.0, (4.0, 4.0, 3.0), 0.05)
+    made = Setup.of(changed(load("hover/retrim"), vehicle=VehicleSpec(*body, command_delay=delay)))
+    assert made.env.delay_ticks == made.learner.plant_delay_ticks == made.preset.plant_delay_ticks == ticks
+    assert Setup.of(made.preset).preset == made.preset

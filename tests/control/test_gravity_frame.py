@@ -291,7 +291,7 @@ def test_a_corrected_model_turns_as_the_vehicle_was_seen_to_turn(key):
     """In the world with bias and lag; in the frame, whose controller answers the bias, with the lag."""
     model = RegressionModel.of(0.02)
     fresh = model.init(key)
-    known = replaced(fresh, rates=replaced(fresh.rates, bias=jnp.array([0.3, 0.0, 0.0]), tau=jnp.array(0.08)))
+    known = replaced(fresh, rates=replaced(fresh.rates, bias=jnp.array([0.3, 0.0, 0.0]), tau=jnp.full(3, 0.08)))
     env = hover_env(Lagged(PointMass(0.02), jnp.array(0.03)))
     world, framed = (view(env, FittedResidual(model, known)).dynamics for view in (WorldView(), GravityView(LIMIT)))
     true = Lagged(PointMass(0.02), jnp.array(0.08))

@@ -15,6 +15,7 @@ from retrim.config.loading import overlaid
 from retrim.config.named_presets import PRESETS
 from retrim.config.vehicle_file import VehicleSpec, read_vehicle
 from retrim.experiments.sweep import Sweep, read_sweep
+from retrim.io.logs import read_map
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -47,6 +48,7 @@ def test_a_page_lists_every_key_and_no_other(page, kind):
 def test_toml_files_of_pages_are_accepted(tmp_path):
     readers = {
         "my_quad": read_vehicle,
+        "my_log": read_map,
         "study": read_sweep,
         "track100": lambda path: overlaid(PRESETS["track/preview"], path),
         "east": lambda path: tomllib.loads(path.read_text()),

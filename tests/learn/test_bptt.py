@@ -8,13 +8,13 @@ import optax
 import pytest
 from jax import random
 
-from helpers import GOAL, hover_env, hover_task
+from helpers import GOAL, hover_env, hover_task, replaced
 from retrim import learn
 from retrim.control import Policy
 from retrim.learn import Env, PolicyState, pretrain
 from retrim.learn.pretrain import random_starts
 from retrim.learn.residuals import EnsembleResidual
-from retrim.physics import Hybrid, LinearDragQuadrotor, PointMass, State, StraightThrough, small
+from retrim.physics import Command, Hybrid, LinearDragQuadrotor, PointMass, State, StraightThrough, small
 from retrim.tasks import Start
 
 # As programs: eagerly, each call compiles its scan again.
@@ -101,6 +101,32 @@ def test_delay_holds_commands_back(key):
         seen = jax.tree.map(lambda leaf: leaf[0], flown.x)
         o, _ = task.observation(task.observation.init(seen), jnp.array(0.0), seen, policy.u_hover)
         np.testing.assert_allclose(flown.u.c[delay], policy(o).c, rtol=1e-12)
+
+
+@pytest.mark.parametrize("delay", [0, 2])
+def test_a_jump_costs_its_square_when_it_is_issued(key, delay):
+    env = hover_env(horizon=8, history=2, delay_ticks=delay)
+    policy = awake(key, env.task.observation.size)
+    start = env.task.reset(key)
+    free, charged = (rollout(each, policy, start) for each in (env, replaced(env, jump_cost=jnp.array(0.3))))
+    jax.tree.map(np.testing.assert_array_equal, (free.x, free.u), (charged.x, charged.u))
+    issued = jax.vmap(Command.vector)(free.u)[delay:]  # it acts so much later
+    jumps = jnp.diff(jnp.concatenate([policy.u_hover.vector()[None], issued]), axis=0)
+    cost = (free.reward - charged.reward)[: len(issued)]
+    np.testing.assert_allclose(cost, 0.3 * jnp.sum(jumps**2, axis=1), rtol=1e-9)
+    assert float(jnp.max(cost)) > 1e-3
+
+
+def test_a_cost_of_jumps_is_in_the_gradient(key):
+    env = replaced(hover_env(horizon=6, history=2), jump_cost=jnp.array(0.3))
+    policy = awake(key, env.task.observation.size)
+    x0 = starts(env.task, key, 3)
+    plain = jax.grad(lambda layers: policy_loss(eqx.tree_at(lambda p: p.layers, policy, layers), env, x0))(
+        policy.layers
+    )
+    found = policy_gradient(policy, env, x0)[1]
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(plain), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-12 * max(float(jnp.abs(b).max()), 1e-12))
 
 
 def test_a_residual_reaches_the_rollout(key):

@@ -35,7 +35,7 @@ class Flying:
         over = self.landing and time.monotonic() > self.landed + 0.2
         t = time.monotonic() - self.began
         control = {"mode": "policy", "swaps": [[0.1, "policy", 1, 0.1]]}
-        return Status(t, control, {}, {}, {}, "landed" if over else None, [], False, None)
+        return Status(t, control, {}, {}, {}, "landed" if over else None, [], False, 0, None)
 
 
 def shown_by(show, seconds=0.3, stop=None):

@@ -58,7 +58,7 @@ def asked(tmp_path):
 
 
 def status(**control):
-    return Status(1.0, control, {}, {}, {}, None, [], False, None)
+    return Status(1.0, control, {}, {}, {}, None, [], False, 0, None)
 
 
 def wish(asked, **fields):

@@ -179,6 +179,22 @@ def test_what_the_watchdog_flies_is_written_without_a_gap(tmp_path):
     assert (found[10:, -1] == Mode.WATCHDOG).all()
 
 
+def test_what_control_says_after_the_watchdog_has_spoken_is_written_too(tmp_path):
+    bus, path = InProcessBus(TOPICS), tmp_path / "flight.csv"
+    recorder = Recorder(path, bus)
+    bus.publish("flight", rows(0, 2))
+    bus.publish(
+        "fallback.flight", rows(4, 3, Mode.WATCHDOG)
+    )  # control was late, and the watchdog had not seen two ticks
+    assert recorder.step() == 5
+    bus.publish("flight", rows(0, 5))
+    assert recorder.step() == 2
+    assert Recorder(path, bus).step() == 0
+    found = read_log(path)
+    np.testing.assert_array_equal(found[:, 0], np.arange(7))
+    np.testing.assert_array_equal(found[:, -1], [Mode.POLICY] * 4 + [Mode.WATCHDOG] * 3)
+
+
 def test_a_full_disk_ends_the_log_and_nothing_else(tmp_path):
     bus = InProcessBus(TOPICS | {"ready.recorder": 4096})
     recorder = Recorder(tmp_path / "gone" / "flight.csv", bus)

@@ -74,11 +74,11 @@ def turning_of(residual: Residual) -> RateFit | None:
 def with_lag(env: Env, found: RateFit | None) -> Env:
     """Return the environment with the lag that was identified, if it has a lag and one was.
 
-    It is that of the rates; thrust comes from the same motors, and has the same one in the model.
+    It is that of the rates; thrust comes from the same motors, and has that of roll and pitch in the model.
     """
     if found is None or not isinstance(env.dynamics, Lagged):
         return env
-    return dataclasses.replace(env, dynamics=Lagged(env.dynamics.base, found.tau))
+    return dataclasses.replace(env, dynamics=Lagged(env.dynamics.base, Command(found.tau[0], found.tau)))
 
 
 class Same(eqx.Module):

@@ -12,22 +12,21 @@ import tyro
 from rich.live import Live
 from rich.table import Table
 
-from ..config.loading import changed, load_for
-from ..config.scenario import Scenario
+from ..config.loading import load_for
 from ..config.setup import Setup
 from ..errors import ConfigError
-from ..experiments.asked import flown_reference, loaded
+from ..experiments.asked import Where, loaded, with_residual
 from ..experiments.figures import picture
 from ..experiments.interrupts import interrupts_only_set
 from ..experiments.limits import check_seeds
 from ..experiments.run import INTERRUPTED, Run
 from ..experiments.tables.document import TableSection
 from ..experiments.training import train
+from ..io.logs.recording import check_recording
 from ..live.display import figures, live_line, live_rows
 from ..live.events import LiveEvents
 from ..live.flying import fly_live
 from ..live.page import page_address
-from ..live.recording import check_recording
 from ..live.session import LONGEST, LiveRequest, check_limits, learners_at
 from ..live.status import Status
 from ..runtime.events import Event
@@ -41,14 +40,8 @@ def live(
     policy: Path | None = None,
     resume: Path | None = None,
     preset: str = "hover/retrim",
-    disturbance: str = "large",
-    plant: str = "bem",
+    where: tyro.conf.OmitArgPrefixes[Where] = Where(),  # noqa: B008
     adapt: str = "full",
-    reference: str | None = None,
-    vehicle: str | None = None,
-    sensors: str = "ideal",
-    thrust_error: float = 0.035,
-    delay: float = 0.02,
     residual: str | None = None,
     seconds: float | None = None,
     fence: float = 3.0,
@@ -70,19 +63,12 @@ def live(
         policy: A policy.safetensors, or the folder that holds one; without one, a policy is trained first.
         resume: A learnt.safetensors of an earlier flight, to go on from.
         preset: Preset to train with where there is neither.
-        disturbance: What disturbs the flight, as for `retrim fly`.
-        plant: What flies: bem, simple, rotorpy, mujoco, crazyflow, or module:name.
+        where: Plant, vehicle and what disturbs the flight.
         adapt: full, lora: learn in flight; base-i, base-do, none: fly without learning; or module:name.
-        reference: What a tracking policy follows.
-        vehicle: Vehicle that the plant simulates; that which the policy was trained for by default.
-        sensors: What the policy is shown of the state: ideal, mocap, onboard, rough, or module:name.
-        thrust_error: By how much more than commanded the rotors give, as a share (bem and simple).
-        delay: Command delay of the plant [s], in whole milliseconds (bem and simple).
-        residual: Residual model: ensemble, regression, layered, or module:name.
+        residual: Residual model: ensemble, regression, layered, linear, or module:name.
         seconds: Length of the flight; until Ctrl-C by default.
         fence: How far from its reference the vehicle may be along any axis before the fallback flies [m].
-        policy_age: Age [s] of the flight that the policy was learnt from, above which the fallback flies; none by
-            default.
+        policy_age: Age [s] of the flight that the policy was learnt from, above which the fallback flies; any age.
         seed: Seed of the start, of the learners and of what is random in the scenario.
         learners: Where learners on another machine, started by `retrim learn`, reach this one: zenoh:HOST:PORT (this
             machine listens there), or ros:HOST:PORT of a rosmaster. By default they run here.
@@ -90,7 +76,7 @@ def live(
         no_page: Show it in the terminal only.
         page_host: Address that the page listens on. Anybody who reaches another than 127.0.0.1 may turn the knobs.
         page_port: Port of the page, or the next one that is free.
-        record: File FILE.mcap of the flight for Foxglove, PlotJuggler or rerun, written at its end.
+        record: FILE.mcap for Foxglove, PlotJuggler or rerun, written at the end; by default flight.mcap in the folder.
         out: Folder of what the flight leaves; a new one under runs/ by default.
     """
 
@@ -107,13 +93,9 @@ def live(
         state, weights, chosen = None, None, load_for(preset.partition("/")[0], preset)
         if policy is not None or resume is not None:
             weights, chosen, state = loaded(policy, resume)
-        if residual is not None:
-            if state is not None:
-                raise ConfigError(f"--residual {residual}: a resumed flight goes on with its own residual")
-            chosen = changed(chosen, adapt={"residual": residual})
-        follows = flown_reference(chosen, reference)
-        scenario = Scenario(disturbance, plant, vehicle, sensors, thrust_error, follows, delay)
-        setup, run = Setup.of(chosen, follows), started(Run("live", out, stop=stop))
+        chosen = with_residual(chosen, residual, state)
+        scenario = where.scenario(chosen)
+        setup, run = Setup.of(chosen, scenario.reference), started(Run("live", out, stop=stop))
         if weights is None:
             weights, losses = train(Setup.of(chosen), seed, reporter=RichReporter(), stop=stop)
             if run.interrupted:
@@ -138,7 +120,7 @@ def _fly(request: LiveRequest, run: Run) -> int:
     show_table(TableSection(("figure", "unit", "value"), figures(done.rows), f"live, {done.flight.log.t[-1]:.1f} s"))
     drawn = picture([done.flight], request.setup, request.scenario, run.folder, stem="live")
     show_paths([*drawn[:1], *done.paths])
-    return run.exit_code
+    return run.exit_code or int(not done.landed)
 
 
 def _open_page(url: str) -> None:

@@ -20,6 +20,8 @@ COMMANDS = {
     "reproduce": "Make a table of the paper again: hover, track, fast, vision, reversing, ...",
     "live": "Fly against the clock and learn at the same time, in processes of their own.",
     "learn": "Learn for a live flight on another machine.",
+    "replay": "Read a flight log: what the model missed, how well it is foretold; identify, adapt.",
+    "export": "Write a policy as NPZ, ONNX or C, for a computer without JAX.",
     "gauntlet": "A policy under everything that changes, at hover or on references: recovery, steady and worst error.",
     "bench": "How long each piece of work takes on this machine.",
     "doctor": "Versions, device and cache, and known faults of dependencies.",
@@ -125,17 +127,23 @@ def _command(name: str, words: list[str], stop: threading.Event) -> int:
 
 @contextlib.contextmanager
 def _stop_on_interrupt(stop: threading.Event) -> Iterator[None]:
-    """Let Ctrl-C set the stop token and raise: a KeyboardInterrupt that JAX swallows is not lost."""
+    """Let Ctrl-C set the stop token and raise: a KeyboardInterrupt that JAX swallows is not lost, and not told."""
 
     def handle(number: int, frame: FrameType | None) -> None:
         stop.set()
         raise KeyboardInterrupt
 
+    def swallowed(error: "sys.UnraisableHookArgs") -> None:
+        if not isinstance(error.exc_value, KeyboardInterrupt):
+            sys.__unraisablehook__(error)
+
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.signal(signal.SIGINT, handle)
+    before, hook = signal.signal(signal.SIGINT, handle), sys.unraisablehook
+    sys.unraisablehook = swallowed
     try:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
+        sys.unraisablehook = hook

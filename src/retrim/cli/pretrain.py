@@ -36,7 +36,7 @@ def pretrain(
         preset: Preset to train with, as hover/retrim or hover/paper; by default the task's own.
         vehicle: Vehicle to train for: small, large, kingfisher, a vehicle file, as my_quad.toml, or module:name.
         reference: What to track: circle, figure8, star, a CSV file, module:name, or a family, as circle+star.
-        residual: Residual model of later adaptation: ensemble, regression, layered, or module:name.
+        residual: Residual model of later adaptation: ensemble, regression, layered, linear, or module:name.
         config: TOML file that overlays the preset, for example with a table [pretrain].
         updates: Optimiser steps, instead of the preset's.
         envs: Starts per step, instead of the preset's.

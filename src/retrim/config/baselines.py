@@ -21,6 +21,7 @@ from ..estimation.l1 import L1Estimator
 from ..estimation.prediction import Prediction
 from ..learn.datt import KNOWN
 from ..tasks.occluded import OccludedKeypoints
+from .tasks import lag_of
 
 if TYPE_CHECKING:
     from .setup import Setup
@@ -64,8 +65,9 @@ class Baseline:
 
 def prediction_of(setup: "Setup") -> Prediction:
     """Return the nominal model of a preset's vehicle."""
-    preset = setup.preset
-    return Prediction(jnp.array(preset.actuator_tau or ACTUATOR_TAU), preset.dt, preset.plant_delay_ticks)
+    preset, lag = setup.preset, lag_of(setup.preset, setup.vehicle)
+    tau = jnp.array(ACTUATOR_TAU) if lag is None else lag.omega[0]  # of all axes: a baseline hardly yaws
+    return Prediction(tau, preset.dt, preset.plant_delay_ticks)
 
 
 def _gains(s: Settings) -> Gains:

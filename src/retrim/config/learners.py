@@ -26,17 +26,17 @@ from ..tasks.keypoints import Keypoints
 from ..tasks.occluded import OccludedKeypoints
 from ..tasks.task import AbstractTask
 from .presets import Preset, Pretrain
-from .tasks import find_task
+from .tasks import find_task, lag_of
 
 OBSERVER_TAU = 0.05  # [s]: half of it is unstable where the plant's delay is 40 ms longer than declared
 WANDER = 4.0  # [m/s^2] in a second
 TILT_LIMIT = 6.0  # [m/s^2], largest disturbance that turns a frame: gravity keeps a downward part
 
 
-def nominal_model(preset: Preset) -> AbstractDynamics[Any]:
-    """Return the point mass of Eq. (1) of the paper, behind the lag of the actuators where a preset declares one."""
-    model = PointMass(preset.dt)
-    return model if preset.actuator_tau is None else Lagged(model, jnp.array(preset.actuator_tau))
+def nominal_model(preset: Preset, vehicle: Vehicle) -> AbstractDynamics[Any]:
+    """Return the point mass of Eq. (1) of the paper, behind the lag of the actuators where one is declared."""
+    model, lag = PointMass(preset.dt), lag_of(preset, vehicle)
+    return model if lag is None else Lagged(model, lag)
 
 
 def pretraining_optimiser(table: Pretrain) -> optax.GradientTransformation:
@@ -110,20 +110,21 @@ def felt_frame(
 
     Args:
         controller: It can be turned.
-        preset: Its control period, declared delay and declared lag are those of the observer.
-        vehicle: Its limits, too.
+        preset: Its control period and declared delay are those of the observer.
+        vehicle: Its limits and its lag, too.
         known: What was learnt of the residual and of the body rates; the observer sees the rest. A pose filter sees
             it all.
     """
     limit = jnp.array(TILT_LIMIT)
     if isinstance(controller, PolicyController) and isinstance(controller.observation, OccludedKeypoints):
         return SeenFrame(controller, limit)
+    lag = lag_of(preset, vehicle)
     observer = DisturbanceObserver(
         PointMass(preset.dt),
         jnp.array(OBSERVER_TAU),
         limit,
         jnp.array(WANDER),
-        None if preset.actuator_tau is None else jnp.array(preset.actuator_tau),
+        None if lag is None else lag.c,
         (vehicle.command_min, vehicle.command_max),
         delay_ticks=preset.plant_delay_ticks,
     )

@@ -43,6 +43,7 @@ OFF: dict[str, tuple[Lever, ...]] = {
         *LAYERS_OFF,
         Lever("no trim", {"adapt": {"trim": "free"}}),
         Lever("the paper's reward", {"reward": "paper"}),
+        Lever("no cost of jumps", {"jump_cost": 0.0}),
         Lever("no past commands", {"command_history": 0}),
         Lever("no delay in the model", {"delay_ticks": 0}),
     ),
@@ -52,6 +53,7 @@ OFF: dict[str, tuple[Lever, ...]] = {
         Lever("references as they are only", {"track": {"felt_copies": 0}}),
         Lever("no acceleration and jerk seen", {"track": {"observation": "preview"}}),
         Lever("no tip in the reward", {"reward": "l2"}),
+        Lever("no cost of jumps", {"jump_cost": 0.0}),
         Lever("no actuator lag in the model", {"actuator_tau": None}),
     ),
 }

@@ -42,6 +42,7 @@ RETRIM = dataclasses.replace(
     FAST,
     name="hover/retrim",
     reward="l2",
+    jump_cost=0.1,
     pretrain=dataclasses.replace(FAST.pretrain, num_updates=300, learning_rate=3e-3, hidden_sizes=(128, 128)),
     adapt=Adapt(
         residual="regression", fit_every=0.2, update_every=0.5, num_updates=5, learning_rate=1e-4,
@@ -55,6 +56,7 @@ TRACK_RETRIM = dataclasses.replace(
     TRACK,
     name="track/retrim",
     reward="sharp",
+    jump_cost=0.1,
     track=FELT,
     pretrain=dataclasses.replace(
         TRACK.pretrain, num_updates=1200, learning_rate=5e-3, adam_b2=0.95, hidden_sizes=(128, 128)

@@ -3,13 +3,17 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from ..errors import ConfigError
 from ..physics.bem import BemQuadrotor
 from ..physics.disturbance import Disturbance
 from ..physics.rotors import LinearDragQuadrotor
 from ..physics.vehicle import Vehicle
+from ..plants.bridges.betaflight import BetaflightPlant
+from ..plants.bridges.endpoint import address_of
+from ..plants.bridges.mavlink import ADDRESS, MavlinkPlant
 from ..plants.crazyflow import CrazyflowPlant
 from ..plants.mujoco import MujocoPlant
-from ..plants.plant import Plant
+from ..plants.plant import Plant, as_numpy
 from ..plants.rotorpy import RotorpyPlant
 from ..plants.sensors import SensorModel
 from ..plants.sim import SimPlant
@@ -32,6 +36,8 @@ class PlantRequest:
     seed: int
     delay: float = DELAY
     """Command delay [s]."""
+    address: str = ""
+    """Where a vehicle is reached; what its link has by default if it is empty."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +55,14 @@ class PlantEntry:
     """Whether it takes an error of the thrust map."""
     has_delay: bool = False
     """Whether it takes a command delay."""
+    is_vehicle: bool = False
+    """Whether it is a link to a vehicle, whose time does not wait and whose world cannot be disturbed. Its name may be
+    followed by an address, as ``mavlink:udp:127.0.0.1:14540``, and it makes a
+    :class:`~retrim.plants.bridges.vehicle_plant.VehiclePlant`."""
+    has_world: bool = False
+    """Whether the world around a vehicle is simulated here, and can be disturbed."""
+    check_address: Callable[[str], object] | None = None
+    """Raises ConfigError for what follows a vehicle's name, if it is no address; None: anything may."""
 
 
 PLANTS: Registry[PlantEntry] = Registry("plant", example="module:name of a PlantEntry")
@@ -63,6 +77,42 @@ def _bem(r: PlantRequest) -> Plant:
 def _simple(r: PlantRequest) -> Plant:
     model = LinearDragQuadrotor.of(r.vehicle, r.dt, thrust_error=r.thrust_error)
     return SimPlant(model, r.disturbance, delay_s=r.delay, sensors=r.sensors, seed=r.seed)
+
+
+def find_plant(name: str) -> tuple[object, str]:
+    """Return what is registered under a name, and the address that follows it.
+
+    Raises:
+        ConfigError: There is no such plant.
+    """
+    kind, _, address = name.partition(":")
+    entry = PLANTS.get(kind)
+    return (entry, address) if entry is not None and entry.is_vehicle else (PLANTS.find(name), "")
+
+
+def is_vehicle(plant: str) -> bool:
+    """Return whether a plant is a link to a vehicle.
+
+    Raises:
+        ConfigError: There is no such plant.
+    """
+    entry = find_plant(plant)[0]
+    return isinstance(entry, PlantEntry) and entry.is_vehicle
+
+
+def _mavlink(r: PlantRequest) -> Plant:
+    low, high = (as_numpy(u).astype(float) for u in (r.vehicle.command_min, r.vehicle.command_max))
+    return MavlinkPlant(r.address, r.dt, low, high)
+
+
+def _betaflight(r: PlantRequest) -> Plant:
+    low, high = (as_numpy(u).astype(float) for u in (r.vehicle.command_min, r.vehicle.command_max))
+    return BetaflightPlant(BemQuadrotor.of(r.vehicle, r.dt, thrust_error=r.thrust_error), r.disturbance, low, high)
+
+
+def _no_address(address: str) -> None:
+    if address:
+        raise ConfigError(f"plant 'betaflight' has no address, and {address!r} is one too many")
 
 
 register_plant(
@@ -106,5 +156,25 @@ register_plant(
         lambda r: CrazyflowPlant(r.disturbance, dt=r.dt),
         "crazyflow's identified Crazyflie, one tick of command delay",
         own_vehicle="cf21B_500",
+    ),
+)
+register_plant(
+    "mavlink",
+    PlantEntry(
+        _mavlink,
+        "a vehicle, or a simulation, that PX4 flies",
+        is_vehicle=True,
+        check_address=lambda address: address_of(address or ADDRESS),
+    ),
+)
+register_plant(
+    "betaflight",
+    PlantEntry(
+        _betaflight,
+        "Betaflight's firmware as the rate controller of blade-element rotors, in real time",
+        has_thrust_error=True,
+        is_vehicle=True,
+        has_world=True,
+        check_address=_no_address,
     ),
 )

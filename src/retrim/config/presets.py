@@ -51,7 +51,7 @@ class Adapt:
     """Ticks of flight that are remembered."""
     residual: str = "ensemble"
     """Residual model: ensemble (the paper's), regression (ten physical numbers), layered (an ensemble on what the
-    regression leaves), or module:name."""
+    regression leaves), linear (19 features, carried along the flight), or module:name."""
     memory: Seconds = 0.5
     """Regression: a tick counts for 1/e of the newest after this long [s]."""
     thrust_prior: float = Field(default=0.05, gt=0, le=1.0, strict=True)
@@ -155,6 +155,8 @@ class Preset:
     """Declared command delay of the plant [ticks], to pair accelerations with commands."""
     actuator_tau: Positive | None = None
     """Time constant of the model's actuators [s]; none by default."""
+    jump_cost: float = Field(default=0.0, ge=0.0, allow_inf_nan=False)
+    """Cost of the squared change of the command from tick to tick, c in m/s^2 and rates in rad/s."""
     track: Track | None = None
     vision: Vision | None = None
     options: dict[str, Any] = Field(default_factory=dict)

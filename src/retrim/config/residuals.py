@@ -8,11 +8,13 @@ import jax.numpy as jnp
 from ..errors import ConfigError
 from ..learn.residuals.ensemble import EnsembleModel
 from ..learn.residuals.layered import LayeredModel
+from ..learn.residuals.linear import LinearModel
 from ..learn.residuals.model import ResidualModel
 from ..learn.residuals.regression import BLOCK, RegressionModel
 from ..physics.vehicle import Vehicle
 from .presets import Preset
 from .registry import Registry
+from .tasks import lag_of
 
 
 @dataclass(frozen=True)
@@ -58,8 +60,9 @@ def _ensemble(request: ResidualRequest, hidden: tuple[int, ...] = (128, 128)) ->
 
 def _regression(request: ResidualRequest) -> RegressionModel:
     p, a, v = request.preset, request.preset.adapt, request.vehicle
-    limits, tau = (v.command_min, v.command_max), p.actuator_tau or 0.03
-    return RegressionModel.of(p.dt, memory=a.memory, thrust_prior=a.thrust_prior, tau=tau, limits=limits)
+    limits, lag = (v.command_min, v.command_max), lag_of(p, v)
+    roll, pitch, yaw = (0.03,) * 3 if lag is None else lag.omega.tolist()
+    return RegressionModel.of(p.dt, memory=a.memory, thrust_prior=a.thrust_prior, tau=(roll, pitch, yaw), limits=limits)
 
 
 def _layered(request: ResidualRequest) -> ResidualModel:
@@ -72,6 +75,11 @@ def _layered(request: ResidualRequest) -> ResidualModel:
     return LayeredModel(_regression(request), _ensemble(request, SMALL))
 
 
+def _linear(request: ResidualRequest) -> LinearModel:
+    return LinearModel.of(request.preset.dt, every=request.preset.adapt.fit_every)
+
+
 register_residual("ensemble", _ensemble)
 register_residual("regression", _regression)
 register_residual("layered", _layered)
+register_residual("linear", _linear)

@@ -7,7 +7,7 @@ from ..errors import ConfigError
 from ..physics.vehicle import Vehicle
 from ..plants.plant import Plant
 from .disturbances import disturbance
-from .plants import DELAY, PLANTS, PlantEntry, PlantRequest
+from .plants import DELAY, PlantEntry, PlantRequest, find_plant
 from .sensors import SENSORS
 from .vehicle_file import VehicleSpec
 from .vehicles import make_vehicle, name_of, vehicle_from
@@ -43,6 +43,13 @@ class Scenario:
                     f"plant {self.plant!r} flies its own vehicle, {entry.own_vehicle}, not {name_of(self.vehicle)}"
                 )
             object.__setattr__(self, "vehicle", vehicle_from(self.vehicle))
+        if entry.check_address is not None:
+            entry.check_address(find_plant(self.plant)[1])
+        if entry.is_vehicle and not entry.has_world and self.disturbance != "none":
+            raise ConfigError(
+                f"plant {self.plant!r} is a vehicle, whose world nobody can disturb by name: disturbance "
+                f"{self.disturbance!r} must be none"
+            )
         if self.sensors != "ideal" and not entry.has_sensors:
             raise ConfigError(
                 f"plant {self.plant!r} measures its true state; sensors {self.sensors!r} need bem or simple"
@@ -59,7 +66,7 @@ class Scenario:
     @property
     def entry(self) -> PlantEntry:
         """The plant's entry in the registry."""
-        entry: Any = PLANTS.find(self.plant)
+        entry: Any = find_plant(self.plant)[0]
         if isinstance(entry, PlantEntry):
             return entry
         if not callable(entry):
@@ -104,5 +111,6 @@ class Scenario:
             dt,
             seed,
             self.delay,
+            find_plant(self.plant)[1],
         )
         return entry.make(request)

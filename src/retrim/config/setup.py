@@ -1,5 +1,6 @@
 """From a preset's numbers to objects, built once."""
 
+import dataclasses
 import math
 from collections import deque
 from collections.abc import Iterator
@@ -7,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import jax
+import jax.numpy as jnp
 import optax
 from jax import random
 from jaxtyping import Array, Float, Key
@@ -36,7 +38,7 @@ from .presets import Preset
 from .presets import Track as TrackTable
 from .references import make_reference, make_training_reference
 from .residuals import ResidualRequest, make_residual
-from .tasks import TaskRequest, find_task
+from .tasks import TaskRequest, delayed, find_task
 from .vehicles import make_vehicle
 
 Latency = Literal["fixed", "measured"]
@@ -77,7 +79,7 @@ class Setup:
         Raises:
             ConfigError: A name does not exist, the task tracks no reference, or values do not fit together.
         """
-        entry = find_task(preset.task)
+        preset, entry = delayed(preset), find_task(preset.task)
         if reference is not None and not entry.has_reference:
             raise ConfigError(f"reference {reference!r}: a {preset.task} policy follows none")
         vehicle = make_vehicle(preset.vehicle)
@@ -91,10 +93,11 @@ class Setup:
             if reference is not None:
                 followed = make_reference(reference) if isinstance(reference, str) else reference
                 flown = entry.make(TaskRequest(preset, vehicle, followed))
-            nominal = nominal_model(preset)
-            env = Env(nominal, task, preset.delay_ticks)
+            nominal = nominal_model(preset, vehicle)
+            jumps = jnp.array(preset.jump_cost) if preset.jump_cost else None
+            env = Env(nominal, task, preset.delay_ticks, jump_cost=jumps)
             model = residual_model or make_residual(ResidualRequest(preset, vehicle))
-            learner = make_learner(preset, model, Env(nominal, flown, preset.delay_ticks))
+            learner = make_learner(preset, model, dataclasses.replace(env, task=flown))
         except (TypeError, ValueError) as error:
             raise (
                 error if isinstance(error, ConfigError) else ConfigError(f"preset {preset.name!r}: {error}")

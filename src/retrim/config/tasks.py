@@ -1,5 +1,6 @@
 """Tasks by name."""
 
+import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -7,6 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 
 from ..errors import ConfigError
+from ..physics.state import Command
 from ..physics.vehicle import Vehicle
 from ..tasks.hover import AbstractHover, Hover, L2Hover
 from ..tasks.keypoints import Keypoints
@@ -22,6 +24,7 @@ from .presets import Preset
 from .presets import Track as TrackTable
 from .presets import Vision as VisionTable
 from .registry import Registry
+from .vehicle_file import VehicleSpec
 
 LEAD = 0.04  # [s]: about as late as commands act, behind a delay and motors
 VISION_REWARDS: dict[str, type[AbstractHover]] = {"paper": Hover, "l2": L2Hover, "view": ViewHover}
@@ -89,6 +92,23 @@ def _hover(request: TaskRequest) -> AbstractTask:
     )
 
 
+def lag_of(preset: Preset, vehicle: Vehicle) -> Command | None:
+    """Return the time constants of thrust and rates [s]: the vehicle's where they are known, else the preset's."""
+    if vehicle.rate_lag is not None:
+        return Command(vehicle.motor_tau, vehicle.rate_lag)
+    tau = preset.actuator_tau
+    return None if tau is None else Command(jnp.array(tau), jnp.full(3, tau))
+
+
+def delayed(preset: Preset) -> Preset:
+    """Return a preset with the command delay of its vehicle, where its file says one, in the model and declared."""
+    vehicle = preset.vehicle
+    if not isinstance(vehicle, VehicleSpec) or vehicle.command_delay is None:
+        return preset
+    ticks = round(vehicle.command_delay / preset.dt)
+    return dataclasses.replace(preset, delay_ticks=ticks, plant_delay_ticks=ticks)
+
+
 def _vision(request: TaskRequest) -> AbstractTask:
     p, table = request.preset, request.preset.vision or VisionTable()
     omega_max = request.vehicle.omega_max
@@ -97,7 +117,7 @@ def _vision(request: TaskRequest) -> AbstractTask:
     )
     flown: OccludedKeypoints | None = None
     if table.occlusion:  # a filter estimates the pose so well that training need not know of it
-        lag = None if p.actuator_tau is None else jnp.array(p.actuator_tau)
+        lag = lag_of(p, request.vehicle)
         flown = OccludedKeypoints(training, jnp.array(table.dropout), lag, delay_ticks=p.plant_delay_ticks)
     kind = VISION_REWARDS[p.reward]
     return kind(

@@ -34,6 +34,12 @@ class VehicleSpec:
     """Largest body rates that the rate controller accepts [rad/s]."""
     motor_tau: Annotated[float, Field(gt=0, le=0.5, strict=True)]
     """Time constant of the motors [s]."""
+    rate_lag: Three | None = None
+    """Time constants of the body rates behind their commands: roll, pitch, yaw [s]; those of the preset by default.
+    Policies are trained for them, and for a thrust that follows as the motors do."""
+    command_delay: Annotated[float, Field(ge=0, le=0.2, strict=True)] | None = None
+    """Between a command and its effect [s]; that of the preset by default. Policies are trained for it, in whole ticks,
+    and learners pair accelerations with the commands that caused them."""
     propeller: Literal["3 inch", "5 inch"] | None = None
     """Blade geometry that is scaled to the vehicle; the nearer one by default."""
     propeller_diameter: Positive | None = None
@@ -99,6 +105,7 @@ class VehicleSpec:
             torque_ratio=like.torque_ratio * scale,
             drag_area=drag,
             propeller=scaled,
+            rate_lag=None if self.rate_lag is None else jnp.array(self.rate_lag),
             esc=dataclasses.replace(esc, base=esc.base * ratio, linear=esc.linear * ratio, root=esc.root * ratio),
         )
 

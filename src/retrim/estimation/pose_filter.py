@@ -43,13 +43,13 @@ class PoseFilter(eqx.Module):
             _moved(x, off), jnp.zeros_like(x.p), jnp.diag(jnp.concatenate([std, push]) ** 2), Command.hover(x.p.dtype)
         )
 
-    def predicted(self, u: Command, dt: float, tau: Float[Array, ""] | None = None) -> "PoseFilter":
+    def predicted(self, u: Command, dt: float, tau: Float[Array, ""] | Command | None = None) -> "PoseFilter":
         """Return the filter ``dt`` seconds later.
 
         Args:
             u: Command that reached the actuators during that time.
             dt: [s]
-            tau: Time constant of the actuators [s]; None for none.
+            tau: Time constants of the actuators [s]; None for none.
         """
         x, dtype = self.x, self.P.dtype
         u, end = (u, u) if tau is None else lagged(self.acting, u, dt, tau)

@@ -6,7 +6,9 @@ from typing import Any
 
 from ..adapt.learner import LearnerState
 from ..config.loading import changed, load_for, overlaid
+from ..config.plants import DELAY, is_vehicle
 from ..config.presets import Preset
+from ..config.scenario import THRUST_ERROR, Scenario
 from ..config.tasks import find_task
 from ..config.vehicle_file import VehicleSpec
 from ..config.vehicles import vehicle_from
@@ -40,6 +42,64 @@ def loaded(
     assert policy is not None
     weights, preset = load_policy(policy)
     return (load_delta(delta, weights).merged() if delta is not None else weights), preset, None
+
+
+@dataclasses.dataclass(frozen=True)
+class Where:
+    """Where a flight takes place, as a command is asked for it."""
+
+    disturbance: str | None = None
+    """What disturbs the flight: none, small, large (the default, but on a vehicle), push, step, kick, reversing, walk,
+    wind, gusts, fan, payload, pickup, battery, weak-rotor, with a size, as wind=6 [m/s] or payload=0.2 [kg], several at
+    once, as wind+payload=0.1, or module:name."""
+    plant: str = "bem"
+    """bem: blade-element rotors; simple: rotors with linear drag; rotorpy, mujoco, crazyflow: independent simulators,
+    each an extra to install; betaflight: its firmware as the rate controller, in real time;
+    mavlink:udp:HOST:PORT or mavlink:serial:DEVICE:BAUD: a vehicle; or module:name."""
+    reference: str | None = None
+    """What a tracking policy follows: circle, figure8, star, module:name or a CSV file of t, x, y, z[, yaw]; what it
+    was trained on by default. A closed file repeats as laps, another is flown once; my.csv:laps and my.csv:once insist.
+    Another reference than that of training needs a policy that sees it."""
+    vehicle: str | None = None
+    """Vehicle that the plant simulates: small, large, kingfisher, a vehicle file or module:name; that which the policy
+    was trained for by default. rotorpy and crazyflow fly their own."""
+    sensors: str = "ideal"
+    """What the policy is shown of the state: ideal, mocap (0.3 mm, 3 mm/s, 1 mrad), onboard (0.6 mm, 6 mm/s, 2 mrad,
+    10 ms late, 1 % of the samples lost), rough (1 mm, 10 mm/s, 3 mrad, 10 ms late, 5 % of the samples lost), or
+    module:name."""
+    thrust_error: float = THRUST_ERROR
+    """By how much more than commanded the rotors give, as a share (bem and simple)."""
+    delay: float = DELAY
+    """Command delay of the plant [s], in whole milliseconds (bem and simple); the policy does not know of it."""
+
+    @property
+    def is_vehicle(self) -> bool:
+        """Whether a vehicle flies, whose time does not wait."""
+        return is_vehicle(self.plant)
+
+    def scenario(self, preset: Preset) -> Scenario:
+        """Return the scenario for a policy.
+
+        Raises:
+            ConfigError: Something does not exist, or does not fit together.
+        """
+        usual = "none" if self.is_vehicle else "large"
+        follows = flown_reference(preset, self.reference)
+        return Scenario(self.disturbance or usual, self.plant, self.vehicle, self.sensors, self.thrust_error, follows,
+                        self.delay)  # fmt: skip
+
+
+def with_residual(preset: Preset, residual: str | None, state: LearnerState | None) -> Preset:
+    """Return a preset with the residual model that was asked for, if one was.
+
+    Raises:
+        ConfigError: There is none of that name, or what an earlier flight learnt has its own.
+    """
+    if residual is None:
+        return preset
+    if state is not None:
+        raise ConfigError(f"--residual {residual}: a resumed flight goes on with its own residual")
+    return changed(preset, adapt={"residual": residual})
 
 
 def flown_reference(preset: Preset, name: str | None) -> str | None:

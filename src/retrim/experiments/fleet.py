@@ -59,6 +59,8 @@ class Fleet:
         if not scenarios or not methods:
             raise ConfigError(f"{len(scenarios)} scenarios by {len(methods)} methods: there is nothing to fly")
         check_flights(starts, seconds)
+        if vehicles := sorted({s.plant for s in scenarios if s.entry.is_vehicle}):
+            raise ConfigError(f"plant {vehicles[0]!r} is a vehicle: it is flown by itself, by `retrim live`")
         self.preset = preset
         self.policies: dict[int, Any] = dict(policies) if isinstance(policies, Mapping) else {0: policies}
         check_seeds(tuple(self.policies))

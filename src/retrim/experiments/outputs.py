@@ -7,12 +7,14 @@ from typing import Any
 
 import numpy as np
 
+from ..adapt.learner import LearnerState
 from ..config.presets import Preset
 from ..config.setup import Setup
 from ..control.lora import LoraPolicy
 from ..control.policy import Policy
 from ..io.checkpoint import save_delta
 from ..io.files import write_whole
+from ..io.logs.recording import Recording, can_record, write_mcap, write_npz
 from ..io.trained import save_learnt, save_policy
 from .flights import Flight
 from .interrupts import interrupts_only_set
@@ -48,12 +50,21 @@ def write_trained(
     return path
 
 
+def write_flights(flights: Sequence[Flight], preset: Preset, folder: Path) -> None:
+    """Write events and logs of flights, and what they learnt, in the place of those of earlier ones."""
+    clear_outputs(folder)
+    write_events(flights, folder)
+    write_logs(flights, folder)
+    write_learnt(flights, preset, folder)
+
+
 def clear_outputs(folder: Path) -> None:
     """Remove what an earlier command left of flights in a folder that is used again, before new files are written."""
     for name in ("learnt.safetensors", "adapted.safetensors", "delta.safetensors", "events.jsonl"):
         (folder / name).unlink(missing_ok=True)
-    for log in (folder / "logs").glob("*.npz"):
-        log.unlink()
+    for log in (folder / "logs").glob("*"):
+        if log.suffix in (".npz", ".mcap"):
+            log.unlink()
 
 
 def write_events(flights: Sequence[Flight], folder: Path) -> None:
@@ -77,27 +88,33 @@ def write_events(flights: Sequence[Flight], folder: Path) -> None:
 
 
 def write_logs(flights: Sequence[Flight], folder: Path) -> None:
-    """Write one NPZ for each flight under ``logs/``: times, true and measured states, commands, errors."""
+    """Write each flight under ``logs/``: as NPZ, and as MCAP where what writes it is installed."""
     (folder / "logs").mkdir(parents=True, exist_ok=True)
     for flight in flights:
-        spec, log = flight.spec, flight.log
-        name = f"{spec.method}_seed{spec.seed}_start{spec.start}"
-        with (folder / "logs" / f"{name}.npz.partial").open("wb") as file:
-            np.savez_compressed(
-                file,
-                t=log.t,
-                p=log.true.p,
-                R=log.true.R,
-                v=log.true.v,
-                p_measured=log.measured.p,
-                R_measured=log.measured.R,
-                v_measured=log.measured.v,
-                u=log.u,
-                age=np.broadcast_to(log.age, log.t.shape),
-                error=flight.error,
-                terminated=log.terminated,
-            )
-        (folder / "logs" / f"{name}.npz.partial").replace(folder / "logs" / f"{name}.npz")
+        spec, recording = flight.spec, recording_of(flight)
+        path = folder / "logs" / f"{spec.method}_seed{spec.seed}_start{spec.start}.npz"
+        write_npz(path, recording)
+        if can_record():
+            write_mcap(path.with_suffix(".mcap"), recording)
+
+
+def recording_of(flight: Flight) -> Recording:
+    """Return what is recorded of a flight."""
+    log = flight.log
+    measured, true = (np.concatenate([x.p, x.R.reshape(-1, 9), x.v], axis=1) for x in (log.measured, log.true))
+    follows = np.concatenate([log.u[1:], log.u[-1:]])  # a log's row has the command of the tick that it ended
+    age = np.broadcast_to(log.age, log.t.shape)
+    return Recording(
+        log.t,
+        measured,
+        true,
+        age,
+        follows,
+        flight.error,
+        flight.target,
+        events=flight.events,
+        terminated=log.terminated,
+    )
 
 
 def write_learnt(flights: Sequence[Flight], preset: Preset, folder: Path) -> None:
@@ -107,8 +124,12 @@ def write_learnt(flights: Sequence[Flight], preset: Preset, folder: Path) -> Non
     low-rank one).
     """
     learnt = next((f.learnt for f in flights if f.learnt is not None and not f.log.terminated), None)
-    if learnt is None:
-        return
+    if learnt is not None:
+        write_state(learnt, preset, folder)
+
+
+def write_state(learnt: LearnerState, preset: Preset, folder: Path) -> None:
+    """Write what was learnt, to go on from, and the policy or the low-rank delta that came of it."""
     save_learnt(folder / "learnt.safetensors", learnt, preset)
     policy = learnt.policy.policy
     if isinstance(policy, LoraPolicy):

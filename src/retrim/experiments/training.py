@@ -13,6 +13,7 @@ from ..config.loading import changed
 from ..config.setup import Setup
 from ..control.policy import Policy
 from ..learn.env import Env
+from ..learn.residuals.model import FittedResidual
 from ..learn.rollout import rollout
 from ..tasks.task import Start
 from .reporter import Reporter, Silent
@@ -65,10 +66,23 @@ def nominal_error(setup: Setup, policy: Policy, *, n: int = 64, seed: int = 1) -
         n: Number of roll-outs, from starts of its training.
         seed: Seed of the starts.
     """
-    dt = setup.preset.dt
-    env = Setup.of(changed(setup.preset, pretrain={"horizon": round(6.0 / dt)})).env
+    return _mean_error(setup, _long(setup).env, policy, n, seed)
+
+
+def model_error(setup: Setup, policy: Policy, residual: FittedResidual, *, n: int = 64, seed: int = 1) -> float:
+    """Return the same in the model that a residual corrects, as the policy sees it in flight."""
+    learner = _long(setup).learner
+    return _mean_error(setup, learner.view(learner.env, residual), policy, n, seed)
+
+
+def _long(setup: Setup) -> Setup:
+    """The set-up with roll-outs of 6 s."""
+    return Setup.of(changed(setup.preset, pretrain={"horizon": round(6.0 / setup.preset.dt)}))
+
+
+def _mean_error(setup: Setup, env: Env, policy: Policy, n: int, seed: int) -> float:
     x0 = jax.vmap(env.task.reset)(random.split(random.key(seed), n))
-    return float(_settled(policy, env, x0, round(0.5 / dt)))
+    return float(_settled(policy, env, x0, round(0.5 / setup.preset.dt)))
 
 
 @eqx.filter_jit

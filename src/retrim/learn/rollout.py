@@ -74,12 +74,13 @@ def _scan(env: Env, policy: Policy, start: Start, perturbations: Perturbations |
         seen = task if frame is None else task.in_frame(frame)
         x_seen = x if frame is None else frame.state(x)
         o, memory = seen.observation(memory, t, x_seen, last)
+        before = last
         last, inputs = (policy(o), ()) if perturbation is None else policy.perturbed(o, perturbation)
         issued = last if frame is None else frame.world_command(last)
         queue = (*pending, issued)
         acting, waiting = queue[0], queue[1:]
         reward = seen.reward(t, x_seen, acting if frame is None else frame.command(acting))
-        reward = jnp.where(alive, reward, worst)
+        reward = jnp.where(alive, reward - env.cost_of_jump(before, last), worst)
         after = dynamics.step(s, acting, calm)
         survived = alive & ~task.terminated(t + task.dt, dynamics.state(after))
         # A terminated vehicle is frozen at its last good state: a diverging state turns masked rewards into NaN

@@ -6,7 +6,7 @@ from typing import Any
 from .events import LiveEvents
 from .status import Status
 
-UNITS = {"steady": "m", "recovery_5cm": "s", "flight_to_swap_s": "s"}
+UNITS = {"steady": "m", "recovery_5cm": "s", "flight_to_swap_s": "s", "simulation_lost_s": "s"}
 
 
 def live_line(status: Status) -> str:
@@ -32,6 +32,8 @@ def live_rows(status: Status, events: LiveEvents) -> list[tuple[str, str]]:
     if refused := control.get("refused"):
         rows.append(("refused messages", ", ".join(f"{what}: {n}" for what, n in refused.items())))
     rows.append(("late samples, held commands", f"{status.world.get('late', 0)}, {status.world.get('held', 0)}"))
+    if lost := status.world.get("lost"):
+        rows.append(("simulation lost", f"{lost:.2f} s: the machine is busy"))
     rows.append(("processes", ", ".join(role if alive else f"{role} (dead)" for role, alive in status.alive.items())))
     if events.all:
         rows.append(("last event", f"{events.all[-1].t:.1f} s {events.all[-1].kind}: {events.all[-1].note}"))

@@ -16,6 +16,7 @@ class LiveEvents:
         self.swaps: list[tuple[float, str, int, float]] = []
         """Time [s], half, version, and how old the flight was that it was learnt from [s]."""
         self._mode, self._watchdog, self._log_failed = "policy", False, False
+        self._watchdog_ticks = 0
         self._restarts: dict[str, int] = {}
         self._given_up: set[int] = set()
         self._refused: dict[str, int] = {}
@@ -49,8 +50,11 @@ class LiveEvents:
             self._log_failed = True
             new.append(Event(t, "guard", f"log: the flight is no longer written down, {status.log_failed}"))
         if status.watchdog_flies and not self._watchdog:
-            self._watchdog = True
             new.append(Event(t, "guard", WATCHDOG))
+        if not status.watchdog_flies and (ticks := status.watchdog_ticks - self._watchdog_ticks):
+            self._watchdog_ticks = status.watchdog_ticks
+            new.append(Event(t, "guard", f"watchdog: it flew {ticks} tick{'s' * (ticks > 1)}, control was late"))
+        self._watchdog = status.watchdog_flies
         if (mode := control.get("mode", self._mode)) != self._mode:
             self._mode = mode
             new.append(Event(t, "guard", f"{mode}: {control.get('reason', '')}"))

@@ -13,9 +13,11 @@ from ..experiments.flights import Flight
 from ..experiments.outputs import clear_outputs, write_events, write_learnt
 from ..experiments.reporter import Reporter
 from ..experiments.run import Run
+from ..io.logs.recording import Recording, can_record, write_mcap, write_npz
+from ..onboard.guard import Mode
+from ..onboard.messages import ACCOUNTS, COMMAND, MEASURED, TRUE
 from ..runtime.events import Event
 from .events import LiveEvents
-from .recording import write_recording
 from .report import complaints, flight_of, histograms, learnt_in, results
 from .session import LEARNING, LiveRequest, live_spec
 from .status import Status
@@ -35,6 +37,8 @@ class LiveFlight(NamedTuple):
     """Those of ``results.json``."""
     paths: list[Path]
     """Files that it left, those that a person looks at first."""
+    landed: bool
+    """Whether the vehicle came down by this flight's own doing: it was not lost, and did not crash."""
 
 
 def fly_live(
@@ -93,15 +97,26 @@ def _written(
     )  # fmt: skip
     write_events([flight], run.folder)
     write_learnt([flight], request.setup.preset, run.folder)
-    recorded = []
-    if request.record is not None:
-        target = np.asarray(jax.jit(jax.vmap(request.setup.flown.target))(rows[:, 1]), dtype=float)
-        write_recording(request.record, rows, target, events.all)
-        recorded = [request.record]
+    recorded = _recorded(request, rows, events)
     for start in run.folder.glob("start*.safetensors"):  # what learners went on from; it is in what they learnt
         start.unlink()
     paths = [*recorded, run.folder / "results.json", run.folder / "flight.csv", *complaints(run.folder)]
-    return LiveFlight(flight, found, paths)
+    return LiveFlight(flight, found, paths, status.ended == "landed")
+
+
+def _recorded(request: LiveRequest, rows: np.ndarray, events: LiveEvents) -> list[Path]:
+    """Write the flight, the landing too, as NPZ and MCAP; return where the latter is, if it was asked for."""
+    target = np.asarray(jax.jit(jax.vmap(request.setup.flown.target))(rows[:, 1]), dtype=float)
+    recording = Recording(
+        rows[:, 1], rows[:, MEASURED], rows[:, TRUE], rows[:, 2], rows[:, COMMAND],
+        np.linalg.norm(rows[:, TRUE][:, :3] - target, axis=1), target,
+        flown_by=[Mode(int(row[-1])).name.lower() for row in rows], policy_age=rows[:, ACCOUNTS["policy_age"]],
+        events=events.all,
+    )  # fmt: skip
+    write_npz(request.folder / "flight.npz", recording)
+    if can_record():
+        write_mcap(request.record or request.folder / "flight.mcap", recording)
+    return [] if request.record is None else [request.record]
 
 
 def _warmed_up(supervisor: Supervisor, run: Run, reporter: Reporter) -> bool:

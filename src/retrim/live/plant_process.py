@@ -93,7 +93,7 @@ def _flown(
         bus.publish("sample", sample.pack())
         if not np.isfinite(sample.truth).all() or sample.truth[2] < FLOOR:
             return "crashed"
-        setpoint = _answer(bus, tick, epoch + (tick + SHARE) * plan.dt)
+        setpoint = answer(bus, tick, epoch + (tick + SHARE) * plan.dt)
         unanswered = 0 if setpoint is not None else unanswered + 1
         if setpoint is None:
             held += 1  # a vehicle goes on with the last one, too
@@ -118,7 +118,7 @@ def _flown(
             bus.publish("world", pack_note("world", late=late, held=held, knobs_refused=plant.refused))
 
 
-def _answer(bus: Bus, tick: int, until: float) -> Setpoint | None:
+def answer(bus: Bus, tick: int, until: float) -> Setpoint | None:
     """Return the answer to a sample, or the fallback's, if there is one in time."""
     while True:
         for topic in ("setpoint", "fallback"):

@@ -45,7 +45,8 @@ def flight_of(
     dt = request.setup.preset.dt
     shown = rows[rows[:, 1] < request.seconds - 0.5 * dt]
     if status.control.get("reason") == "landing":  # as ordered: what follows is not the policy's
-        shown = shown[np.cumsum(shown[:, -1] != Mode.POLICY) == 0]
+        by_policy = np.flatnonzero(shown[:, -1] == Mode.POLICY)
+        shown = shown[: by_policy[-1] + 1] if len(by_policy) else shown[:0]
     if len(shown) < 2:
         raise PlantError(f"{request.folder / 'flight.csv'} holds {len(shown)} ticks: there was no flight")
     u = np.concatenate([HOVER[None], shown[:-1, COMMAND]])
@@ -93,6 +94,7 @@ def results(
         "flight_to_swap_s": float(np.median([swap[3] for swap in policies])) if policies else None,
         "samples_late": status.world.get("late"),
         "commands_held": status.world.get("held"),
+        "simulation_lost_s": status.world.get("lost"),
         "restarts": sum(status.restarts.values()),
         "refused_messages": sum(status.control.get("refused", {}).values()),
         "taken_back": len(given_up),

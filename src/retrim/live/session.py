@@ -23,12 +23,13 @@ from ..experiments.flights import FlightSpec
 from ..io.trained import save_learnt
 from ..onboard.guard import Limits
 from ..onboard.messages import MOST_TICKS
+from ..physics.state import State
 from ..plants.plant import as_numpy
 from ..runtime.pilot import ControllerPilot
 from ..transport.remote import Address
 from .controllers import adaptive_source, plain_source
 from .page import free_port
-from .spec import LiveSpec, PageSpec
+from .spec import MAINS, VEHICLE, LiveSpec, PageSpec
 from .states import vector_of
 
 LAYERS: tuple[Layer, ...] = ("residual", "policy")
@@ -98,6 +99,7 @@ def live_spec(request: LiveRequest) -> LiveSpec:
     """
     setup, preset = request.setup, request.setup.preset
     window = max(preset.adapt.window, round(3.0 / preset.dt))
+    vehicle = request.scenario.entry.is_vehicle  # which starts at rest where its reference does
     if request.learners is not None:
         _check_remote(request)
     if window > MOST_TICKS:
@@ -126,7 +128,9 @@ def live_spec(request: LiveRequest) -> LiveSpec:
         reference=request.scenario.reference,
         scenario=request.scenario,
         vehicle=preset.vehicle,
-        x0=vector_of(setup.flight_starts(1, request.seed)[0]),
+        x0=vector_of(
+            State.at(setup.flown.target(jnp.array(0.0))) if vehicle else setup.flight_starts(1, request.seed)[0]
+        ),
         home=np.asarray(setup.flown.home(), dtype=float),
         limits=_limits(request),
         dt=preset.dt,
@@ -137,6 +141,7 @@ def live_spec(request: LiveRequest) -> LiveSpec:
         folder=request.folder,
         page=_page(request) if request.page is not None else None,
         learners=request.learners if request.method in LEARNING else None,
+        mains=MAINS | {"plant": VEHICLE} if vehicle else MAINS,
     )
 
 

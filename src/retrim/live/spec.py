@@ -24,6 +24,8 @@ MAINS = {
     "bridge": "retrim.live.bridge_process:carry",
 }
 """Main function of each process, by role."""
+VEHICLE = "retrim.live.vehicle_process:fly"
+"""Main function of the plant's process where the plant is a vehicle."""
 
 
 @dataclass(frozen=True)

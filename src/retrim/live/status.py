@@ -19,6 +19,8 @@ class Status:
     rejections: list[str]
     """What learners said since the last look of results that must not be used."""
     watchdog_flies: bool
-    """The watchdog has commanded."""
+    """The newest command is the watchdog's."""
+    watchdog_ticks: int
+    """How often the watchdog has commanded."""
     log_failed: str | None
     """Why the flight is no longer written down; None while it is."""

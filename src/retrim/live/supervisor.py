@@ -12,7 +12,7 @@ from typing import Any
 
 from ..errors import MessageError, PlantError
 from ..onboard.launch import last_words, launch
-from ..onboard.messages import last_note, pack_note
+from ..onboard.messages import Setpoint, last_note, pack_note
 from ..onboard.realtime import cores_of
 from ..transport.message import describe
 from ..transport.shared_memory import SharedMemoryBus
@@ -42,6 +42,7 @@ class Supervisor:
     """What the operating system refused to which process."""
     epoch: float | None = None
     _landing: bool = False
+    _airborne_ordered: bool = False
     _said: dict[str, int] = field(default_factory=dict)
     _remote: RemoteLearners | None = None
 
@@ -56,7 +57,8 @@ class Supervisor:
 
     def __exit__(self, *_: object) -> None:
         """Land what still flies, end what still runs, and take the bus away."""
-        if self.epoch is not None and self._alive("plant") and not last_note(self.bus, "ended"):
+        aloft = self.epoch is not None or self._airborne_ordered
+        if aloft and self._alive("plant") and not last_note(self.bus, "ended"):
             self.land()
             until = time.monotonic() + LANDING
             while self._alive("plant") and not last_note(self.bus, "ended") and time.monotonic() < until:
@@ -102,6 +104,8 @@ class Supervisor:
             raise PlantError(f"the flight cannot be written down: {failed}")
         for role in ("control", "plant", "watchdog"):
             self.refused[role] = last_note(self.bus, f"ready.{role}", "ready").get("refused", [])
+        if last_note(self.bus, "ready.plant", "ready").get("stands"):
+            yield from self._lift_off()
 
     def take_off(self) -> None:
         """Give the order; the first tick is half a second away, the same for all.
@@ -112,6 +116,15 @@ class Supervisor:
         self._check_alive()
         self.epoch = time.monotonic() + 0.5
         self.bus.publish("order", pack_note("order", epoch=self.epoch))
+
+    def _lift_off(self) -> Iterator[tuple[str, float]]:
+        """Let a vehicle take off by its autopilot, now that all are ready to fly it."""
+        began, self._airborne_ordered = time.monotonic(), True
+        self.bus.publish("order", pack_note("order", order="take off"))
+        while self.bus.latest("airborne") is None:
+            self._check_alive()
+            yield "the vehicle, which takes off", time.monotonic() - began
+            time.sleep(0.1)
 
     def land(self) -> None:
         """Give the order to land, once."""
@@ -163,8 +176,11 @@ class Supervisor:
             alive |= self._remote.alive()
         control, world = last_note(self.bus, "status"), last_note(self.bus, "world")
         failed = last_note(self.bus, "ready.recorder", "ready").get("failed")
-        t, watchdog = time.monotonic() - self.epoch, self.bus.latest("fallback") is not None
-        return Status(t, control, world, alive, dict(self.restarts), ended, self._rejections(), watchdog, failed)
+        t, fallback = time.monotonic() - self.epoch, self.bus.latest("fallback")
+        by_watchdog = self._sent("fallback") > self._sent("setpoint")
+        ticks = 0 if fallback is None else fallback.version
+        said = self._rejections()
+        return Status(t, control, world, alive, dict(self.restarts), ended, said, by_watchdog, ticks, failed)
 
     def finish(self, patience: float = 3.0) -> None:
         """Wait until the log is written."""
@@ -186,10 +202,19 @@ class Supervisor:
     def _check_alive(self) -> None:
         if self._remote is not None and (failed := self._remote.failed()) is not None:
             raise PlantError(failed)
+        if why := last_note(self.bus, "ended").get("reason"):
+            raise PlantError(f"the flight ended before it began: {why}")
         for role in self.processes:
             if not self._alive(role):
-                why = last_note(self.bus, "ended").get("reason") or last_words(self._complaints(role))
-                raise PlantError(f"the {role} process ended before take-off: {why}")
+                raise PlantError(f"the {role} process ended before take-off: {last_words(self._complaints(role))}")
+
+    def _sent(self, topic: str) -> float:
+        """Return when the newest command of a topic was sent, monotonic clock [s]."""
+        message = self.bus.latest(topic)
+        try:
+            return float("-inf") if message is None else Setpoint.unpack(message.data).sent
+        except MessageError:
+            return float("-inf")
 
     def _rejections(self) -> list[str]:
         found = []

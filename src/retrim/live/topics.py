@@ -4,7 +4,8 @@ from ..onboard.messages import COLUMNS
 from ..onboard.topics import LAYERS, SLOTS, slot
 from .spec import LiveSpec
 
-SMALL = ("sample", "setpoint", "fallback", "order", "ended", "world", "knobs", "wish", "learning", "ground")
+SMALL = ("sample", "setpoint", "fallback", "order", "ended", "world", "knobs", "wish", "learning", "ground",
+         "airborne")  # fmt: skip
 ROLES = ("control", "plant", "watchdog", "recorder", "page", "bridge", *LAYERS)
 
 

@@ -1,4 +1,8 @@
-"""The process that writes the flight down as it goes. What it has written is readable whatever happens to it."""
+"""The process that writes the flight down as it goes. What it has written is readable whatever happens to it.
+
+Two processes report ticks: the one that flies, and the watchdog when it takes over. What one of them says late is
+written late; :func:`read_log` puts it in order.
+"""
 
 import time
 from dataclasses import dataclass
@@ -35,9 +39,9 @@ class Recorder:
         self._path, self._bus = path, bus
         self._versions = {"flight": 0, "fallback.flight": 0}
         self.failed: str | None = None
-        self._last = -1
+        self._written: set[int] = set()
         try:
-            self._last = _mended(path)
+            self._written = _mended(path)
         except OSError as error:
             self.failed = str(error)
 
@@ -54,7 +58,7 @@ class Recorder:
             rows = FlightRows.unpack(message.data).rows
         except MessageError:
             return 0
-        return self._append(rows[rows[:, 0] > self._last])
+        return self._append(rows[[int(tick) not in self._written for tick in rows[:, 0]]])
 
     def _append(self, new: np.ndarray) -> int:
         try:
@@ -64,32 +68,33 @@ class Recorder:
             self.failed = str(error)
             self._bus.publish("ready.recorder", pack_note("ready", failed=self.failed))
             return 0
-        if len(new):
-            self._last = int(new[-1, 0])
+        self._written.update(int(tick) for tick in new[:, 0])
         return len(new)
 
 
 def read_log(path: Path) -> np.ndarray:
-    """Return the ticks of a log, in the columns of :data:`retrim.onboard.messages.COLUMNS`; a torn last line is left.
+    """Return the ticks of a log in their order, in the columns of :data:`retrim.onboard.messages.COLUMNS`.
+
+    A torn last line is left out.
 
     Raises:
         OSError: There is no such file.
     """
     lines = path.read_text().splitlines(keepends=True)[1:]
     whole = [line.split(",") for line in lines if line.endswith("\n") and line.count(",") == len(COLUMNS) - 1]
-    return np.array(whole, dtype=float).reshape(-1, len(COLUMNS))
+    rows = np.array(whole, dtype=float).reshape(-1, len(COLUMNS))
+    return rows[np.argsort(rows[:, 0], kind="stable")]
 
 
-def _mended(path: Path) -> int:
-    """Write the header, or take away a torn last line; return the last tick that is written."""
+def _mended(path: Path) -> set[int]:
+    """Write the header, or take away a torn last line; return the ticks that are written."""
     if not path.exists() or path.stat().st_size == 0:
         path.write_text(",".join(COLUMNS) + "\n")
-        return -1
+        return set()
     with path.open("r+b") as file:
         data = file.read()
         file.truncate(data.rfind(b"\n") + 1)
-    rows = read_log(path)
-    return int(rows[-1, 0]) if len(rows) else -1
+    return {int(tick) for tick in read_log(path)[:, 0]}
 
 
 def record(plan: RecorderPlan) -> None:

@@ -1,6 +1,6 @@
 """First-order actuator lag for any model. Without it, a steep reward yields gains that slow motors cannot follow."""
 
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import equinox as eqx
 import jax
@@ -23,22 +23,24 @@ class LagState(eqx.Module, Generic[X]):
     acting: Command
 
 
-def lagged(acting: U, u: U, dt: float, tau: Float[Array, ""]) -> tuple[U, U]:
+def lagged(acting: U, u: U, dt: float, tau: Float[Array, ""] | Command) -> tuple[U, U]:
     """Return what a first-order lag makes of a command over a tick.
 
     Args:
         acting: Command at the actuators at the beginning of the tick; or arrays of commands.
         u: Command that reaches them, of the same kind.
         dt: Length of the tick [s].
-        tau: Time constant [s].
+        tau: Time constant [s], of all parts alike, or of each part of a command.
 
     Returns:
         The mean over the tick, and what acts at its end.
     """
-    decay = jnp.exp(-dt / tau)
-    left = tau / dt * (1.0 - decay)  # share of the old command in the mean over the tick
+    taus: Any = tau if isinstance(tau, Command) else jax.tree.map(lambda _: tau, u)
+    decay = jax.tree.map(lambda each: jnp.exp(-dt / each), taus)
+    # Share of the old command in the mean over the tick.
+    left = jax.tree.map(lambda each, kept: each / dt * (1.0 - kept), taus, decay)
     mean, end = (
-        jax.tree.map(lambda old, new, share=share: new + share * (old - new), acting, u) for share in (left, decay)
+        jax.tree.map(lambda old, new, share: new + share * (old - new), acting, u, shares) for shares in (left, decay)
     )
     return mean, end
 
@@ -73,8 +75,8 @@ class Lagged(AbstractDynamics[LagState[X]]):
     """Each command reaches the model through a first-order lag."""
 
     base: AbstractDynamics[X]
-    tau: Float[Array, ""]
-    """Time constant [s]."""
+    tau: Float[Array, ""] | Command
+    """Time constant [s], of thrust and rates alike, or of each."""
 
     @property
     def dt(self) -> float:
@@ -83,8 +85,12 @@ class Lagged(AbstractDynamics[LagState[X]]):
 
     @property
     def settling_ticks(self) -> Float[Array, ""]:
-        """Three time constants, on top of the base model's settling time [ticks]."""
-        return jnp.ceil(3.0 * self.tau / self.dt - 0.01) + self.base.settling_ticks  # whole ticks are, to rounding
+        """Three time constants, on top of the base model's settling time [ticks].
+
+        They are those of what moves the vehicle: a turn about the thrust axis does not, and yaw may take a second.
+        """
+        tau = jnp.maximum(self.tau.c, jnp.max(self.tau.omega[:2])) if isinstance(self.tau, Command) else self.tau
+        return jnp.ceil(3.0 * tau / self.dt - 0.01) + self.base.settling_ticks  # whole ticks are, to rounding
 
     def init(self, x: State) -> LagState[X]:
         """Lift to the base model's state, with the actuators at hover."""

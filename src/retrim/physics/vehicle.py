@@ -72,6 +72,9 @@ class Vehicle(eqx.Module):
     """c A of the body along its axes [m^2]."""
     propeller: Propeller
     esc: Esc
+    rate_lag: Float[Array, "3"] | None = None
+    """Time constants of the body rates behind their commands, if they are known [s]. Models of training have them; a
+    plant's follow from motors and rate loop."""
 
     def __check_init__(self) -> None:
         """Raise ``ValueError``, naming the field, where no such vehicle can exist; traced values are not checked."""
@@ -79,7 +82,7 @@ class Vehicle(eqx.Module):
             return
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            if isinstance(value, eqx.Module):
+            if value is None or isinstance(value, eqx.Module):
                 continue
             numbers = value.tolist() if value.ndim else [value.item()]  # no program is compiled for a check
             if not all(math.isfinite(number) and number > 0 for number in numbers):

@@ -18,9 +18,9 @@ from jaxtyping import Array, Float, Int
 from ..physics import so3
 from ..physics.bem import BemQuadrotor, BemState
 from ..physics.effects import ExternalEffects
+from ..physics.motors import CommandedSpeeds
 from ..physics.state import Command, State
 from ..physics.substep import SUBSTEP, AbstractSubstepDynamics, RotorState
-from ..physics.vehicle import Vehicle
 from .extras import import_extra
 
 PERIOD = 10  # [ms]
@@ -97,18 +97,6 @@ class RaptorState(eqx.Module):
     """Milliseconds flown."""
 
 
-class _Motors(eqx.Module):
-    """What stands in the place of a rate controller: it commands speeds, whatever the command says."""
-
-    speeds: Float[Array, "4"]
-    thrust_map: Float[Array, ""]
-
-    def __call__(
-        self, vehicle: Vehicle, s: RotorState, u: Command
-    ) -> tuple[Float[Array, "4"], Float[Array, "3"], Float[Array, "3"]]:
-        return self.speeds, s.integral, s.wanted_slow
-
-
 class RaptorQuadrotor(AbstractSubstepDynamics[RaptorState]):
     """A blade-element vehicle with RAPTOR on board; commands from outside are not listened to."""
 
@@ -145,7 +133,7 @@ class RaptorQuadrotor(AbstractSubstepDynamics[RaptorState]):
         vehicle = self.base.vehicle
         throttle = 0.5 * (jnp.clip(action, -1.0, 1.0) + 1.0)[jnp.array(ORDER)]
         speeds = vehicle.motor_min + throttle * (vehicle.motor_max - vehicle.motor_min)
-        flown = BemQuadrotor(vehicle, _Motors(speeds, self.base.loop.thrust_map), self.base.dt)
+        flown = BemQuadrotor(vehicle, CommandedSpeeds(speeds, self.base.loop.thrust_map), self.base.dt)
         return RaptorState(flown.substep(s.body, u, effects), hidden, action, s.ms + 1)
 
     def _decided(self, s: RaptorState) -> tuple[Float[Array, "4"], Float[Array, " hidden"]]:

@@ -43,8 +43,8 @@ class OccludedKeypoints(AbstractObservation[OccludedMemory]):
     """The observation of training; ``noise`` is that of the camera."""
     dropout: Float[Array, ""]
     """Probability that a visible point is missed in a frame."""
-    lag: Float[Array, ""] | None = None
-    """Time constant of the actuators that the filter knows of [s]."""
+    lag: Command | None = None
+    """Time constants of the actuators that the filter knows of [s]."""
     frame: FeltFrame | None = None
     """The picture is what a camera would show in this frame; the filter and ``full`` stay in the world."""
     delay_ticks: int = eqx.field(static=True, default=0)

@@ -6,6 +6,8 @@ from .ensemble import EnsembleState as EnsembleState
 from .ensemble import fit_ensemble as fit_ensemble
 from .layered import LayeredModel as LayeredModel
 from .layered import LayeredState as LayeredState
+from .linear import LinearModel as LinearModel
+from .linear import LinearState as LinearState
 from .model import FittedResidual as FittedResidual
 from .model import ResidualModel as ResidualModel
 from .rates import RateFit as RateFit

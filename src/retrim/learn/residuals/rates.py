@@ -16,7 +16,7 @@ from ...physics.actuators import lagged
 from ...physics.state import Command, where
 from .targets import Targets
 
-GRID, SHORTEST, LONGEST = 24, 0.002, 0.2  # time constants that are compared: how many, and from where to where [s]
+GRID, SHORTEST, LONGEST = 32, 0.002, 1.0  # time constants that are compared: how many, and from where to where [s]
 UNSETTLED = 0.16  # [s] at the beginning of a window that only let the lag settle
 
 
@@ -27,8 +27,9 @@ class RateFit(eqx.Module):
     """The vehicle turns so much faster than it is told, body frame [rad/s]."""
     deviation: Float[Array, "3"]
     """Standard deviation of the bias [rad/s]."""
-    tau: Float[Array, ""]
-    """Time constant of the lag between commanded and flown rates [s]."""
+    tau: Float[Array, "3"]
+    """Time constants of the lag between commanded and flown rates [s]. Roll and pitch, which the same differences of
+    thrust turn, have one; yaw, which the rotors' drag turns, may be far slower."""
 
 
 class RateModel(eqx.Module):
@@ -36,10 +37,10 @@ class RateModel(eqx.Module):
 
     bias_prior: Float[Array, ""]
     """Standard deviation of a bias before any flight [rad/s]."""
-    tau_prior: Float[Array, ""]
-    """Median of the time constant before any flight [s]."""
+    tau_prior: Float[Array, "3"]
+    """Medians of the time constants before any flight [s]."""
     tau_spread: Float[Array, ""]
-    """Standard deviation of its logarithm."""
+    """Standard deviation of their logarithms."""
     noise: Float[Array, ""]
     """Smallest standard deviation of the mean rate of a tick [rad/s]; a noisier flight shows its own."""
     memory: Float[Array, ""]
@@ -48,16 +49,16 @@ class RateModel(eqx.Module):
     """Control tick [s]."""
 
     @classmethod
-    def of(cls, dt: float, *, memory: float, tau: float = 0.03) -> "RateModel":
+    def of(cls, dt: float, *, memory: float, tau: tuple[float, float, float] = (0.03,) * 3) -> "RateModel":
         """Return the model with priors that fit the rate loops of small quadrotors.
 
         Args:
             dt: Control tick [s].
             memory: Time constant of forgetting [s].
-            tau: Time constant of the lag that is most likely [s].
+            tau: Time constants of the lag that are most likely, of roll, pitch and yaw [s].
         """
         one = jnp.ones(())  # a fit has its type, so that nothing is compiled again after the first
-        return cls(0.3 * one, tau * one, 0.7 * one, 0.05 * one, memory * one, dt)
+        return cls(0.3 * one, jnp.array(tau), 0.7 * one, 0.05 * one, memory * one, dt)
 
     def init(self) -> RateFit:
         """Return the prior."""
@@ -73,15 +74,15 @@ class RateModel(eqx.Module):
         missed = rows.omega[None] - jax.vmap(lambda tau: self._followed(rows, tau))(taus)
         total = jnp.sum(weight)
         mean = jnp.einsum("n,gni->gi", weight, missed) / jnp.maximum(total, 1e-6)
-        left = jnp.einsum("n,gni->g", weight, (missed - mean[:, None]) ** 2)
-        variance = jnp.maximum(self.noise**2, jnp.min(left) / (3.0 * jnp.maximum(total, 1.0)))
+        left = jnp.einsum("n,gni->gi", weight, (missed - mean[:, None]) ** 2)
+        variance = jnp.maximum(self.noise**2, jnp.min(_shared(left), axis=0) / jnp.maximum(total, 1.0))
         shrunk = self.bias_prior**2 / (self.bias_prior**2 + variance / jnp.maximum(total, 1e-6))
-        misfit = left / variance + total * (1.0 - shrunk) * jnp.sum(mean**2, axis=1) / variance
-        misfit = misfit + (jnp.log(taus / self.tau_prior) / self.tau_spread) ** 2
-        share = jax.nn.softmax(-0.5 * misfit)
-        tau = jnp.exp(jnp.sum(share * jnp.log(taus)))
+        misfit = (left + total * (1.0 - shrunk)[None] * mean**2) / variance[None]
+        misfit = _shared(misfit, 2.0) + (jnp.log(taus[:, None] / self.tau_prior[None]) / self.tau_spread) ** 2
+        share = jax.nn.softmax(-0.5 * misfit, axis=0)
+        tau = jnp.exp(jnp.sum(share * jnp.log(taus)[:, None], axis=0))
         deviation = jnp.sqrt((1.0 - shrunk) * self.bias_prior**2)
-        fitted = RateFit(shrunk * share @ mean, jnp.broadcast_to(deviation, (3,)), tau)
+        fitted = RateFit(shrunk * jnp.sum(share * mean, axis=0), deviation, tau)
         return where(total > 0.0, fitted, self.init())
 
     def _followed(self, rows: Targets, tau: Float[Array, ""]) -> Float[Array, "n 3"]:
@@ -93,3 +94,9 @@ class RateModel(eqx.Module):
 
         first = jax.tree.map(lambda leaf: leaf[0], rows.u)
         return lax.scan(tick, Command(first.c, rows.omega[0]), rows.u)[1]
+
+
+def _shared(each: Float[Array, "g 3"], times: float = 1.0) -> Float[Array, "g 3"]:
+    """Return ``times`` their mean for roll and pitch, which have one lag, and what it is for yaw."""
+    both = 0.5 * times * (each[:, 0] + each[:, 1])
+    return jnp.stack([both, both, each[:, 2]], axis=1)

@@ -71,7 +71,7 @@ class RegressionModel(eqx.Module):
         memory: float = 0.5,
         noise: float = 0.5,
         thrust_prior: float = 0.05,
-        tau: float = 0.03,
+        tau: tuple[float, float, float] = (0.03,) * 3,
         limits: tuple[Command, Command] | None = None,
     ) -> "RegressionModel":
         """Return the model with priors that fit small and medium quadrotors.
@@ -81,7 +81,7 @@ class RegressionModel(eqx.Module):
             memory: Time constant of forgetting [s].
             noise: Standard deviation of one row of targets [m/s^2]: of the sensors, and of what no feature explains.
             thrust_prior: Standard deviation of the thrust gain [-].
-            tau: Most likely time constant of the body rates [s].
+            tau: Most likely time constants of the body rates [s].
             limits: Smallest and largest command; None: commands have no limit.
         """
         prior = jnp.array([5.0, 5.0, 5.0, thrust_prior, 0.3, 0.3, 0.3, 0.03, 0.03, 0.03])

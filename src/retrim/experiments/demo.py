@@ -1,0 +1,85 @@
+"""The whole loop in a minute: pretrain, push, adapt; a table and pictures."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+from ..config.loading import load_for
+from ..config.scenario import Scenario
+from ..config.setup import Setup
+from .figures import picture
+from .interrupts import interrupts_only_set
+from .limits import check_flights, check_seeds
+from .metrics import rows
+from .outputs import write_events, write_trained
+from .reporter import Reporter
+from .run import Run
+from .tables.document import TableSection
+from .tables.hover import PAPER
+from .tables.levels import LEVELS, level_table
+from .tables.study import Study, fly_all
+from .training import nominal_error, train
+
+SHOWN = ("base", "full")
+WHY = {
+    "hover/retrim": "felt gravity turns the frame in milliseconds, a closed-form residual and short bursts do the rest",
+    "hover/fast": "the paper's loop with a command delay in the model, trained in seconds",
+    "hover/released": "the delay, observation and training size of the authors' code",
+    "hover/paper": "as printed: no delay in the model, no past commands in the observation",
+}
+
+
+class Shown(NamedTuple):
+    """What a demonstration leaves to be looked at."""
+
+    table: TableSection
+    pictures: list[Path]
+    best: Path
+    """The picture to look at first."""
+
+
+def demonstrate(
+    name: str, plant: str, run: Run, reporter: Reporter, *, seconds: float, starts: int, seed: int
+) -> Shown | None:
+    """Pretrain a hover policy, push it with disturbances that it never saw, and re-train it while it flies.
+
+    Args:
+        name: Preset of a hover policy.
+        plant: What flies.
+        run: Where to.
+        reporter: Receives lines and progress.
+        seconds: Length of a flight.
+        starts: Flights per disturbance and method.
+        seed: Seed of everything.
+
+    Returns:
+        What is to be looked at; None if pretraining was interrupted.
+
+    Raises:
+        ConfigError: A name does not exist, or the sizes cannot be flown.
+    """
+    check_seeds([seed])
+    check_flights(starts, seconds)
+    preset = load_for("hover", name)
+    scenario, setup = Scenario("large", plant=plant), Setup.of(preset)
+    reporter.say(f"{len(LEVELS) * 2 * starts} flights of {seconds:g} s; about a minute on two cores")
+    reporter.say(f"preset {preset.name}: {WHY.get(preset.name, 'your choice')}")
+    reporter.say(f"{scenario.vehicle_name(preset.vehicle)} quadrotor on plant {plant}: {scenario.entry.about}")
+    policy, losses = train(setup, seed, reporter=reporter, stop=run.stop)
+    if losses:
+        write_trained(run, setup, policy, losses, seed=seed)
+    if run.interrupted:
+        reporter.say(f"interrupted while pretraining, after {len(losses)} steps")
+        return None
+    study = Study(preset, {seed: policy}, (nominal_error(setup, policy),))
+    reporter.say(f"hover error in its own model: {1000 * study.errors[0]:.1f} mm")
+    scenarios = [replace(scenario, disturbance=level) for level in LEVELS]
+    flights = fly_all(study, scenarios, run, reporter, starts=starts, seconds=seconds).flown
+    found = rows(flights)
+    with interrupts_only_set(run.stop):
+        run.write_results(found, seeds=[seed], preset=preset.name, losses=losses)
+        write_events(flights, run.folder)
+    title = f"hover error [m]: mean ± std over {starts} starts, last 2 s of {seconds:g} s; in brackets the paper's"
+    table = level_table(found, SHOWN, {method: PAPER[method] for method in SHOWN}, title)
+    drawn = [path for each in scenarios for path in picture(flights, setup, each, run.folder)]
+    return Shown(table, [path for path in drawn if path.suffix == ".png"], run.folder / "hover_large.png")
