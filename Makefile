@@ -7,7 +7,7 @@ STAMP := $(VENV)/.installed
 
 DEV := $(VENV)/.installed-dev
 
-.PHONY: setup dev demo test check docs wheel mutants drill test-page test-ros test-px4 betaflight test-betaflight bench tables pins clean
+.PHONY: setup dev demo test check docs wheel mutants drill test-page test-ros test-px4 test-crazyflie betaflight test-betaflight bench tables pins clean
 
 setup: $(STAMP)
 
@@ -57,6 +57,12 @@ test-page: dev
 test-px4: dev
 	unshare --net $$(test "$$(id -u)" = 0 || echo --map-root-user) \
 		sh -c 'ip link set lo up && exec $(BIN)/pytest -n 0 -s -m px4'
+
+# The peer that stands in for a Crazyflie, flown by Bitcraze's own client library, in an environment of its own.
+test-crazyflie: dev
+	$(UV) venv --quiet --clear --python $(PYTHON) build/cflib
+	$(UV) pip install --quiet --python build/cflib 'cflib>=0.1.34'
+	RETRIM_CFLIB=build/cflib/bin/python $(BIN)/pytest -n 0 -m slow tests/live/test_crazyflie_client.py
 
 # Betaflight's firmware as the rate controller of the simulated vehicle; it is compiled here, in half a minute.
 betaflight: dev

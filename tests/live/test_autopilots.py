@@ -1,4 +1,4 @@
-"""Whole live flights through an autopilot: a peer that speaks MAVLink, and PX4's own simulation where there is one.
+"""Whole live flights through an autopilot: peers that speak MAVLink and CRTP, and PX4's simulation where it is.
 
 PX4 listens on every address of the machine: run its tests in a network namespace (`make test-px4` makes one).
 """
@@ -17,6 +17,8 @@ import pytest
 
 from retrim.onboard.guard import Mode
 from retrim.onboard.recorder import read_log
+from retrim.plants.bridges import crtp
+from retrim.plants.bridges.crazyflie_link import CrazyflieLink
 from retrim.plants.bridges.endpoint import UdpEndpoint
 from retrim.plants.bridges.mavlink_link import MavlinkLink
 from retrim.testing.px4 import PAYLOAD
@@ -55,8 +57,8 @@ def started(*words):
         process.stdout.close()
 
 
-def live(policy, address, out, *words, seconds=20):
-    command = [*RETRIM, "live", "--policy", str(policy), "--plant", f"mavlink:{address}", "--seconds", str(seconds)]
+def live(policy, plant, out, *words, seconds=20):
+    command = [*RETRIM, "live", "--policy", str(policy), "--plant", plant, "--seconds", str(seconds)]
     return subprocess.Popen([*command, "--out", str(out), *words], stdout=subprocess.PIPE, text=True)
 
 
@@ -81,16 +83,20 @@ def error(rows, since=0.0, until=1e9, target=HOME):
     return np.linalg.norm(flown[:, TRUE] - target, axis=1)
 
 
-# ---- a peer
+# ---- peers
+
+PEERS = {"mavlink": f"mavlink:udp:127.0.0.1:{PORT}", "crazyflie": f"crazyflie:udp:127.0.0.1:{PORT}"}
+each_peer = pytest.mark.parametrize("speaks", PEERS)
 
 
-def peer(*words):
-    return started("retrim.testing.mavlink_peer", "--port", str(PORT), *words)
+def peer(speaks, *words):
+    return started(f"retrim.testing.{speaks}_peer", "--port", str(PORT), *words)
 
 
-def test_a_flight_adapts_under_a_large_disturbance(small, tmp_path):
-    with peer("--disturbance", "large"):
-        said = said_by(live(small, f"udp:127.0.0.1:{PORT}", tmp_path))
+@each_peer
+def test_a_flight_adapts_under_a_large_disturbance(speaks, small, tmp_path):
+    with peer(speaks, "--disturbance", "large"):
+        said = said_by(live(small, PEERS[speaks], tmp_path))
     figures, rows = found(tmp_path)
     assert "flight over: landed" in said
     assert figures["policies"] > 10
@@ -99,10 +105,11 @@ def test_a_flight_adapts_under_a_large_disturbance(small, tmp_path):
     assert error(rows, since=15.0).mean() < 0.05
 
 
-def test_a_link_that_is_cut_for_a_second_ends_in_a_landing(small, tmp_path):
+@each_peer
+def test_a_link_that_is_cut_for_a_second_ends_in_a_landing(speaks, small, tmp_path):
     """The guard sinks blindly, holds when it sees again, and lands; the log goes on."""
-    with peer("--cut", "5", "1"):
-        said = said_by(live(small, f"udp:127.0.0.1:{PORT}", tmp_path))
+    with peer(speaks, "--cut", "5", "1"):
+        said = said_by(live(small, PEERS[speaks], tmp_path))
     _, rows = found(tmp_path)
     modes = rows[:, -1]
     assert "blind: " in said
@@ -112,25 +119,30 @@ def test_a_link_that_is_cut_for_a_second_ends_in_a_landing(small, tmp_path):
     assert np.abs(rows[:, 18:20]).max() < 1.0
 
 
-def test_a_link_that_is_cut_for_five_seconds_is_lost_and_the_log_is_kept(small, tmp_path):
-    """The vehicle is its autopilot's, which holds its place; nobody takes it back."""
-    with peer("--cut", "5", "5"):
-        said = said_by(live(small, f"udp:127.0.0.1:{PORT}", tmp_path), fails=True)
+@each_peer
+def test_a_link_that_is_cut_for_five_seconds_is_lost_and_the_log_is_kept(speaks, small, tmp_path):
+    """The vehicle is its autopilot's, which holds its place, or lets it fall; nobody takes it back."""
+    with peer(speaks, "--cut", "5", "5"):
+        said = said_by(live(small, PEERS[speaks], tmp_path), fails=True)
     figures, rows = found(tmp_path)
     assert "plant lost: the link has been silent for 2 s" in said
     assert 5.0 < rows[-1, 1] < 8.0
     assert "missed_ticks" in figures
 
 
+def killed_in_flight(speaks, policy, out):
+    """Fly, kill the process of the link after two seconds, and return when all of retrim has ended."""
+    flight = live(policy, PEERS[speaks], out)
+    while not (out / "flight.csv").exists() or len((out / "flight.csv").read_text().splitlines()) < 100:
+        assert flight.poll() is None
+        time.sleep(0.1)
+    os.kill(bridge_of(flight.pid), signal.SIGKILL)
+    assert "the plant process is gone" in said_by(flight, fails=True)
+
+
 def test_a_bridge_that_is_killed_leaves_the_vehicle_to_its_autopilot(small, tmp_path):
-    with peer() as autopilot:
-        flight = live(small, f"udp:127.0.0.1:{PORT}", tmp_path)
-        while not (tmp_path / "flight.csv").exists() or len((tmp_path / "flight.csv").read_text().splitlines()) < 100:
-            assert flight.poll() is None
-            time.sleep(0.1)
-        os.kill(bridge_of(flight.pid), signal.SIGKILL)
-        said = said_by(flight, fails=True)
-        assert "the plant process is gone" in said
+    with peer("mavlink") as autopilot:
+        killed_in_flight("mavlink", small, tmp_path)
         assert autopilot.poll() is None
         listener = MavlinkLink(UdpEndpoint("127.0.0.1", PORT))
         try:
@@ -140,6 +152,20 @@ def test_a_bridge_that_is_killed_leaves_the_vehicle_to_its_autopilot(small, tmp_
             assert listener.mode == (4, 3)
             assert listener.armed
             assert abs(listener.reading.p[2] - 1.0) < 0.5
+        finally:
+            listener.close()
+
+
+def test_a_crazyflie_whose_bridge_is_killed_falls(small, tmp_path):
+    """There is nothing on board that would hold it: after two seconds without a setpoint its motors stop."""
+    with peer("crazyflie"):
+        killed_in_flight("crazyflie", small, tmp_path)
+        listener = CrazyflieLink(UdpEndpoint("127.0.0.1", 0), ("127.0.0.1", PORT))
+        try:
+            listener.start_logs(5.0, lambda: True)
+            listener.pump(time.monotonic() + 3.5)
+            assert not listener.status.info & crtp.FLYING
+            assert abs(listener.reading.p[2]) < 0.1
         finally:
             listener.close()
 
@@ -155,7 +181,7 @@ def bridge_of(supervisor):
 # ---- PX4
 
 PX4_ONLY = pytest.mark.skipif(not PX4, reason="RETRIM_PX4 names no unpacked PX4")
-ADDRESS = "udp:127.0.0.1:14540"
+ADDRESS = "mavlink:udp:127.0.0.1:14540"
 
 
 class Changes:

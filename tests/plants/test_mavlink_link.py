@@ -1,13 +1,12 @@
 """One end of MAVLink: what it believes, whom it believes, and what it says."""
 
 import math
-import os
 import time
-from collections import deque
 
 import numpy as np
 import pytest
 
+from made_up_wire import Wire
 from retrim import PlantError
 from retrim.plants.bridges import frames
 from retrim.plants.bridges.mavlink_link import MavlinkLink
@@ -16,27 +15,6 @@ mavlink = pytest.importorskip("pymavlink.dialects.v20.common")
 PX4, INVALID = 12, 8
 HERE = ("127.0.0.1", 14580)
 TURNED = np.array([0.9, 0.1, -0.2, math.sqrt(1 - 0.81 - 0.01 - 0.04)])
-
-
-class Wire:
-    """An end in memory."""
-
-    def __init__(self):
-        self.inbox, self.sent = deque(), []
-        self._read, self._write = os.pipe()
-
-    def fileno(self):
-        return self._read
-
-    def receive(self):
-        return self.inbox.popleft() if self.inbox else None
-
-    def send(self, data, to):
-        self.sent.append((data, to))
-
-    def close(self):
-        os.close(self._read)
-        os.close(self._write)
 
 
 @pytest.fixture

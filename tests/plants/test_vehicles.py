@@ -12,18 +12,18 @@ import pytest
 
 from retrim import Command, ConfigError, PlantError, Scenario, State, testing
 from retrim.config.plants import find_plant, is_vehicle
-from retrim.plants.bridges import mavlink
+from retrim.plants.bridges import crazyflie, mavlink
 from retrim.plants.bridges.mavlink_link import MavlinkLink
 
 PORT = 24560
 
 
 @contextlib.contextmanager
-def peer(*words, port=PORT):
+def peer(*words, port=PORT, speaks="mavlink"):
     """A process that stands in for an autopilot and its vehicle."""
-    if importlib.util.find_spec("pymavlink") is None:
+    if speaks == "mavlink" and importlib.util.find_spec("pymavlink") is None:
         pytest.skip("the extra mavlink is not installed")
-    command = [sys.executable, "-m", "retrim.testing.mavlink_peer", "--plant", "simple", "--port", str(port), *words]
+    command = [sys.executable, "-m", f"retrim.testing.{speaks}_peer", "--plant", "simple", "--port", str(port), *words]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
         assert "Ctrl-C ends it" in process.stdout.readline()
@@ -34,13 +34,18 @@ def peer(*words, port=PORT):
         process.stdout.close()
 
 
-def link(port=PORT, **changes):
-    return Scenario(plant=f"mavlink:udp:127.0.0.1:{port}", **changes).make("small")
+def link(port=PORT, speaks="mavlink", **changes):
+    return Scenario(plant=f"{speaks}:udp:127.0.0.1:{port}", **changes).make("small")
 
 
 def test_mavlink_conforms():
     with peer():
         testing.check_vehicle(link)
+
+
+def test_a_crazyflie_conforms():
+    with peer(port=PORT + 5, speaks="crazyflie"):
+        testing.check_vehicle(lambda: link(PORT + 5, "crazyflie"))
 
 
 def test_another_vehicle_conforms():
@@ -79,6 +84,23 @@ def test_silence_is_noticed():
         plant.stop()
 
 
+def test_a_crazyflie_that_is_silent_is_noticed():
+    with peer("--cut", "0.5", "60", port=PORT + 6, speaks="crazyflie"):
+        plant = hovering(link(PORT + 6, "crazyflie"))
+        vehicle = Scenario(plant="simple").make_vehicle("small")
+        share = float(9.81 * vehicle.mass / vehicle.thrust_max / 1.035)
+        assert plant.hover / 65_535 == pytest.approx(share, rel=0.02)
+        with pytest.raises(PlantError, match="silent for 2 s; a Crazyflie stops its motors"):
+            step_for(plant, 10.0)
+        plant.stop()
+
+
+def test_no_crazyflie_there_is_named(monkeypatch):
+    monkeypatch.setattr(crazyflie, "ANSWERS_S", 0.3)
+    with link(PORT + 7, "crazyflie") as plant, pytest.raises(PlantError, match=r"does not answer on port 13 in 0\.3 s"):
+        plant.connect()
+
+
 def test_nobody_there_is_named(monkeypatch):
     monkeypatch.setattr(mavlink, "HEARD_S", 0.3)
     with link(PORT + 1) as plant, pytest.raises(PlantError, match=r"no autopilot was heard there in 0\.3 s"):
@@ -95,7 +117,16 @@ def test_a_port_that_is_taken_is_named():
         other.close()
 
 
-@pytest.mark.parametrize("plant", ["mavlink", "mavlink:udp:127.0.0.1:14540", "mavlink:serial:/dev/ttyACM0:921600"])
+@pytest.mark.parametrize(
+    "plant",
+    [
+        "mavlink",
+        "mavlink:udp:127.0.0.1:14540",
+        "mavlink:serial:/dev/ttyACM0:921600",
+        "crazyflie",
+        "crazyflie:udp:10.0.0.7:19850",
+    ],
+)
 def test_a_vehicle_is_known_by_its_name_and_address(plant):
     assert is_vehicle(plant)
     assert find_plant(plant)[1] == plant.partition(":")[2]
@@ -127,9 +158,15 @@ def test_a_wrong_address_is_named_before_it_flies(address):
         Scenario(plant=f"mavlink:{address}")
 
 
-def test_a_rate_that_px4_does_not_take_is_refused():
-    with pytest.raises(ConfigError, match="10 to 250 Hz"):
-        Scenario(plant="mavlink").make("small", dt=0.2)
+def test_a_crazyflie_is_not_reached_by_a_serial_line():
+    with pytest.raises(ConfigError, match="a Crazyflie is reached by udp:HOST:PORT"):
+        Scenario(plant="crazyflie:serial:/dev/ttyACM0:921600")
+
+
+@pytest.mark.parametrize(("plant", "why"), [("mavlink", "10 to 250 Hz"), ("crazyflie", "10 to 100 Hz")])
+def test_a_rate_that_an_autopilot_does_not_take_is_refused(plant, why):
+    with pytest.raises(ConfigError, match=why):
+        Scenario(plant=plant).make("small", dt=0.2)
 
 
 def test_commands_stay_within_what_the_vehicle_takes():

@@ -9,6 +9,8 @@ from ..physics.disturbance import Disturbance
 from ..physics.rotors import LinearDragQuadrotor
 from ..physics.vehicle import Vehicle
 from ..plants.bridges.betaflight import BetaflightPlant
+from ..plants.bridges.crazyflie import CrazyfliePlant
+from ..plants.bridges.crazyflie import check_address as check_crazyflie
 from ..plants.bridges.endpoint import address_of
 from ..plants.bridges.mavlink import ADDRESS, MavlinkPlant
 from ..plants.crazyflow import CrazyflowPlant
@@ -105,6 +107,11 @@ def _mavlink(r: PlantRequest) -> Plant:
     return MavlinkPlant(r.address, r.dt, low, high)
 
 
+def _crazyflie(r: PlantRequest) -> Plant:
+    low, high = (as_numpy(u).astype(float) for u in (r.vehicle.command_min, r.vehicle.command_max))
+    return CrazyfliePlant(r.address, r.dt, low, high)
+
+
 def _betaflight(r: PlantRequest) -> Plant:
     low, high = (as_numpy(u).astype(float) for u in (r.vehicle.command_min, r.vehicle.command_max))
     return BetaflightPlant(BemQuadrotor.of(r.vehicle, r.dt, thrust_error=r.thrust_error), r.disturbance, low, high)
@@ -165,6 +172,15 @@ register_plant(
         "a vehicle, or a simulation, that PX4 flies",
         is_vehicle=True,
         check_address=lambda address: address_of(address or ADDRESS),
+    ),
+)
+register_plant(
+    "crazyflie",
+    PlantEntry(
+        _crazyflie,
+        "a Crazyflie, or a simulated one, by CRTP over UDP",
+        is_vehicle=True,
+        check_address=check_crazyflie,
     ),
 )
 register_plant(

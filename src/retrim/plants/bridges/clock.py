@@ -9,6 +9,7 @@ ENOUGH = 3  # of them, to know the rate
 APART = 0.03  # [s], standard deviation of their times, to know the rate
 SLIP = 3e-3  # [s] beyond what a round trip explains
 JITTER = 1e-4  # [s], of the quickest exchange
+WINDOW_S = 2.0  # [s] within which some message has come without a delay
 
 
 class RemoteClock:
@@ -50,3 +51,23 @@ class RemoteClock:
             return None
         centre, height = self._line
         return height + self._rate * (remote - centre)
+
+
+class ArrivalClock:
+    """Follows a clock that nobody can ask, by when its messages arrive: the quickest of the last ones count.
+
+    How long even they took is not known to it.
+    """
+
+    def __init__(self) -> None:
+        self._arrived: deque[tuple[float, float]] = deque()
+
+    def arrived(self, remote: float, now: float) -> None:
+        """Take note of a message, of a time of the other clock, that came at one of ours [s]."""
+        while self._arrived and now - self._arrived[0][0] > WINDOW_S:
+            self._arrived.popleft()
+        self._arrived.append((now, now - remote))
+
+    def here(self, remote: float) -> float | None:
+        """Return what our clock shows when the other shows ``remote`` [s]; None if it was never heard."""
+        return remote + min(offset for _, offset in self._arrived) if self._arrived else None

@@ -1,13 +1,17 @@
 """Where bytes of an autopilot come from and go to: a UDP port, or a serial line."""
 
 import contextlib
+import select
 import socket
+import time
+from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
 from ...errors import ConfigError, PlantError
 from ..extras import import_extra
 
 LONGEST = 65_535
+NAP_S = 0.02  # [s]: at least as often, chores are done
 
 
 @runtime_checkable
@@ -142,3 +146,22 @@ def open_endpoint(address: str) -> Endpoint:
     """
     kind, place, number = address_of(address)
     return UdpEndpoint(place, number) if kind == "udp" else SerialEndpoint(place, number)
+
+
+def pump(endpoint: Endpoint, until: float, chores: Callable[[float], None], take: Callable[[bytes, Any], None]) -> None:
+    """Read what comes, and do what has to be done now and then, until an instant of the monotonic clock [s].
+
+    Args:
+        endpoint: Where bytes come from.
+        until: When it ends; what has come is read all the same.
+        chores: Called with the time.
+        take: Called with what has come in one go, and who sent it.
+    """
+    while True:
+        chores(time.monotonic())
+        while (come := endpoint.receive()) is not None:
+            take(*come)
+        left = until - time.monotonic()
+        if left <= 0.0:
+            return
+        select.select([endpoint], [], [], min(left, NAP_S))

@@ -9,9 +9,9 @@ from ...errors import ConfigError, PlantError
 from ...physics.state import STANDARD_GRAVITY
 from .endpoint import address_of, open_endpoint
 from .frames import heading_of
-from .mavlink_link import MavlinkLink, Reading
+from .mavlink_link import MavlinkLink
 from .vehicle_plant import KeepOn, VehiclePlant
-from .vehicle_state import VehicleState
+from .vehicle_state import Reading, VehicleState
 
 ADDRESS = "udp:127.0.0.1:14540"  # to which PX4 sends on the machine that it runs on
 PX4 = 12  # MAV_AUTOPILOT
@@ -23,7 +23,6 @@ HEARD_S, READY_S, UNREADY_S = 10.0, 40.0, 12.0  # [s] to be heard; to be ready; 
 SWITCH_S, ARM_S, GO_S, LANDING_S = 5.0, 8.0, 40.0, 40.0  # [s]
 ASK_AGAIN_S = 1.0  # [s]
 LOST_S = 2.0  # [s] of silence, after which the autopilot has long gone its own way
-THERE, STILL, STAY_S = 0.2, 0.25, 1.0  # [m], [m/s], [s] of one who has arrived
 THRUST_S = 2.0  # [s] over which the thrust at hover is learnt
 TELL_EVERY_S = 0.05  # [s] between two setpoints of where to go
 
@@ -106,7 +105,7 @@ class MavlinkPlant(VehiclePlant):
         self._ask(self._offboard, SET_MODE, (1.0, *map(float, OFFBOARD)), SWITCH_S, keep_on, "offboard mode")
         self._engaged = True
         self._ask(lambda: link.armed, ARM_DISARM, (1.0,), ARM_S, keep_on, "to be armed")
-        if not self.until(self._staying(), GO_S, keep_on):
+        if not self.until(self.staying(self._place, self._tell), GO_S, keep_on):
             raise PlantError(
                 f"the autopilot is at {self._reading().p.round(2).tolist()} m after {GO_S:g} s, not at "
                 f"{self._place.round(2).tolist()}{self._said()}"
@@ -133,8 +132,8 @@ class MavlinkPlant(VehiclePlant):
             raise PlantError(f"the link has been silent for {LOST_S:g} s; the autopilot does what its failsafe says")
         if self._engaged and not (self._offboard() and link.armed):
             raise PlantError(f"the autopilot has left offboard mode, for mode {link.mode}{self._said()}")
-        told = None if truth is None or now - truth.stamp > LOST_S else _state(truth, now)
-        return _state(x, now)._replace(truth=told)
+        told = None if truth is None or now - truth.stamp > LOST_S else truth.at(now)
+        return x.at(now)._replace(truth=told)
 
     def transmit(self, u: np.ndarray) -> np.ndarray:
         """Send thrust and body rates."""
@@ -181,20 +180,6 @@ class MavlinkPlant(VehiclePlant):
             self._told = time.monotonic()
             self.link.fly_to(self._place, self._heading)
 
-    def _staying(self) -> KeepOn:
-        """Return what tells whether the vehicle has been at its place for a while."""
-        since = math.inf
-
-        def stays() -> bool:
-            nonlocal since
-            self._tell()
-            x = self._reading()
-            there = np.abs(x.p - self._place).max() < THERE and np.abs(x.v).max() < STILL
-            since = min(since, time.monotonic()) if there else math.inf
-            return time.monotonic() - since > STAY_S
-
-        return stays
-
     def _ask(
         self, done: KeepOn, number: int, parameters: tuple[float, ...], patience: float, keep_on: KeepOn, what: str
     ) -> None:
@@ -214,7 +199,3 @@ class MavlinkPlant(VehiclePlant):
 
     def _said(self) -> str:
         return f"; it said: {'; '.join(self.link.texts)}" if self.link.texts else ""
-
-
-def _state(x: Reading, now: float) -> VehicleState:
-    return VehicleState(x.p, x.R, x.v, x.omega, max(0.0, now - x.stamp))

@@ -4,12 +4,11 @@ Nothing here decides when to arm or who flies; :mod:`.mavlink` does.
 """
 
 import math
-import select
 import struct
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -17,10 +16,10 @@ from ...errors import PlantError
 from ..extras import import_extra
 from . import frames
 from .clock import RemoteClock
-from .endpoint import Endpoint
+from .endpoint import Endpoint, pump
+from .vehicle_state import Reading
 
 HEARTBEAT_S, SYNC_S = 0.5, 0.1
-NAP_S = 0.02  # [s]: at least as often, chores are done
 PREARM = 0x10000000  # bit of SYS_STATUS: it could be armed
 ARMED = 0x80  # bit of HEARTBEAT.base_mode
 ONBOARD_COMPUTER, INVALID = 18, 8  # MAV_TYPE, MAV_AUTOPILOT
@@ -30,21 +29,6 @@ RATES_ONLY = 128  # SET_ATTITUDE_TARGET: thrust and body rates count, the attitu
 PLACE_AND_YAW = 0x9F8  # SET_POSITION_TARGET_LOCAL_NED: velocity, acceleration and yaw rate do not count
 PAIRED_S = 0.025  # [s] between a position and an attitude that are one state
 SETTLED_S = 1.0  # [s] without ODOMETRY, after which other messages are made do with
-
-
-class Reading(NamedTuple):
-    """A state, in our frames."""
-
-    stamp: float
-    """When it was valid, by the monotonic clock of this machine [s]."""
-    p: np.ndarray
-    """World [m]."""
-    R: np.ndarray
-    """Body to world."""
-    v: np.ndarray
-    """World [m/s]."""
-    omega: np.ndarray
-    """Body rates [rad/s]."""
 
 
 class MavlinkLink:
@@ -94,14 +78,7 @@ class MavlinkLink:
 
     def pump(self, until: float) -> None:
         """Read what comes, and say what has to be said now and then, until an instant of the monotonic clock [s]."""
-        while True:
-            self._chores(time.monotonic())
-            while (come := self._endpoint.receive()) is not None:
-                self._take(*come)
-            left = until - time.monotonic()
-            if left <= 0.0:
-                return
-            select.select([self._endpoint], [], [], min(left, NAP_S))
+        pump(self._endpoint, until, self._chores, self._take)
 
     def command(self, number: int, *parameters: float) -> None:
         """Send COMMAND_LONG. Its first answer only says that it arrived; the autopilot's state says what came of it."""

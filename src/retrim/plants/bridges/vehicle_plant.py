@@ -1,6 +1,7 @@
 """A vehicle as a plant: its time does not wait, and it cannot be put anywhere."""
 
 import abc
+import math
 import time
 from collections.abc import Callable
 
@@ -16,6 +17,7 @@ from .vehicle_state import VehicleState
 KeepOn = Callable[[], bool]
 """Asked again and again."""
 NAP_S = 0.01  # [s] between two questions
+THERE, STILL, STAY_S = 0.2, 0.25, 1.0  # [m], [m/s], [s] of one who has arrived
 
 
 class VehiclePlant(Plant, abc.ABC):
@@ -34,8 +36,8 @@ class VehiclePlant(Plant, abc.ABC):
         """
         self.dt = dt
         self.low, self.high = low, high
-        self.lost = 0.0
-        """Time that a simulated vehicle did not fly, because the machine was busy [s]."""
+        self.lost: float | None = None
+        """Time that a vehicle, simulated here, did not fly because the machine was busy [s]; None for any other."""
         self._tick: int | None = None
         self._began = 0.0
         self._thrust = STANDARD_GRAVITY
@@ -112,6 +114,25 @@ class VehiclePlant(Plant, abc.ABC):
                 raise PlantError("the flight was given up before the hand-over")
             self.wait(time.monotonic() + NAP_S)
         return False
+
+    def staying(self, place: np.ndarray, meanwhile: Callable[[], object] = lambda: None) -> KeepOn:
+        """Return what tells whether the vehicle has been at a place [m] for a while.
+
+        Args:
+            place: World [m].
+            meanwhile: Done at each question.
+        """
+        since = math.inf
+
+        def stays() -> bool:
+            nonlocal since
+            meanwhile()
+            x = self.read()
+            there = np.abs(x.p - place).max() < THERE and np.abs(x.v).max() < STILL
+            since = min(since, time.monotonic()) if there else math.inf
+            return time.monotonic() - since > STAY_S
+
+        return stays
 
     @abc.abstractmethod
     def land(self) -> None:

@@ -43,3 +43,22 @@ class VehicleState(NamedTuple):
         return self._replace(
             p=self.p + h * self.v + 0.5 * h * h * a, R=self.R @ turned, v=self.v + h * a, truth=truth
         )  # fmt: skip
+
+
+class Reading(NamedTuple):
+    """A state that a link has heard, in our frames."""
+
+    stamp: float
+    """When it was valid, by the monotonic clock of this machine [s]."""
+    p: np.ndarray
+    """World [m]."""
+    R: np.ndarray
+    """Body to world."""
+    v: np.ndarray
+    """World [m/s]."""
+    omega: np.ndarray
+    """Body rates [rad/s]."""
+
+    def at(self, now: float) -> VehicleState:
+        """Return it as a state with an age, at an instant of the same clock [s]."""
+        return VehicleState(self.p, self.R, self.v, self.omega, max(0.0, now - self.stamp))

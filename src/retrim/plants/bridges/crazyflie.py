@@ -1,0 +1,220 @@
+"""A Crazyflie as a plant: it takes off by itself, hands over, and lands when the flight is over."""
+
+import socket
+import time
+
+import numpy as np
+
+from ...errors import ConfigError, PlantError
+from ...physics.state import STANDARD_GRAVITY
+from . import crtp
+from .crazyflie_link import CrazyflieLink
+from .endpoint import UdpEndpoint, address_of
+from .frames import heading_of
+from .vehicle_plant import KeepOn, VehiclePlant
+from .vehicle_state import Reading, VehicleState
+
+ADDRESS = "udp:127.0.0.1:19850"  # where a simulated one, or a bridge to the radio, listens on this machine
+ANSWERS_S, READY_S, STILL_S, ARM_S, GO_S, LANDING_S = 5.0, 20.0, 2.0, 5.0, 20.0, 15.0  # [s]
+LOST_S = 2.0  # [s] of silence; by then it has stopped its motors
+WANDERS = 0.1  # [m] by which the place of one who stands may change
+SPEED, RISE_S = 0.5, 2.0  # [m/s] on the way to the start; [s] of a take-off
+THRUST_S = 2.0  # [s] over which the thrust at hover is learnt
+GROUND = 0.1  # [m] above where it took off
+
+
+class CrazyfliePlant(VehiclePlant):
+    """A Crazyflie, by CRTP over UDP: thrust and body rates as its manual setpoint, states from its log.
+
+    World and body are its own, which are ours. Thrust per mass is a share of the range of its thrust command, g over
+    what that was at hover; battery and thrust map are left to adaptation.
+    """
+
+    def __init__(self, address: str, dt: float, low: np.ndarray, high: np.ndarray) -> None:
+        """Build a plant; nothing is sent before it connects.
+
+        Args:
+            address: ``udp:HOST:PORT`` where it listens.
+            dt: Control period [s].
+            low: Smallest command [c, omega].
+            high: Largest one.
+
+        Raises:
+            ConfigError: The address is none, or the period is not one that it can be flown at.
+        """
+        super().__init__(dt, low, high)
+        if not 0.01 <= dt <= 0.1:
+            raise ConfigError(f"dt = {dt} s: a Crazyflie is commanded at 10 to 100 Hz")
+        self.address = check_address(address)
+        self.hover: float | None = None
+        """Thrust command that carries the vehicle, 0 to 65535; known once it has hovered."""
+        self._link: CrazyflieLink | None = None
+        self._flies, self._floor = False, 0.0
+
+    @property
+    def link(self) -> CrazyflieLink:
+        """The connection.
+
+        Raises:
+            PlantError: There is none.
+        """
+        if self._link is None:
+            raise PlantError(f"{self.address}: not connected; call connect or reset first")
+        return self._link
+
+    def connect(self, keep_on: KeepOn = lambda: True) -> None:
+        """Wait for it, and until it knows where it is and could be armed."""
+        if self._link is None:
+            _, host, port = address_of(self.address)
+            try:
+                to = (socket.gethostbyname(host), port)
+            except OSError as error:
+                raise PlantError(f"{self.address}: no such host ({error})") from error
+            self._link = CrazyflieLink(UdpEndpoint("0.0.0.0", 0), to)
+        elif self._link.reading is not None:
+            return
+        link = self._link
+        try:
+            link.start_logs(ANSWERS_S, keep_on)
+        except PlantError as error:
+            raise PlantError(f"{self.address}: {error}{link.said()}") from error
+        able = crtp.CAN_ARM | crtp.ARMED
+        if not self.until(lambda: bool(link.reading and self._is(able)), READY_S, keep_on):
+            raise PlantError(f"{self.address}: it cannot be armed in {READY_S:g} s{link.said()}")
+        if not self._is(crtp.FLYING):
+            self._stands_still(keep_on)
+
+    def take_off(self, p: np.ndarray | None, yaw: float | None, keep_on: KeepOn = lambda: True) -> None:
+        """Let it fly to a place by its own commander, and learn what thrust it takes to hover there."""
+        link, x = self.link, self._reading()
+        if not self._is(crtp.FLYING):
+            self._floor = float(x.p[2])
+        place = x.p + np.array([0.0, 0.0, 1.0]) if p is None else np.asarray(p, dtype=float)
+        heading = heading_of(x.R) if yaw is None else yaw
+        if not self._is(crtp.ARMED):
+            link.send(crtp.arm(True, link.version))
+        if not self.until(lambda: self._is(crtp.ARMED) and self._is(crtp.CAN_FLY), ARM_S, keep_on):
+            raise PlantError(f"{self.address}: the Crazyflie refuses to be armed{link.said()}")
+        self._flies = True
+        if not self._is(crtp.FLYING):
+            link.send(crtp.take_off(float(place[2]), heading, RISE_S))
+            self.until(lambda: False, RISE_S, keep_on)
+        way = max(1.0, float(np.linalg.norm(place - self._reading().p)) / SPEED)
+        link.send(crtp.go_to(place, heading, way, link.version))
+        if not self.until(self.staying(place), GO_S + way, keep_on):
+            raise PlantError(
+                f"{self.address}: the Crazyflie is at {self._reading().p.round(2).tolist()} m after {GO_S + way:.0f} "
+                f"s, not at {place.round(2).tolist()}{link.said()}"
+            )
+        link.thrusts.clear()
+        self.hold(time.monotonic() + THRUST_S)
+        thrusts = np.array(link.thrusts)
+        if len(thrusts) < 5 or not 0.05 < np.median(thrusts) / crtp.THRUST[1] < 0.95:
+            raise PlantError(f"the thrust at hover is not known: the log said {thrusts.round().tolist()}")
+        self.hover = float(np.mean(thrusts))
+
+    def hold(self, until: float) -> None:
+        """Let its commander hold the place of the take-off."""
+        self.link.pump(until)
+
+    def read(self) -> VehicleState:
+        """Return the newest state of its log."""
+        link = self.link
+        link.pump(0.0)
+        now = time.monotonic()
+        if now - link.heard > LOST_S:
+            raise PlantError(f"the link has been silent for {LOST_S:g} s; a Crazyflie stops its motors then")
+        for bit, what in (
+            (crtp.TUMBLED, "lies on its back"),
+            (crtp.LOCKED, "has locked itself"),
+            (crtp.CRASHED, "has crashed"),
+        ):
+            if self._is(bit):
+                raise PlantError(f"the Crazyflie says that it {what}{link.said()}")
+        if self._flies and not self._is(crtp.ARMED):
+            raise PlantError(f"the Crazyflie is not armed any more{link.said()}")
+        return self._reading().at(now)
+
+    def transmit(self, u: np.ndarray) -> np.ndarray:
+        """Send thrust and body rates."""
+        if self.hover is None:
+            raise PlantError(f"{self.address}: the vehicle has not taken off; call take_off or reset first")
+        per_c = self.hover / STANDARD_GRAVITY
+        thrust = round(float(np.clip(u[0] * per_c, *crtp.THRUST)))
+        self.link.send(crtp.rates_setpoint(thrust, u[1:]))
+        return np.concatenate([[thrust / per_c], u[1:]])
+
+    def wait(self, until: float) -> None:
+        """Keep the link alive."""
+        self.link.pump(until)
+
+    def land(self) -> None:
+        """Let its commander land it, and disarm it; who does not answer any more is left alone."""
+        link, self._link = self._link, None
+        if link is None:
+            return
+        try:
+            if self._flies and link.reading is not None:
+                self._sink(link)
+            link.stop_logs()
+        finally:
+            self._flies, self.hover = False, None
+            link.close()
+
+    def _sink(self, link: CrazyflieLink) -> None:
+        """Land, with orders that are given again, since they may be lost."""
+        reading = link.reading
+        assert reading is not None
+        until = time.monotonic() + LANDING_S
+        while time.monotonic() < min(until, link.heard + LOST_S):
+            height = reading.p[2] - self._floor
+            if height < GROUND:
+                break
+            link.send(crtp.relax())
+            link.send(crtp.land(self._floor, max(1.0, height / SPEED)))
+            asked = time.monotonic()
+            while time.monotonic() < min(until, asked + 1.5 + height / SPEED) and height > 0.5 * GROUND:
+                link.pump(time.monotonic() + 0.05)
+                height = (link.reading or reading).p[2] - self._floor
+            reading = link.reading or reading
+        for order in (crtp.stop_planning(), crtp.arm(False, link.version)):
+            link.send(order)
+            link.pump(time.monotonic() + 0.1)
+
+    def _is(self, bits: int) -> bool:
+        """Whether its supervisor says any of these."""
+        status = self.link.status
+        return status is not None and bool(status.info & bits)
+
+    def _reading(self) -> Reading:
+        if self.link.reading is None:
+            raise PlantError(f"{self.address}: the Crazyflie has sent no state")
+        return self.link.reading
+
+    def _stands_still(self, keep_on: KeepOn) -> None:
+        """Check that its estimate does not wander, as one without a positioning system does."""
+        first = self._reading().p
+        wanders = 0.0
+
+        def wandered() -> bool:
+            nonlocal wanders
+            wanders = max(wanders, float(np.abs(self._reading().p - first).max()))
+            return False
+
+        self.until(wandered, STILL_S, keep_on)
+        if wanders > WANDERS:
+            raise PlantError(
+                f"{self.address}: the Crazyflie stands, and its estimate wandered by {wanders:.2f} m in {STILL_S:g} s; "
+                f"is there a positioning system?"
+            )
+
+
+def check_address(address: str) -> str:
+    """Return an address of a Crazyflie; where one is by default if it is empty.
+
+    Raises:
+        ConfigError: It is none, or not one of UDP.
+    """
+    if address_of(address or ADDRESS)[0] != "udp":
+        raise ConfigError(f"address {address!r}: a Crazyflie is reached by udp:HOST:PORT, as {ADDRESS}")
+    return address or ADDRESS

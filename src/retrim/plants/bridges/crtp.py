@@ -1,0 +1,208 @@
+"""CRTP, the language of a Crazyflie: packets of a port, a channel and up to 30 bytes, little endian.
+
+Its world is ours, x, y and z up, and so is its body, forward, left, up; but its pitch is nose up, against our y.
+"""
+
+import math
+import struct
+from typing import NamedTuple
+
+import numpy as np
+
+from ...errors import MessageError
+
+CONSOLE, PARAMETERS, MEMORY, LOG, SETPOINT, HIGH_LEVEL, SUPERVISOR, PLATFORM, LINK = 0, 2, 4, 5, 7, 8, 9, 13, 15
+LONGEST = 31  # bytes, with the header
+TOC, CONTROL, DATA = 0, 1, 2  # channels of LOG
+ITEM, INFO = 2, 3  # commands of a table of contents
+RESET, CREATE, APPEND, START = 5, 6, 7, 3  # commands of LOG's CONTROL
+LISTED = 9  # variables that one of them has room for
+LOG_MS = 10  # of START's unit
+STOP, MANUAL, RELAX = 0, 11, 0  # of SETPOINT's channels 0, 0 and 1
+HL_STOP, GO_TO, TAKE_OFF, LAND, GO_TO_LINEAR = 3, 4, 7, 8, 12  # commands of HIGH_LEVEL
+NEW_GO_TO, OWN_SUPERVISOR = 8, 12  # protocol versions since which there is GO_TO_LINEAR, and the port SUPERVISOR
+CAN_ARM, ARMED, AUTO_ARMED, CAN_FLY, FLYING, TUMBLED, LOCKED, CRASHED = (1 << bit for bit in range(8))
+THRUST = (1, 65_535)  # at 0 the motors stop and its controllers begin anew
+STATE_LOG = {
+    **{f"stateEstimateZ.{name}": "h" for name in ("x", "y", "z", "vx", "vy", "vz")},
+    "stateEstimateZ.quat": "I",
+    **{f"stateEstimateZ.{name}": "h" for name in ("rateRoll", "ratePitch", "rateYaw")},
+}
+"""What a block of states holds, and how [mm, mm/s, packed quaternion, mrad/s]."""
+STATUS_LOG = {"stabilizer.thrust": "f", "supervisor.info": "H", "pm.vbat": "f"}
+LOG_TYPES = {"B": 1, "H": 2, "I": 3, "b": 4, "h": 5, "i": 6, "f": 7}
+_STATE, _STATUS = (struct.Struct("<" + "".join(block.values())) for block in (STATE_LOG, STATUS_LOG))
+_PITCH_UP = np.array([1.0, -1.0, 1.0])
+_BITS, _HALF = 511, math.sqrt(0.5)
+
+
+class Packet(NamedTuple):
+    """What came, or goes."""
+
+    port: int
+    channel: int
+    body: bytes = b""
+
+    def pack(self) -> bytes:
+        """Return the bytes of the wire."""
+        return bytes([self.port << 4 | 3 << 2 | self.channel]) + self.body
+
+
+def unpacked(data: bytes) -> Packet:
+    """Return the packet of a datagram.
+
+    Raises:
+        MessageError: It is empty or too long.
+    """
+    if not 0 < len(data) <= LONGEST:
+        raise MessageError(f"{len(data)} bytes are no packet, which has 1 to {LONGEST}")
+    return Packet(data[0] >> 4, data[0] & 3, data[1:])
+
+
+def rates_setpoint(thrust: int, omega: np.ndarray) -> Packet:
+    """Return a setpoint of thrust and body rates.
+
+    Args:
+        thrust: 0 to 65535.
+        omega: Body rates, ours [rad/s].
+    """
+    roll, pitch, yaw = (float(rate) for rate in np.degrees(_PITCH_UP * omega))
+    return Packet(SETPOINT, 0, struct.pack("<BfffHB", MANUAL, roll, pitch, yaw, thrust, 1))
+
+
+def take_off(height: float, yaw: float, duration: float) -> Packet:
+    """Return the order to take off, to a height [m] and heading [rad], in a time [s]."""
+    return Packet(HIGH_LEVEL, 0, struct.pack("<BBff?f", TAKE_OFF, 0, height, yaw, False, duration))
+
+
+def go_to(p: np.ndarray, yaw: float, duration: float, version: int) -> Packet:
+    """Return the order to go to a place [m] and heading [rad], in a time [s]."""
+    head = (GO_TO_LINEAR, 0, 0, 0) if version >= NEW_GO_TO else (GO_TO, 0, 0)
+    return Packet(HIGH_LEVEL, 0, struct.pack(f"<{len(head)}B5f", *head, *map(float, p), yaw, duration))
+
+
+def land(height: float, duration: float) -> Packet:
+    """Return the order to land, to a height [m], in a time [s]."""
+    return Packet(HIGH_LEVEL, 0, struct.pack("<BBff?f", LAND, 0, height, 0.0, True, duration))
+
+
+def stop_planning() -> Packet:
+    """Return the order that ends what take_off, go_to and land began; the motors stop."""
+    return Packet(HIGH_LEVEL, 0, bytes([HL_STOP, 0]))
+
+
+def relax() -> Packet:
+    """Return the word that no more setpoints come, so that orders count again; without it the motors stop."""
+    return Packet(SETPOINT, 1, struct.pack("<BI", RELAX, 0))
+
+
+def arm(yes: bool, version: int) -> Packet:
+    """Return the order to arm or disarm."""
+    port, channel = (SUPERVISOR, 1) if version >= OWN_SUPERVISOR else (PLATFORM, 0)
+    return Packet(port, channel, bytes([1, yes]))
+
+
+def new_block(number: int, variables: list[tuple[str, int]]) -> list[Packet]:
+    """Return the orders to make a block of a log, of types and numbers of variables."""
+    listed = [struct.pack("<BH", LOG_TYPES[kind], item) for kind, item in variables]
+    parts = [b"".join(listed[k : k + LISTED]) for k in range(0, len(listed), LISTED)]
+    return [Packet(LOG, CONTROL, bytes([APPEND if k else CREATE, number]) + part) for k, part in enumerate(parts)]
+
+
+def start_block(number: int, period: float) -> Packet:
+    """Return the order to send a block every so many seconds."""
+    return Packet(LOG, CONTROL, bytes([START, number, max(1, round(1e3 * period / LOG_MS))]))
+
+
+class StateRow(NamedTuple):
+    """A state in a log."""
+
+    p: np.ndarray
+    """World [m]."""
+    R: np.ndarray
+    """Body to world."""
+    v: np.ndarray
+    """World [m/s]."""
+    omega: np.ndarray
+    """Body rates [rad/s]."""
+
+
+def state_of(values: bytes) -> StateRow:
+    """Return the state in what STATE_LOG lists.
+
+    Raises:
+        MessageError: It has another length, or its attitude is none.
+    """
+    if len(values) != _STATE.size:
+        raise MessageError(f"{len(values)} bytes are no state, which has {_STATE.size}")
+    *where, quat, roll, pitch, yaw = _STATE.unpack(values)
+    place = 1e-3 * np.array(where, dtype=float)
+    return StateRow(place[:3], attitude_of(quat), place[3:], 1e-3 * _PITCH_UP * np.array([roll, pitch, yaw]))
+
+
+def state_values(p: np.ndarray, R: np.ndarray, v: np.ndarray, omega: np.ndarray) -> bytes:
+    """Return what STATE_LOG lists; the inverse of :func:`state_of`."""
+    rows = [np.clip(np.round(1e3 * x), -32_768, 32_767).astype(int).tolist() for x in (p, v, _PITCH_UP * omega)]
+    return _STATE.pack(*rows[0], *rows[1], quaternion_of(R), *rows[2])
+
+
+class Status(NamedTuple):
+    """How it is, in a log."""
+
+    thrust: float
+    """What its controller commands, 0 to 65535."""
+    info: int
+    """Bits of its supervisor: CAN_ARM, ARMED and so on."""
+    battery: float
+    """[V]."""
+
+
+def status_of(values: bytes) -> Status:
+    """Return the status in what STATUS_LOG lists.
+
+    Raises:
+        MessageError: It has another length, or is not finite.
+    """
+    if len(values) != _STATUS.size:
+        raise MessageError(f"{len(values)} bytes are no status, which has {_STATUS.size}")
+    found = Status(*_STATUS.unpack(values))
+    if not (math.isfinite(found.thrust) and math.isfinite(found.battery)):
+        raise MessageError("a status that is not finite")
+    return found
+
+
+def status_values(status: Status) -> bytes:
+    """Return what STATUS_LOG lists; the inverse of :func:`status_of`."""
+    return _STATUS.pack(*status)
+
+
+def attitude_of(packed: int) -> np.ndarray:
+    """Return an attitude, body to world, of 32 bits: which element is largest, and sign and size of the others.
+
+    Raises:
+        MessageError: The others are larger than a unit quaternion has room for.
+    """
+    from scipy.spatial.transform import Rotation  # here: it takes as long to import as all of retrim
+
+    largest, q = packed >> 30, np.zeros(4)
+    for k, i in enumerate(i for i in (3, 2, 1, 0) if i != largest):
+        bits = packed >> 10 * k
+        q[i] = (-1.0 if bits >> 9 & 1 else 1.0) * (bits & _BITS) / _BITS * _HALF
+    rest = 1.0 - float(q @ q)
+    if rest < 0.24:  # the largest of four is half the length at least
+        raise MessageError("a packed quaternion whose largest element is not")
+    q[largest] = math.sqrt(rest)
+    out: np.ndarray = Rotation.from_quat(q).as_matrix()
+    return out
+
+
+def quaternion_of(R: np.ndarray) -> int:
+    """Return an attitude in 32 bits; the inverse of :func:`attitude_of` to 2 mrad."""
+    from scipy.spatial.transform import Rotation  # here, likewise
+
+    q = Rotation.from_matrix(R).as_quat()
+    packed = largest = int(np.argmax(np.abs(q)))
+    q = -q if q[largest] < 0.0 else q
+    for i in (i for i in range(4) if i != largest):
+        packed = packed << 10 | int(q[i] < 0.0) << 9 | min(_BITS, round(_BITS * abs(float(q[i])) / _HALF))
+    return packed

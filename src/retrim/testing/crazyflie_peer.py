@@ -1,0 +1,243 @@
+"""A peer that speaks CRTP as a Crazyflie does and flies the plant ``bem``: for tests, and to try a link without one.
+
+``python -m retrim.testing.crazyflie_peer --disturbance large`` flies until Ctrl-C. It knows what :mod:`retrim` needs of
+the firmware (versions, its log, arming, its own commander, the manual setpoint, what it does where setpoints stop) and
+what a client asks before that, and nothing else. The vehicle is one of ours: only the language is a Crazyflie's.
+"""
+
+import argparse
+import math
+import socket
+import struct
+import time
+
+import numpy as np
+
+from ..config.scenario import Scenario
+from ..errors import MessageError
+from ..plants.bridges import crtp
+from ..plants.bridges.crtp import Packet
+from .peer_vehicle import GROUND, PeerVehicle, fly_until_interrupted
+
+VERSION = 12  # of the protocol
+LEVELS_S, STOPS_S = 0.5, 2.0  # [s] without a setpoint
+READY_S = 0.5  # [s] until it can be armed
+FULL = 65_535.0  # thrust
+VARIABLES = {**crtp.STATUS_LOG, "stateEstimate.x": "f", "stateEstimate.y": "f", **crtp.STATE_LOG}
+UNKNOWN = 2  # error of what is not there
+
+
+class CrazyfliePeer:
+    """A Crazyflie. :meth:`step` is a hundredth of a second of it."""
+
+    def __init__(self, scenario: Scenario, *, port: int = 19850, seed: int = 0) -> None:
+        """Build one that stands at the origin, its nose along x.
+
+        Args:
+            scenario: Plant, vehicle and what disturbs the flight.
+            port: Where it listens, on this machine.
+            seed: Of the disturbance.
+        """
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.bind(("127.0.0.1", port))
+        self._socket.setblocking(False)
+        self._client: tuple[str, int] | None = None
+        self.vehicle = PeerVehicle(scenario, heading=0.0, seed=seed)
+        self._began = time.monotonic()
+        self.armed = self.locked = self.cut = False
+        """Whether it is; has locked itself; hears and says nothing."""
+        self._place: np.ndarray | None = None
+        self._yaw = 0.0
+        self._lands = False
+        self._setpoint: np.ndarray | None = None
+        self._told = -math.inf
+        self._thrust = 0.0
+        self._blocks: dict[int, list[str]] = {}
+        self._periods: dict[int, int] = {}
+        self._tick = 0
+
+    @property
+    def by_rates(self) -> bool:
+        """Whether it flies thrust and body rates that somebody else commands."""
+        return self.vehicle.flies and self._setpoint is not None
+
+    def step(self) -> None:
+        """Read what came, fly for a tick, and say how it went."""
+        self._read()
+        vehicle, u = self.vehicle, self._commanded()
+        self._thrust = 0.0 if u is None else float(u[0]) / vehicle.thrust_max * FULL
+        if vehicle.flies:
+            vehicle.step(np.zeros(4) if u is None else u)
+            if vehicle.p[2] < GROUND and (self._lands or u is None):
+                self.locked = self.locked or (u is None and float(np.linalg.norm(vehicle.v)) > 1.0)
+                vehicle.stand()
+                self._place, self._lands = None, False
+        elif u is not None and self.armed:
+            vehicle.lift_off()
+        self._tick += 1
+        for block, every in self._periods.items():
+            if self._tick % every == 0:
+                values = b"".join(self._value(name) for name in self._blocks[block])
+                ms = round(1e3 * (time.monotonic() - self._began)) % (1 << 24)
+                self._send(Packet(crtp.LOG, crtp.DATA, bytes([block]) + ms.to_bytes(3, "little") + values))
+
+    def close(self) -> None:
+        """Give the port back."""
+        self.vehicle.close()
+        self._socket.close()
+
+    def _commanded(self) -> np.ndarray | None:
+        """Return what flies; None: the motors stand."""
+        since = time.monotonic() - self._told
+        if not self.armed or self.locked:
+            return None
+        if self._setpoint is not None:
+            if since < LEVELS_S:
+                return self._setpoint
+            if since > STOPS_S:
+                return None
+            upright = np.array([0.0, 0.0, 1.0])
+            level = 6.0 * (self.vehicle.R.T @ np.cross(self.vehicle.R[:, 2], upright))
+            return np.array([self._setpoint[0], level[0], level[1], 0.0])
+        if self._place is None:
+            return None
+        if self._lands:
+            self._place = np.array([*self._place[:2], max(self.vehicle.p[2] - 0.3, -0.5)])
+        return self.vehicle.towards(self._place, self._yaw)
+
+    def _info(self) -> int:
+        flies = self.vehicle.flies
+        bits = crtp.CAN_ARM * (not self.armed and time.monotonic() - self._began > READY_S)
+        return int(bits | (crtp.ARMED | crtp.CAN_FLY) * self.armed | crtp.FLYING * flies | crtp.LOCKED * self.locked)
+
+    def _value(self, name: str) -> bytes:
+        x = self.vehicle
+        group, _, of = name.partition(".")
+        if group == "stateEstimateZ":
+            offset = struct.calcsize("<" + "".join(list(crtp.STATE_LOG.values())[: list(crtp.STATE_LOG).index(name)]))
+            kind = struct.calcsize("<" + crtp.STATE_LOG[name])
+            return crtp.state_values(x.p, x.R, x.v, x.omega)[offset : offset + kind]
+        known = {"thrust": self._thrust, "info": self._info(), "vbat": 3.9, "x": float(x.p[0]), "y": float(x.p[1])}
+        return struct.pack("<" + VARIABLES[name], known[of])
+
+    def _read(self) -> None:
+        while True:
+            try:
+                data, sender = self._socket.recvfrom(2048)
+            except OSError:
+                return
+            if self.cut:
+                continue
+            self._client = sender
+            try:
+                self._take(crtp.unpacked(data))
+            except (MessageError, struct.error, IndexError, ValueError):
+                continue
+
+    def _take(self, packet: Packet) -> None:
+        port, channel, body = packet
+        if (port, channel) in ((crtp.LINK, 0), (crtp.LINK, 3)):  # an echo; a question who is there
+            self._send(packet)
+        elif (port, channel) == (crtp.LINK, 1):
+            self._send(packet._replace(body=b"Bitcraze Crazyflie".ljust(30, b"\0")))
+        elif (port, channel) == (crtp.PLATFORM, 1) and body[:1] == b"\0":
+            self._send(packet._replace(body=bytes([0, VERSION])))
+        elif (port, channel) == (crtp.SUPERVISOR, 1) and body[0] == 1:
+            self.armed = bool(body[1]) and not self.locked and time.monotonic() - self._began > READY_S
+            self._send(packet._replace(body=bytes([0x81, self.armed == bool(body[1]), self.armed])))
+        elif (port, channel) == (crtp.SUPERVISOR, 0) and body[0] == 0x0C:
+            self._send(packet._replace(body=b"\x8c" + struct.pack("<H", self._info())))
+        elif (port, channel) in ((crtp.PARAMETERS, 0), (crtp.MEMORY, 0)):
+            self._send(packet._replace(body=body[:1] + bytes(6)))  # it has none
+        elif port == crtp.LOG:
+            self._log(packet)
+        elif (port, channel) == (crtp.SETPOINT, 0) and body[0] == crtp.MANUAL:
+            self._manual(body)
+        elif (port, channel) == (crtp.SETPOINT, 1) and body[0] == crtp.RELAX:
+            self._setpoint = None
+            self._place = self.vehicle.p.copy() if self.vehicle.flies else None
+        elif port == crtp.HIGH_LEVEL:
+            self._plan(body)
+            self._send(packet._replace(body=body[:3].ljust(3, b"\0") + b"\0"))
+
+    def _manual(self, body: bytes) -> None:
+        _, roll, pitch, yaw, thrust, rate = struct.unpack("<BfffHB", body)
+        if rate == 1:
+            c = thrust / FULL * self.vehicle.thrust_max
+            self._setpoint = np.array([c, *np.radians([roll, -pitch, yaw])])
+            self._told = time.monotonic()
+
+    def _plan(self, body: bytes) -> None:
+        kind, x = body[0], self.vehicle
+        if kind == crtp.TAKE_OFF and not x.flies:
+            height, self._yaw = struct.unpack("<ff", body[2:10])
+            self._place, self._setpoint, self._lands = np.array([*x.p[:2], height]), None, False
+        elif kind == crtp.GO_TO_LINEAR and x.flies:
+            *place, self._yaw, _ = struct.unpack("<5f", body[4:24])
+            self._place = np.array(place)
+        elif kind == crtp.LAND and x.flies:
+            self._place, self._lands = x.p.copy(), True
+        elif kind == crtp.HL_STOP:
+            self._place, self._lands = None, False
+
+    def _log(self, packet: Packet) -> None:
+        _, channel, body = packet
+        if channel == crtp.TOC and body[0] == crtp.INFO:
+            self._send(packet._replace(body=struct.pack("<BHIBB", crtp.INFO, len(VARIABLES), 0x12345678, 16, 128)))
+        elif channel == crtp.TOC and body[0] == crtp.ITEM:
+            (number,) = struct.unpack("<H", body[1:3])
+            name, kind = list(VARIABLES.items())[number]
+            listed = body[:3] + bytes([crtp.LOG_TYPES[kind]]) + name.encode().replace(b".", b"\0") + b"\0"
+            self._send(packet._replace(body=listed))
+        elif channel == crtp.CONTROL:
+            self._send(packet._replace(body=body[:2].ljust(2, b"\0") + bytes([self._ordered(body)])))
+
+    def _ordered(self, body: bytes) -> int:
+        """Return the error of what is done about a block of the log; 0: none."""
+        if body[0] == crtp.RESET:
+            self._blocks, self._periods = {}, {}
+        elif body[0] in (crtp.CREATE, crtp.APPEND):
+            whole = 2 + 3 * ((len(body) - 2) // 3)  # what is left over is left out, as the firmware does
+            numbers = [number for _, number in struct.iter_unpack("<BH", body[2:whole])]
+            if max(numbers) >= len(VARIABLES) or (body[0] == crtp.APPEND and body[1] not in self._blocks):
+                return UNKNOWN
+            before = [] if body[0] == crtp.CREATE else self._blocks[body[1]]
+            self._blocks[body[1]] = before + [list(VARIABLES)[number] for number in numbers]
+        elif body[0] == crtp.START:
+            if body[1] not in self._blocks:
+                return UNKNOWN
+            self._periods[body[1]] = max(1, body[2])
+        return 0
+
+    def _send(self, packet: Packet) -> None:
+        if not self.cut and self._client is not None:
+            try:
+                self._socket.sendto(packet.pack(), self._client)
+            except OSError:  # nobody listens any more
+                return
+
+
+def main() -> None:
+    """Fly until Ctrl-C."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--disturbance", default="none", help="as for `retrim fly`")
+    parser.add_argument("--plant", default="bem", help="as for `retrim fly`")
+    parser.add_argument("--port", type=int, default=19850, help="where it listens, on this machine")
+    parser.add_argument("--cut", type=float, nargs=2, help="seconds by rates until the link is cut, and for how long")
+    chosen = parser.parse_args()
+    peer = CrazyfliePeer(Scenario(chosen.disturbance, chosen.plant), port=chosen.port)
+    engaged = math.inf
+
+    def step() -> None:
+        nonlocal engaged
+        if peer.by_rates:
+            engaged = min(engaged, time.monotonic())
+        peer.cut = chosen.cut is not None and chosen.cut[0] <= time.monotonic() - engaged < sum(chosen.cut)
+        peer.step()
+
+    fly_until_interrupted(step, f"it listens at udp:127.0.0.1:{chosen.port}")
+    peer.close()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,125 @@
+"""A simulated vehicle with an autopilot's controller of its place: what a peer flies, whatever language it speaks."""
+
+import math
+import os
+import time
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..config.scenario import Scenario
+from ..onboard.guard import GeometricHover, Limits
+from ..onboard.realtime import be_punctual, sleep_until
+from ..physics.state import STANDARD_GRAVITY, Command, State
+from ..plants.bridges import frames
+from ..plants.plant import as_numpy
+
+DT = 0.01  # [s]
+GROUND = 0.05  # [m]
+
+
+class PeerVehicle:
+    """It stands at the origin until it lifts off. :meth:`step` is a hundredth of a second."""
+
+    def __init__(self, scenario: Scenario, *, heading: float, seed: int = 0) -> None:
+        """Build one.
+
+        Args:
+            scenario: Plant, vehicle and what disturbs the flight.
+            heading: Where its nose points, from east counter-clockwise [rad].
+            seed: Of the disturbance.
+        """
+        vehicle = scenario.make_vehicle("small")
+        self._plant = scenario.make("small", dt=DT, seed=seed)
+        c, s = math.cos(heading), math.sin(heading)
+        R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        self.x, self.omega = np.concatenate([np.zeros(3), R.ravel(), np.zeros(3)]), np.zeros(3)
+        """State p, R, v, and body rates."""
+        self.flies = False
+        low, high = (as_numpy(u).astype(float) for u in (vehicle.command_min, vehicle.command_max))
+        fence = np.full(3, 1e3)
+        self._hover = GeometricHover(Limits(-fence, fence, low, high), DT)
+        self.thrust_max = float(vehicle.thrust_max / vehicle.mass)
+        """What all motors can give, per mass [m/s^2]."""
+        self._place(0.0)
+        self._step_plant(np.array([STANDARD_GRAVITY, 0.0, 0.0, 0.0]))  # compiled before somebody waits for it
+
+    @property
+    def p(self) -> np.ndarray:
+        """Where it is [m]."""
+        return self.x[:3]
+
+    @property
+    def R(self) -> np.ndarray:
+        """Its attitude, body to world."""
+        return self.x[3:12].reshape(3, 3)
+
+    @property
+    def v(self) -> np.ndarray:
+        """Its velocity [m/s]."""
+        return self.x[12:]
+
+    def lift_off(self) -> None:
+        """Begin to fly, where it stands."""
+        self.flies = True
+        self._place(GROUND)
+
+    def step(self, u: np.ndarray) -> None:
+        """Fly a command [c, omega] for a tick."""
+        x = self._step_plant(u)
+        before, after = self.R, np.asarray(x.R, dtype=float)
+        turned = (before.T @ after - after.T @ before) / (2 * DT)
+        self.omega = np.array([turned[2, 1], turned[0, 2], turned[1, 0]])
+        self.x = np.concatenate([np.asarray(leaf, dtype=float).ravel() for leaf in (x.p, x.R, x.v)])
+
+    def stand(self) -> None:
+        """Be on the ground, upright, where it is."""
+        self.flies, self.omega = False, np.zeros(3)
+        yaw = frames.heading_of(self.R)
+        R = np.array([[math.cos(yaw), -math.sin(yaw), 0.0], [math.sin(yaw), math.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
+        self.x = np.concatenate([[*self.p[:2], 0.0], R.ravel(), np.zeros(3)])
+
+    def towards(self, place: np.ndarray, yaw: float) -> np.ndarray:
+        """Return the command [c, omega] that flies it to a place [m] and heading [rad]."""
+        u = self._hover.command(self.x, place)
+        wrong = yaw - frames.heading_of(self.R)
+        u[3] += np.clip(2.0 * math.atan2(math.sin(wrong), math.cos(wrong)), -1.0, 1.0)
+        return u
+
+    def forget(self) -> None:
+        """Forget what the controller of its place has learnt of the disturbance."""
+        self._hover.integral[:] = 0.0
+
+    def close(self) -> None:
+        """End the simulation."""
+        self._plant.stop()
+
+    def _place(self, z: float) -> None:
+        p = np.array([*self.p[:2], z])
+        self._plant.reset(State(*(jnp.asarray(a, jnp.result_type(float)) for a in (p, self.R, np.zeros(3)))))
+
+    def _step_plant(self, u: np.ndarray) -> State:
+        dtype = jnp.result_type(float)
+        return self._plant.step(Command(jnp.asarray(u[0], dtype), jnp.asarray(u[1:], dtype)))[0].x
+
+
+def fly_until_interrupted(step: Callable[[], None], address: str) -> None:
+    """Take a step every hundredth of a second, until Ctrl-C.
+
+    Args:
+        step: What to do.
+        address: Where it is reached, to be said.
+    """
+    jax.config.update("jax_cpu_enable_async_dispatch", False)
+    print(f"{address}; Ctrl-C ends it", flush=True)
+    be_punctual(25, os.sched_getaffinity(0))
+    began, tick = time.monotonic(), 0
+    try:
+        while True:
+            step()
+            tick = max(tick + 1, int((time.monotonic() - began) / DT))
+            sleep_until(began + tick * DT)
+    except KeyboardInterrupt:
+        return

@@ -1,0 +1,177 @@
+"""One end of CRTP: what it believes, whom it believes, and what it says."""
+
+import struct
+import time
+
+import numpy as np
+import pytest
+
+from made_up_wire import Wire
+from retrim import PlantError
+from retrim.plants.bridges import crtp
+from retrim.plants.bridges.crazyflie_link import STATES, STATUSES, CrazyflieLink
+from retrim.plants.bridges.crtp import Packet
+
+HERE, ELSEWHERE = ("127.0.0.1", 19850), ("127.0.0.1", 19851)
+UPRIGHT = np.eye(3)
+
+
+@pytest.fixture
+def wire():
+    made = Wire()
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def link(wire):
+    return CrazyflieLink(wire, HERE)
+
+
+def sent(wire):
+    return [crtp.unpacked(data) for data, _ in wire.sent]
+
+
+def says(wire, link, block, ms, values, sender=HERE):
+    packet = Packet(crtp.LOG, crtp.DATA, bytes([block]) + (ms % (1 << 24)).to_bytes(3, "little") + values)
+    wire.inbox.append((packet.pack(), sender))
+    link.pump(0.0)
+
+
+def state(p=(0.0, 0.0, 1.0), v=(0.0, 0.0, 0.0), omega=(0.0, 0.0, 0.0)):
+    return crtp.state_values(np.array(p), UPRIGHT, np.array(v), np.array(omega))
+
+
+def test_a_state_is_read_in_our_frames(wire, link):
+    says(wire, link, STATES, 1000, state((1.0, -2.0, 0.5), (0.1, 0.2, 0.3), (0.4, 0.5, 0.6)))
+    x = link.reading
+    np.testing.assert_allclose(x.p, [1.0, -2.0, 0.5], atol=1e-3)
+    np.testing.assert_allclose(x.v, [0.1, 0.2, 0.3], atol=1e-3)
+    np.testing.assert_allclose(x.omega, [0.4, 0.5, 0.6], atol=1e-3)
+    assert 0.0 <= time.monotonic() - x.stamp < 0.5
+
+
+def test_a_state_that_was_late_is_as_old_as_it_says(wire, link):
+    says(wire, link, STATES, 1000, state())
+    time.sleep(0.05)
+    says(wire, link, STATES, 1010, state())
+    assert time.monotonic() - link.reading.stamp == pytest.approx(0.04, abs=0.02)
+
+
+def test_its_time_may_begin_anew_after_four_hours(wire, link):
+    says(wire, link, STATES, (1 << 24) - 5, state())
+    says(wire, link, STATES, (1 << 24) + 5, state((0.1, 0.0, 1.0)))
+    assert link.reading.p[0] == pytest.approx(0.1)
+    assert link.ignored == 0
+
+
+def test_what_was_overtaken_is_not_taken_back(wire, link):
+    says(wire, link, STATES, 1010, state((0.1, 0.0, 1.0)))
+    says(wire, link, STATES, 1000, state((0.0, 0.0, 1.0)))
+    assert link.reading.p[0] == pytest.approx(0.1)
+
+
+def test_a_leap_is_not_believed_while_there_are_states_and_is_afterwards(wire, link):
+    says(wire, link, STATES, 1000, state())
+    says(wire, link, STATES, 1010, state((5.0, 0.0, 1.0)))
+    assert (link.reading.p[0], link.ignored) == (0.0, 1)
+    time.sleep(0.6)
+    says(wire, link, STATES, 1610, state((5.0, 0.0, 1.0)))
+    assert link.reading.p[0] == pytest.approx(5.0)
+
+
+def test_a_status_is_read(wire, link):
+    says(wire, link, STATUSES, 1000, crtp.status_values(crtp.Status(30_000.0, crtp.ARMED | crtp.CAN_FLY, 3.9)))
+    assert link.status.info & crtp.ARMED
+    assert list(link.thrusts) == [30_000.0]
+
+
+def test_of_2000_damaged_packets_none_is_believed(wire, link):
+    """Random ones, cut ones, ones of strangers, and logs of right length with random content."""
+    rng = np.random.default_rng(0)
+    says(wire, link, STATES, 5_000_000, state())
+    says(wire, link, STATUSES, 5_000_000, crtp.status_values(crtp.Status(1.0, 0, 3.9)))
+    good = Packet(crtp.LOG, crtp.DATA, bytes([STATES]) + (5_000_010).to_bytes(3, "little") + state((9.0, 9.0, 9.0)))
+    before, heard = link.reading, link.heard
+    for k in range(2000):
+        kind = k % 4
+        if kind == 0:
+            data = rng.bytes(int(rng.integers(0, 40)))
+            data = data if len(data) == 0 or (data[0] >> 4, data[0] & 3) != (crtp.CONSOLE, 0) else b""
+        elif kind == 1:
+            data = good.pack()[: int(rng.integers(0, len(good.pack())))]
+        elif kind == 2:
+            data = good.pack()
+        else:
+            data = Packet(crtp.LOG, crtp.DATA, bytes([1 + k // 4 % 2]) + rng.bytes(3 + 22)).pack()
+        wire.inbox.append((data, ELSEWHERE if kind == 2 else HERE))
+        link.pump(0.0)
+    assert link.reading is before
+    assert link.status.thrust == 1.0
+    assert link.heard >= heard
+    assert link.ignored > 1400  # the others were of ports that nobody listens to
+    says(wire, link, STATES, 5_000_020, state((0.1, 0.0, 1.0)))
+    assert link.reading.p[0] == pytest.approx(0.1)
+
+
+def firmware(names, *, version=12, refuses=0):
+    """What answers like one, to the questions of a start."""
+
+    def answer(data):
+        packet = answered(crtp.unpacked(data))
+        return None if packet is None else packet.pack()
+
+    def answered(packet):
+        port, channel, body = packet
+        if (port, channel) == (crtp.PLATFORM, 1):
+            return packet._replace(body=bytes([0, version]))
+        if (port, channel) == (crtp.LOG, crtp.TOC) and body[0] == crtp.INFO:
+            return packet._replace(body=struct.pack("<BHIBB", crtp.INFO, len(names), 1, 16, 128))
+        if (port, channel) == (crtp.LOG, crtp.TOC):
+            name = names[int.from_bytes(body[1:3], "little")].encode().replace(b".", b"\0") + b"\0"
+            return packet._replace(body=body[:3] + b"\5" + name)
+        if (port, channel) == (crtp.LOG, crtp.CONTROL):
+            return packet._replace(body=body[:2].ljust(2, b"\0") + bytes([refuses if body[0] == crtp.START else 0]))
+        return None
+
+    return answer
+
+
+def test_logs_are_asked_for_by_the_numbers_of_their_names(wire, link):
+    names = ["other.one", *reversed(crtp.STATE_LOG), "other.two", *crtp.STATUS_LOG, "other.three"]
+    wire.answer = firmware(names)
+    link.start_logs(1.0, lambda: True)
+    made = [packet.body for packet in sent(wire) if (packet.port, packet.channel) == (crtp.LOG, crtp.CONTROL)]
+    listed = [
+        n for body in made if body[0] in (crtp.CREATE, crtp.APPEND) for _, n in struct.iter_unpack("<BH", body[2:])
+    ]
+    assert [names[n] for n in listed] == [*crtp.STATE_LOG, *crtp.STATUS_LOG]
+    assert [body for body in made if body[0] == crtp.START] == [bytes([3, 1, 1]), bytes([3, 2, 5])]
+    assert link.version == 12
+    asked = [packet.body for packet in sent(wire) if packet[:2] == (crtp.LOG, crtp.TOC) and packet.body[0] == crtp.ITEM]
+    assert len(asked) == len(names) - 1  # no further than they are
+
+
+@pytest.mark.parametrize(
+    ("answer", "why"),
+    [
+        (lambda data: None, "does not answer on port 13 in 0.3 s"),
+        (firmware([*crtp.STATE_LOG, "pm.vbat"]), "logs no stabilizer.thrust, supervisor.info; its firmware is too old"),
+        (firmware([*crtp.STATE_LOG, *crtp.STATUS_LOG], refuses=12), "refuses a block of its log: error 12"),
+    ],
+)
+def test_what_cannot_be_logged_is_named(wire, link, answer, why):
+    wire.answer = answer
+    with pytest.raises(PlantError, match=why):
+        link.start_logs(0.3, lambda: True)
+
+
+def test_giving_up_is_noticed_while_nobody_answers(link):
+    with pytest.raises(PlantError, match="given up"):
+        link.start_logs(5.0, lambda: False)
+
+
+def test_its_words_are_kept(wire, link):
+    wire.inbox.append((Packet(crtp.CONSOLE, 0, b"SYS: low \nbattery\n").pack(), HERE))
+    link.pump(0.0)
+    assert link.said() == "; it said: SYS: low battery"
