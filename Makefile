@@ -72,12 +72,13 @@ test-betaflight: betaflight
 	unshare --net $$(test "$$(id -u)" = 0 || echo --map-root-user) \
 		sh -c 'ip link set lo up && exec $(BIN)/pytest -n 0 -s -m betaflight'
 
-# Buses and whole flights over ROS 1 with a real rosmaster, which is installed if there is none, and over zenoh between
+# Buses, vehicles and whole flights over ROS 1 with a real rosmaster, installed if there is none, and over zenoh between
 # two network namespaces, which takes the rights of root.
 test-ros: dev
-	command -v rosmaster >/dev/null || apt-get install --yes --no-install-recommends python3-rospy python3-rosmaster python3-std-msgs
+	command -v rosmaster >/dev/null || apt-get install --yes --no-install-recommends \
+		python3-rospy python3-rosmaster python3-std-msgs python3-nav-msgs python3-geometry-msgs
 	$(BIN)/pytest -n 0 tests/transport/test_bus.py tests/onboard/test_noise_on_buses.py
-	$(BIN)/pytest -n 0 -m slow tests/live/test_two_machines.py
+	$(BIN)/pytest -n 0 -m slow tests/live/test_two_machines.py tests/live/test_ros_vehicle.py
 
 bench: setup
 	$(BIN)/retrim bench

@@ -125,6 +125,8 @@ def test_a_port_that_is_taken_is_named():
         "mavlink:serial:/dev/ttyACM0:921600",
         "crazyflie",
         "crazyflie:udp:10.0.0.7:19850",
+        "ros",
+        "ros:10.0.0.7:11311/quad1/mavros",
     ],
 )
 def test_a_vehicle_is_known_by_its_name_and_address(plant):
@@ -156,6 +158,14 @@ def test_what_a_vehicle_cannot_be_asked_is_refused_before_it_flies(asked, why):
 def test_a_wrong_address_is_named_before_it_flies(address):
     with pytest.raises(ConfigError, match="expected udp:HOST:PORT"):
         Scenario(plant=f"mavlink:{address}")
+
+
+@pytest.mark.parametrize(
+    "address", ["11311", "10.0.0.7:0", "10.0.0.7:70000", "10.0.0.7:11311/", "http://10.0.0.7:11311"]
+)
+def test_a_wrong_rosmaster_is_named_before_it_flies(address):
+    with pytest.raises(ConfigError, match="expected HOST:PORT of a rosmaster"):
+        Scenario(plant=f"ros:{address}")
 
 
 def test_a_crazyflie_is_not_reached_by_a_serial_line():

@@ -13,6 +13,7 @@ from ..plants.bridges.crazyflie import CrazyfliePlant
 from ..plants.bridges.crazyflie import check_address as check_crazyflie
 from ..plants.bridges.endpoint import address_of
 from ..plants.bridges.mavlink import ADDRESS, MavlinkPlant
+from ..plants.bridges.ros import RosPlant, parts_of
 from ..plants.crazyflow import CrazyflowPlant
 from ..plants.mujoco import MujocoPlant
 from ..plants.plant import Plant, as_numpy
@@ -112,6 +113,11 @@ def _crazyflie(r: PlantRequest) -> Plant:
     return CrazyfliePlant(r.address, r.dt, low, high)
 
 
+def _ros(r: PlantRequest) -> Plant:
+    low, high = (as_numpy(u).astype(float) for u in (r.vehicle.command_min, r.vehicle.command_max))
+    return RosPlant(r.address, r.dt, low, high, float(r.vehicle.thrust_max / r.vehicle.mass))
+
+
 def _betaflight(r: PlantRequest) -> Plant:
     low, high = (as_numpy(u).astype(float) for u in (r.vehicle.command_min, r.vehicle.command_max))
     return BetaflightPlant(BemQuadrotor.of(r.vehicle, r.dt, thrust_error=r.thrust_error), r.disturbance, low, high)
@@ -181,6 +187,15 @@ register_plant(
         "a Crazyflie, or a simulated one, by CRTP over UDP",
         is_vehicle=True,
         check_address=check_crazyflie,
+    ),
+)
+register_plant(
+    "ros",
+    PlantEntry(
+        _ros,
+        "a vehicle behind ROS 1: odometry or poses in, attitude targets out, as mavros has them",
+        is_vehicle=True,
+        check_address=parts_of,
     ),
 )
 register_plant(

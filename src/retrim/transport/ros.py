@@ -1,21 +1,11 @@
-"""A bus by ROS 1, the paper's transport: latched topics of bytes, and a rosmaster that knows who is where.
+"""A bus by ROS 1, the paper's transport: latched topics of bytes, and a rosmaster that knows who is where."""
 
-rospy comes with the system (Debian: ``python3-rospy``), not from a package index; no other file imports it.
-"""
-
-import os
-import socket
-import sys
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
-from urllib.parse import urlparse
 
-from ..errors import ConfigError
+from ..rospy_node import join, system_module
 from .network import NetworkBus
 
-SYSTEM = Path("/usr/lib/python3/dist-packages")
-"""Where Debian puts packages; a virtual environment does not look there."""
 PREFIX = "/retrim"
 
 
@@ -32,18 +22,9 @@ class RosBus(NetworkBus):
         Raises:
             ConfigError: rospy is not installed, or there is no master.
         """
-        address = urlparse(master)
-        try:
-            socket.create_connection((address.hostname or "", address.port or 11311), 5.0).close()
-        except OSError as error:
-            raise ConfigError(f"ROS: no rosmaster at {master!r} ({error})") from error
-        os.environ["ROS_MASTER_URI"] = master
-        if address.hostname in ("127.0.0.1", "localhost"):  # otherwise its sockets listen everywhere
-            os.environ["ROS_IP"] = "127.0.0.1"
-        rospy, message = _rospy()
+        rospy, message = join(master), system_module("std_msgs.msg").UInt8MultiArray
         super().__init__(capacities)
         self._rospy, self._message = rospy, message
-        rospy.init_node("retrim", anonymous=True, disable_signals=True, disable_rosout=True, disable_rostime=True)
         self._publishers: dict[str, Any] = {}
         self._subscribers = [
             rospy.Subscriber(_name(topic), message, self._listener(topic), queue_size=1, tcp_nodelay=True,
@@ -65,18 +46,6 @@ class RosBus(NetworkBus):
 
     def _listener(self, topic: str) -> Any:
         return lambda message: self._received(topic, bytes(message.data))
-
-
-def _rospy() -> tuple[Any, Any]:
-    """Return rospy and the type of messages; the system's packages come after ours."""
-    if str(SYSTEM) not in sys.path and SYSTEM.is_dir():
-        sys.path.append(str(SYSTEM))
-    try:
-        import rospy
-        from std_msgs.msg import UInt8MultiArray
-    except ImportError as error:
-        raise ConfigError(f"a bus by ROS 1 needs rospy from the system: apt install python3-rospy ({error})") from error
-    return rospy, UInt8MultiArray
 
 
 def _name(topic: str) -> str:

@@ -1,0 +1,158 @@
+"""A node of ROS 1 that hears where a vehicle is, and says how it shall fly; topics are those of mavros.
+
+Nothing here decides who flies; :mod:`.ros` does.
+"""
+
+import math
+import time
+from typing import Any
+
+import numpy as np
+
+from ...rospy_node import join, system_module
+from .clock import ArrivalClock
+from .vehicle_state import Reading
+
+ODOMETRY, POSE, TARGET = "local_position/odom", "local_position/pose", "setpoint_raw/attitude"
+RATES_ONLY = 128  # type_mask of an AttitudeTarget: the attitude does not count
+FRESH_S = 0.5  # [s] without odometry, after which poses are made do with
+SMOOTH_S = 0.03  # [s] over which velocities that follow from poses are smoothed
+ATTITUDE_TARGET = """std_msgs/Header header
+uint8 type_mask
+uint8 IGNORE_ROLL_RATE = 1
+uint8 IGNORE_PITCH_RATE = 2
+uint8 IGNORE_YAW_RATE = 4
+uint8 IGNORE_THRUST = 64
+uint8 IGNORE_ATTITUDE = 128
+geometry_msgs/Quaternion orientation
+geometry_msgs/Vector3 body_rate
+float32 thrust
+================================================================================
+MSG: std_msgs/Header
+uint32 seq
+time stamp
+string frame_id
+================================================================================
+MSG: geometry_msgs/Quaternion
+float64 x
+float64 y
+float64 z
+float64 w
+================================================================================
+MSG: geometry_msgs/Vector3
+float64 x
+float64 y
+float64 z
+"""
+"""The fields of mavros_msgs/AttitudeTarget, by whose checksum nodes know each other; Debian has no mavros."""
+
+
+def attitude_target() -> Any:
+    """Return the type mavros_msgs/AttitudeTarget.
+
+    Raises:
+        ConfigError: genpy is not installed.
+    """
+    made = system_module("genpy.dynamic").generate_dynamic("mavros_msgs/AttitudeTarget", ATTITUDE_TARGET)
+    return made["mavros_msgs/AttitudeTarget"]
+
+
+class RosLink:
+    """Subscribes to odometry and poses, and publishes attitude targets; callbacks come in threads of rospy's."""
+
+    def __init__(self, master: str, namespace: str) -> None:
+        """Join.
+
+        Args:
+            master: Where the rosmaster is, as ``http://127.0.0.1:11311``.
+            namespace: What names of topics begin with, as ``/mavros``.
+
+        Raises:
+            ConfigError: ROS is not installed, or there is no master.
+        """
+        rospy = join(master)
+        self._rospy, self._target = rospy, attitude_target()
+        self._clock, self._odometry_at = ArrivalClock(), -math.inf
+        self.reading: Reading | None = None
+        self.heard = -math.inf
+        """When a state that makes sense came last, monotonic clock [s]."""
+        self.ignored = 0
+        """States that make no sense."""
+        odometry, pose = system_module("nav_msgs.msg").Odometry, system_module("geometry_msgs.msg").PoseStamped
+        self._ends = [
+            rospy.Subscriber(f"{namespace}/{topic}", kind, take, queue_size=1, tcp_nodelay=True)
+            for topic, kind, take in ((ODOMETRY, odometry, self._odometry), (POSE, pose, self._pose))
+        ]
+        self._publisher = rospy.Publisher(f"{namespace}/{TARGET}", self._target, queue_size=1, tcp_nodelay=True)
+        self._ends.append(self._publisher)
+
+    def fly_rates(self, thrust: float, omega: np.ndarray) -> None:
+        """Publish an AttitudeTarget.
+
+        Args:
+            thrust: Share of the motors' thrust, 0 to 1.
+            omega: Body rates, ours, which are those of ROS: forward, left, up [rad/s].
+        """
+        target = self._target()
+        target.header.stamp = self._rospy.Time.from_sec(time.time())
+        target.type_mask, target.thrust, target.orientation.w = RATES_ONLY, float(thrust), 1.0
+        target.body_rate.x, target.body_rate.y, target.body_rate.z = map(float, omega)
+        self._publisher.publish(target)
+
+    def close(self) -> None:
+        """Leave the topics; the node stays as long as the process."""
+        for end in self._ends:
+            end.unregister()
+
+    def _odometry(self, message: Any) -> None:
+        """Take nav_msgs/Odometry: pose in its frame, twist in its child's frame, the body, unless that is the same."""
+        twist, pose = message.twist.twist, message.pose.pose
+        v, omega = (np.array([a.x, a.y, a.z]) for a in (twist.linear, twist.angular))
+        found = _pose(pose)
+        if found is None or not np.isfinite(np.concatenate([v, omega])).all():
+            self.ignored += 1
+            return
+        p, R = found
+        self._odometry_at = time.monotonic()
+        in_world = message.child_frame_id in ("", message.header.frame_id)
+        self._take(message.header.stamp.to_sec(), p, R, v if in_world else R @ v, R.T @ omega if in_world else omega)
+
+    def _pose(self, message: Any) -> None:
+        """Take geometry_msgs/PoseStamped, where no odometry comes: velocities follow from two of them, smoothed."""
+        from scipy.spatial.transform import Rotation  # here: it takes as long to import as all of retrim
+
+        found, last = _pose(message.pose), self.reading
+        if found is None:
+            self.ignored += 1
+            return
+        if time.monotonic() - self._odometry_at < FRESH_S:
+            return
+        p, R = found
+        stamp = message.header.stamp.to_sec()
+        here = self._clock.here(stamp)
+        if last is None or here is None or not 1e-4 < (dt := here - last.stamp) < FRESH_S:
+            self._take(stamp, p, R, np.zeros(3), np.zeros(3))
+            return
+        new = dt / (dt + SMOOTH_S)
+        v = last.v + new * ((p - last.p) / dt - last.v)
+        omega = last.omega + new * (Rotation.from_matrix(last.R.T @ R).as_rotvec() / dt - last.omega)
+        self._take(stamp, p, R, v, omega)
+
+    def _take(self, stamp: float, p: np.ndarray, R: np.ndarray, v: np.ndarray, omega: np.ndarray) -> None:
+        now = time.monotonic()
+        self._clock.arrived(stamp, now)
+        here = self._clock.here(stamp)
+        assert here is not None
+        if self.reading is None or here >= self.reading.stamp or now - self.heard > FRESH_S:
+            self.reading, self.heard = Reading(here, p, R, v, omega), now
+
+
+def _pose(pose: Any) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return place and attitude of geometry_msgs/Pose; None if it makes no sense."""
+    from scipy.spatial.transform import Rotation  # here, likewise
+
+    p, q = pose.position, pose.orientation
+    place, quaternion = np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w])
+    if not np.isfinite(np.concatenate([place, quaternion])).all() or not 0.5 < quaternion @ quaternion < 2.0:
+        return None
+    return place, Rotation.from_quat(quaternion).as_matrix()

@@ -1,0 +1,97 @@
+"""A peer behind ROS 1 that flies the plant ``bem``: for tests, and to try a node without a vehicle.
+
+``python -m retrim.testing.ros_peer http://127.0.0.1:11311 --disturbance large`` flies until Ctrl-C: it goes to the
+start, publishes odometry, or poses alone, follows attitude targets while they come, and holds its place when they stop.
+"""
+
+import argparse
+import math
+import time
+from typing import Any
+
+import numpy as np
+
+from ..config.scenario import Scenario
+from ..plants.bridges.ros import NAMESPACE
+from ..plants.bridges.ros_link import ODOMETRY, POSE, TARGET, attitude_target
+from ..rospy_node import join, system_module
+from .peer_vehicle import PeerVehicle, fly_until_interrupted
+
+FRESH_S = 0.3  # [s] for which a target counts
+
+
+class RosPeer:
+    """A vehicle, and who flies it. :meth:`step` is a hundredth of a second of both."""
+
+    def __init__(self, master: str, scenario: Scenario, *, place: np.ndarray, yaw: float, poses: bool = False) -> None:
+        """Build one that is about to take off.
+
+        Args:
+            master: Where the rosmaster is.
+            scenario: Plant, vehicle and what disturbs the flight.
+            place: Where it waits, world [m].
+            yaw: Its heading there [rad].
+            poses: Whether it publishes poses, and no odometry.
+        """
+        rospy = join(master)
+        self._rospy, self._poses = rospy, poses
+        self._kind = system_module("geometry_msgs.msg").PoseStamped if poses else system_module("nav_msgs.msg").Odometry
+        self._publisher = rospy.Publisher(
+            f"{NAMESPACE}/{POSE if poses else ODOMETRY}", self._kind, queue_size=1, tcp_nodelay=True
+        )
+        rospy.Subscriber(f"{NAMESPACE}/{TARGET}", attitude_target(), self._heard, queue_size=1, tcp_nodelay=True)
+        self.vehicle = PeerVehicle(scenario, heading=0.0)
+        self._place, self._yaw = place, yaw
+        self._told, self._u, self._by_rates = -math.inf, np.zeros(4), False
+        self.vehicle.lift_off()
+
+    def step(self) -> None:
+        """Fly for a tick, and say how it went."""
+        fresh = time.monotonic() - self._told < FRESH_S
+        if self._by_rates and not fresh:
+            self._place = self.vehicle.p.copy()
+            self.vehicle.forget()
+        self._by_rates = fresh
+        self.vehicle.step(self._u if fresh else self.vehicle.towards(self._place, self._yaw))
+        self._say()
+
+    def _heard(self, target: Any) -> None:
+        rate = target.body_rate
+        self._u = np.array([target.thrust * self.vehicle.thrust_max, rate.x, rate.y, rate.z])
+        self._told = time.monotonic()
+
+    def _say(self) -> None:
+        from scipy.spatial.transform import Rotation  # here: it takes as long to import as all of retrim
+
+        x, message = self.vehicle, self._kind()
+        message.header.stamp = self._rospy.Time.from_sec(time.time())
+        message.header.frame_id = "map"
+        pose = message.pose if self._poses else message.pose.pose
+        pose.position.x, pose.position.y, pose.position.z = map(float, x.p)
+        q = Rotation.from_matrix(x.R).as_quat()
+        pose.orientation.x, pose.orientation.y, pose.orientation.z, pose.orientation.w = map(float, q)
+        if not self._poses:
+            message.child_frame_id = "base_link"
+            twist, v = message.twist.twist, x.R.T @ x.v
+            twist.linear.x, twist.linear.y, twist.linear.z = map(float, v)
+            twist.angular.x, twist.angular.y, twist.angular.z = map(float, x.omega)
+        self._publisher.publish(message)
+
+
+def main() -> None:
+    """Fly until Ctrl-C."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("master", help="where the rosmaster is, as http://127.0.0.1:11311")
+    parser.add_argument("--disturbance", default="none", help="as for `retrim fly`")
+    parser.add_argument("--plant", default="bem", help="as for `retrim fly`")
+    parser.add_argument("--place", type=float, nargs=3, default=(0.0, 0.0, 1.0), help="where it waits [m]")
+    parser.add_argument("--yaw", type=float, default=0.0, help="its heading there [rad]")
+    parser.add_argument("--poses", action="store_true", help="poses alone, no odometry")
+    chosen = parser.parse_args()
+    scenario = Scenario(chosen.disturbance, chosen.plant)
+    peer = RosPeer(chosen.master, scenario, place=np.array(chosen.place), yaw=chosen.yaw, poses=chosen.poses)
+    fly_until_interrupted(peer.step, f"it is at {chosen.master}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,76 @@
+"""A vehicle behind ROS 1: conformance, and a whole flight that adapts. `make test-ros` installs ROS and runs them."""
+
+import contextlib
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from retrim import PlantError, Scenario, testing
+from retrim.experiments.latency import rosmaster
+from retrim.onboard.guard import Mode
+from retrim.onboard.recorder import read_log
+from retrim.plants.bridges import ros
+from retrim.plants.bridges.ros_link import attitude_target
+from retrim.testing.vehicle import HEADING
+
+pytestmark = pytest.mark.slow
+RETRIM = [sys.executable, "-m", "retrim.cli"]
+
+
+@pytest.fixture(scope="module")
+def master():
+    with rosmaster() as found:
+        if found is None:
+            pytest.skip("needs rosmaster and rospy: make test-ros installs them")
+        yield f"{found.host}:{found.port}"
+
+
+@contextlib.contextmanager
+def peer(master, *words):
+    command = [sys.executable, "-m", "retrim.testing.ros_peer", f"http://{master}", *words]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    try:
+        assert "Ctrl-C ends it" in process.stdout.readline()
+        yield process
+    finally:
+        process.kill()
+        process.wait(10.0)
+        process.stdout.close()
+
+
+def test_targets_are_those_of_mavros(master):
+    assert attitude_target()._md5sum == "456f3af666b22ccd0222ea053a86b548"
+
+
+@pytest.mark.parametrize("more", [(), ("--poses",)], ids=["odometry", "poses alone"])
+def test_it_is_a_link_to_a_vehicle(master, more):
+    place = (0.3, -0.2, 1.5)
+    with peer(master, "--plant", "simple", "--place", *map(str, place), "--yaw", str(HEADING), *more):
+        testing.check_vehicle(lambda: Scenario(plant=f"ros:{master}").make("small"), place=place)
+
+
+def test_nobody_there_is_named(master, monkeypatch):
+    monkeypatch.setattr(ros, "HEARD_S", 0.3)
+    plant, why = Scenario(plant=f"ros:{master}/elsewhere").make("small"), r"neither /elsewhere/.* came in 0\.3 s"
+    with plant, pytest.raises(PlantError, match=why):
+        plant.connect()
+
+
+def test_a_flight_adapts_under_a_large_disturbance(master, tmp_path):
+    policy, flight = tmp_path / "policy", tmp_path / "flight"
+    words = [*RETRIM, "pretrain", "hover", "--preset", "hover/retrim", "--out", str(policy)]
+    subprocess.run(words, check=True, capture_output=True, timeout=300)
+    with peer(master, "--disturbance", "large"):
+        words = [*RETRIM, "live", "--policy", str(policy), "--plant", f"ros:{master}", "--seconds", "20"]
+        ran = subprocess.run([*words, "--out", str(flight)], capture_output=True, text=True, timeout=240)
+    assert ran.returncode == 0, ran.stdout
+    figures = {row["metric"]: row["value"] for row in json.loads((flight / "results.json").read_text())["rows"]}
+    rows = read_log(flight / "flight.csv")
+    late = rows[(rows[:, 1] > 15.0) & (rows[:, -1] == Mode.POLICY)]
+    assert "flight over: landed" in ran.stdout
+    assert figures["policies"] > 10
+    assert figures["refused_messages"] == 0
+    assert np.linalg.norm(late[:, 3:6] - [0.0, 0.0, 1.0], axis=1).mean() < 0.05
