@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 
 from helpers import random_state
-from retrim import PlantError
+from retrim import PlantError, load
 from retrim.config import PRESETS, Scenario, Setup
 from retrim.control import AbstractController
+from retrim.experiments.asked import Where
 from retrim.physics import Command, Constant, State, small, so3
 from retrim.plants import Plant, crazyflow
 from retrim.plants.crazyflow import CrazyflowPlant
@@ -281,6 +282,19 @@ def test_missing_extra_names_the_command_that_installs_it(name, monkeypatch):
     with pytest.raises(PlantError, match=wanted) as error:
         PLANTS[name]("none")
     assert isinstance(error.value.__cause__, ImportError)
+
+
+@pytest.mark.parametrize("name", [*EXTRAS, "mavlink"])
+def test_missing_extra_is_named_before_anything_is_trained(name, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pymavlink" if name == "mavlink" else name, None)
+    with pytest.raises(PlantError, match=rf"plant '{name}' needs the package .*`uv pip install -e '\.\[{name}\]'`"):
+        Where(plant=name, disturbance="none").scenario(load("hover/retrim"))
+
+
+def test_missing_firmware_is_named_before_anything_is_trained(monkeypatch):
+    monkeypatch.setenv("RETRIM_BETAFLIGHT", "/nowhere")
+    with pytest.raises(PlantError, match="RETRIM_BETAFLIGHT=/nowhere: no program"):
+        Where(plant="betaflight").scenario(load("hover/retrim"))
 
 
 def python(code):

@@ -9,17 +9,20 @@ from ..physics.disturbance import Disturbance
 from ..physics.rotors import LinearDragQuadrotor
 from ..physics.vehicle import Vehicle
 from ..plants.bridges.betaflight import BetaflightPlant
+from ..plants.bridges.betaflight_firmware import find_firmware
 from ..plants.bridges.crazyflie import CrazyfliePlant
 from ..plants.bridges.crazyflie import check_address as check_crazyflie
 from ..plants.bridges.endpoint import address_of
 from ..plants.bridges.mavlink import ADDRESS, MavlinkPlant
 from ..plants.bridges.ros import RosPlant, parts_of
 from ..plants.crazyflow import CrazyflowPlant
+from ..plants.extras import check_extra
 from ..plants.mujoco import MujocoPlant
 from ..plants.plant import Plant, as_numpy
 from ..plants.rotorpy import RotorpyPlant
 from ..plants.sensors import SensorModel
 from ..plants.sim import SimPlant
+from ..rospy_node import system_module
 from .registry import Registry
 
 DELAY = 0.02  # [s], of commands, where a scenario may choose it
@@ -66,6 +69,8 @@ class PlantEntry:
     """Whether the world around a vehicle is simulated here, and can be disturbed."""
     check_address: Callable[[str], object] | None = None
     """Raises ConfigError for what follows a vehicle's name, if it is no address; None: anything may."""
+    needs: Callable[[], object] | None = None
+    """Raises an error if a program or package is not there; asked before anything is trained. None: it needs none."""
 
 
 PLANTS: Registry[PlantEntry] = Registry("plant", example="module:name of a PlantEntry")
@@ -154,6 +159,7 @@ register_plant(
         lambda r: RotorpyPlant(r.disturbance, dt=r.dt),
         "rotorpy's aerodynamics, motors and rate loop, one tick of command delay",
         own_vehicle="hummingbird",
+        needs=lambda: check_extra("rotorpy", "rotorpy"),
     ),
 )
 register_plant(
@@ -161,6 +167,7 @@ register_plant(
     PlantEntry(
         lambda r: MujocoPlant(r.vehicle, r.disturbance, dt=r.dt),
         "a body in MuJoCo's medium, one tick of command delay",
+        needs=lambda: check_extra("mujoco", "mujoco"),
     ),
 )
 register_plant(
@@ -169,6 +176,7 @@ register_plant(
         lambda r: CrazyflowPlant(r.disturbance, dt=r.dt),
         "crazyflow's identified Crazyflie, one tick of command delay",
         own_vehicle="cf21B_500",
+        needs=lambda: check_extra("crazyflow", "crazyflow"),
     ),
 )
 register_plant(
@@ -178,6 +186,7 @@ register_plant(
         "a vehicle, or a simulation, that PX4 flies",
         is_vehicle=True,
         check_address=lambda address: address_of(address or ADDRESS),
+        needs=lambda: check_extra("pymavlink", "mavlink", package="pymavlink"),
     ),
 )
 register_plant(
@@ -196,6 +205,7 @@ register_plant(
         "a vehicle behind ROS 1: odometry or poses in, attitude targets out, as mavros has them",
         is_vehicle=True,
         check_address=parts_of,
+        needs=lambda: system_module("rospy"),
     ),
 )
 register_plant(
@@ -207,5 +217,6 @@ register_plant(
         is_vehicle=True,
         has_world=True,
         check_address=_no_address,
+        needs=find_firmware,
     ),
 )

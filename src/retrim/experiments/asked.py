@@ -55,7 +55,8 @@ class Where:
     plant: str = "bem"
     """bem: blade-element rotors; simple: rotors with linear drag; rotorpy, mujoco, crazyflow: independent simulators,
     each an extra to install; betaflight: its firmware as the rate controller, in real time;
-    mavlink:udp:HOST:PORT or mavlink:serial:DEVICE:BAUD: a vehicle; or module:name."""
+    mavlink:udp:HOST:PORT, mavlink:serial:DEVICE:BAUD, crazyflie:udp:HOST:PORT, ros:HOST:PORT: a vehicle; or
+    module:name."""
     reference: str | None = None
     """What a tracking policy follows: circle, figure8, star, module:name or a CSV file of t, x, y, z[, yaw]; what it
     was trained on by default. A closed file repeats as laps, another is flown once; my.csv:laps and my.csv:once insist.
@@ -82,11 +83,15 @@ class Where:
 
         Raises:
             ConfigError: Something does not exist, or does not fit together.
+            PlantError: What the plant needs is not installed.
         """
         usual = "none" if self.is_vehicle else "large"
         follows = flown_reference(preset, self.reference)
-        return Scenario(self.disturbance or usual, self.plant, self.vehicle, self.sensors, self.thrust_error, follows,
-                        self.delay)  # fmt: skip
+        scenario = Scenario(self.disturbance or usual, self.plant, self.vehicle, self.sensors, self.thrust_error,
+                            follows, self.delay)  # fmt: skip
+        if scenario.entry.needs is not None:
+            scenario.entry.needs()
+        return scenario
 
 
 def with_residual(preset: Preset, residual: str | None, state: LearnerState | None) -> Preset:

@@ -2,6 +2,7 @@
 
 import contextlib
 import importlib
+import importlib.util
 import io
 from types import ModuleType
 
@@ -25,9 +26,28 @@ def import_extra(module: str, name: str, *, package: str | None = None, kind: st
         with contextlib.redirect_stdout(io.StringIO()):  # mujoco.mjx prints which accelerators it did not find
             return importlib.import_module(module)
     except ImportError as error:
-        raise PlantError(
-            f"{kind} {name!r} needs the package {package or name!r} ({error}); in a checkout: `make dev`, or "
-            f"`uv pip install -e '.[{name}]'`; elsewhere: `pip install {package or name}`"
-        ) from error
+        raise _missing(name, package, kind, str(error)) from error
     except RuntimeError as error:
         raise PlantError(f"plant {name}: {' '.join(str(error).split())}") from error
+
+
+def check_extra(module: str, name: str, *, package: str | None = None) -> None:
+    """Check that a plant's package is there, without the time that an import takes.
+
+    Args:
+        module: Its module.
+        name: The extra, which is the plant's name, too.
+        package: Its name in the registry of packages; that of the extra by default.
+
+    Raises:
+        PlantError: It is not, with the command that installs it.
+    """
+    if importlib.util.find_spec(module) is None:
+        raise _missing(name, package, "plant", f"No module named {module!r}")
+
+
+def _missing(name: str, package: str | None, kind: str, why: str) -> PlantError:
+    return PlantError(
+        f"{kind} {name!r} needs the package {package or name!r} ({why}); in a checkout: `make dev`, or "
+        f"`uv pip install -e '.[{name}]'`; elsewhere: `pip install {package or name}`"
+    )
