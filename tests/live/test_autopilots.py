@@ -205,19 +205,20 @@ class Changes:
 def test_px4_hovers_and_a_load_and_a_weak_battery_are_felt_for_less_than_three_seconds(tmp_path_factory, tmp_path):
     policy = trained(tmp_path_factory, "hover", "--vehicle", SIH)
     with started("retrim.testing.px4", PX4):
-        changes, flight = Changes(), live(policy, ADDRESS, tmp_path, seconds=50)
+        changes, flight = Changes(), live(policy, ADDRESS, tmp_path, seconds=90)
         try:
             changes.set_at(tmp_path / "flight.csv", 30.0, flight, SIH_MASS=1.3)
-            changes.set_at(tmp_path / "flight.csv", 40.0, flight, SIH_T_MAX=4.25)
+            changes.set_at(tmp_path / "flight.csv", 60.0, flight, SIH_T_MAX=4.25)
         finally:
             changes.link.close()
         said = said_by(flight)
     figures, rows = found(tmp_path)
-    print(f"mean error [m] by 5 s: {[round(float(error(rows, t, t + 5).mean()), 3) for t in range(0, 50, 5)]}")
+    print(f"mean error [m] by 5 s: {[round(float(error(rows, t, t + 5).mean()), 3) for t in range(0, 90, 5)]}")
     assert "flight over: landed" in said
-    # PX4's estimate is 4 to 5 cm off, and wanders: a few seconds are 6 to 11 cm, as they are without a change.
-    for since, until in ((0.0, 30.0), (33.0, 40.0), (43.0, 50.0)):
-        assert error(rows, since, until).mean() < 0.12
+    # PX4's estimate is 4 to 5 cm off, and wanders: single windows of 5 s are 4 to 12 cm, as they are without a change.
+    spans = [error(rows, since, until).mean() for since, until in ((0.0, 30.0), (33.0, 60.0), (63.0, 90.0))]
+    print(f"mean error [m] before, and from 3 s after each change: {np.round(spans, 3).tolist()}")
+    assert max(spans) < 0.10
     assert figures["fallback_ticks"] <= BUSY * len(rows)
 
 

@@ -1,5 +1,6 @@
 """Replaying a log: what is foretold, by whom, and what a policy learns from it."""
 
+import importlib
 import json
 
 import jax
@@ -17,7 +18,7 @@ from retrim.experiments.reporter import Silent
 from retrim.experiments.run import Run
 from retrim.io.logs import read_flight_log, read_map
 from retrim.io.trained import save_policy
-from retrim.replay.adaptation import adapt_to
+from retrim.replay.adaptation import Adapted, adapt_to
 from retrim.replay.foretelling import Protocol, foretell
 from retrim.replay.predictors import learnt, mean_of, ridge, yardsticks
 from retrim.replay.replay import Replay, replay
@@ -26,6 +27,7 @@ from retrim.replay.rows import rows_of
 pytestmark = pytest.mark.usefixtures("optax_promotion")
 
 PUSH = (1.0, -0.5, 0.3)
+replays = importlib.import_module("retrim.replay.replay")  # the module, not its function of the same name
 SHORT = Protocol(buffer=2.0, horizon=1.0, every=1.0)
 
 
@@ -129,3 +131,31 @@ def test_a_policy_learns_the_push_of_a_log(files, tmp_path):
     model = setup.learner.residual_model
     x, u = jax.tree.map(lambda leaf: leaf[100], (rows_of(log).x, rows_of(log).u))
     np.testing.assert_allclose(model.predict(result.state.residual, x, u), PUSH, atol=0.1)
+
+
+def test_a_policy_is_adapted_with_its_own_residual_and_a_model_that_it_cannot_hold_is_named(
+    files, tmp_path, monkeypatch
+):
+    preset = tiny_preset(adapt={"residual": "regression", "window": 100, "fit_every": 1.0})
+    policy = Setup.of(preset).new_policy(jax.random.key(0))
+    save_policy(tmp_path / "p.safetensors", policy, preset)
+    used = []
+
+    def adapted(rows, setup, policy, **asked):
+        used.append(setup.preset.adapt.residual)
+        return Adapted(setup.learner.init(policy, jax.random.key(0)), 0, 5, 3.0, 3.0 if len(used) == 1 else 0.1)
+
+    monkeypatch.setattr(replays, "adapt_to", adapted)
+    said = []
+    for residual in (None, "linear"):
+        asked = Replay(
+            map=str(files[1]),
+            buffer=2.0,
+            horizon=1.0,
+            adapt="full",
+            policy=tmp_path / "p.safetensors",
+            residual=residual,
+        )
+        said.append(replay(files[0], asked, Run("replay", tmp_path), Silent()).sections[-1].about)
+    assert used == ["regression", "linear"]
+    assert ["the policy does not hold" in each for each in said] == [True, False]

@@ -30,6 +30,7 @@ from .vehicle import vehicle_toml
 SHOWN = ("regression", "ensemble", "linear")  # residual models beside the yardsticks
 ENSEMBLE_RATE = 1e-3  # learning rate: with that of hover/paper an ensemble learns the noise of a real log
 DEFAULT = "hover/retrim"
+LOST = 0.5  # [m]: an error in a model that has nothing to do with a flight any more
 SPANS = {"buffer": (0.2, 600.0), "horizon": (0.1, 600.0), "delay": (0.0, 1.0), "lag": (0.0, 5.0)}  # [s]
 
 
@@ -44,8 +45,9 @@ class Replay:
     """Residual models are fitted to the last so many seconds."""
     horizon: float = 5.0
     """They foretell so many seconds."""
-    residual: str = "linear"
-    """Residual model beside regression, ensemble and linear, and that of --adapt; or module:name."""
+    residual: str | None = None
+    """Residual model of --adapt, or module:name; by default that of the policy. It is shown beside regression, ensemble
+    and linear."""
     delay: float = 0.0
     """The thrust comes so much behind its command [s]; --identify finds it."""
     lag: float = 0.0
@@ -98,7 +100,7 @@ def replay(path: Path, asked: Replay, run: Run, reporter: Reporter) -> Document:
     policy, preset = load_policy(asked.policy) if asked.policy else (None, load(DEFAULT))
     if asked.vehicle is not None:
         preset = changed(preset, vehicle=asked.vehicle)
-    setup = Setup.of(changed(preset, adapt={"residual": asked.residual}))
+    setup = Setup.of(preset if asked.residual is None else changed(preset, adapt={"residual": asked.residual}))
     log = read_flight_log(path, None if asked.map is None else read_map(asked.map), dt=preset.dt)
     rows, protocol = rows_of(log, delay=asked.delay, lag=asked.lag), Protocol(asked.buffer, asked.horizon)
     late = f" Thrust acts {1000 * asked.delay:g} ms late, with a lag of {1000 * asked.lag:g} ms."
@@ -133,7 +135,7 @@ def _foretold(
     goal = tuple(float(x) for x in home)
     preset = changed(setup.preset, goal=goal, dt=max(0.001, round(log.dt, 3)))
     adapt: dict[str, Any] = {"window": round(protocol.buffer / log.dt), "fit_every": protocol.every}
-    names = dict.fromkeys([*SHOWN, asked.residual])
+    names = dict.fromkeys([*SHOWN, *([asked.residual] if asked.residual else [])])
     predictors = yardsticks(log.dt)
     for name in names:
         more = {"fit_learning_rate": ENSEMBLE_RATE} if name == "ensemble" else {}
@@ -163,4 +165,9 @@ def _adapted(
         f"{result.admitted} of {result.tried} updates passed the gate, residual `{preset.adapt.residual}`. Error over "
         f"the last half second of 6 s in the model that the log has corrected, 64 starts of the task."
     )
+    if not result.after < LOST:
+        about += (
+            " **In that model the policy does not hold**: the residual says more than the log has shown. Try another "
+            "`--residual`, `--delay` and `--lag` of `--identify`, or a log with more movement."
+        )
     return TableSection(("policy", "error [m]"), lines, "A policy adapted to the log", about)
