@@ -21,6 +21,7 @@ WANDERS = 0.1  # [m] by which the place of one who stands may change
 SPEED, RISE_S = 0.5, 2.0  # [m/s] on the way to the start; [s] of a take-off
 THRUST_S = 2.0  # [s] over which the thrust at hover is learnt
 GROUND = 0.1  # [m] above where it took off
+WRONG = {crtp.TUMBLED: "lies on its back", crtp.LOCKED: "has locked itself", crtp.CRASHED: "has crashed"}
 
 
 class CrazyfliePlant(VehiclePlant):
@@ -91,21 +92,24 @@ class CrazyfliePlant(VehiclePlant):
             self._floor = float(x.p[2])
         place = x.p + np.array([0.0, 0.0, 1.0]) if p is None else np.asarray(p, dtype=float)
         heading = heading_of(x.R) if yaw is None else yaw
-        if not self._is(crtp.ARMED):
-            link.send(crtp.arm(True, link.version))
-        if not self.until(lambda: self._is(crtp.ARMED) and self._is(crtp.CAN_FLY), ARM_S, keep_on):
+        self._flies = True  # from here on it has to be landed and disarmed
+        ready = lambda: self._is(crtp.ARMED) and self._is(crtp.CAN_FLY)  # noqa: E731
+        if not self.insist(lambda: link.send(crtp.arm(True, link.version)), ready, ARM_S, keep_on):
             raise PlantError(f"{self.address}: the Crazyflie refuses to be armed{link.said()}")
-        self._flies = True
         if not self._is(crtp.FLYING):
-            link.send(crtp.take_off(float(place[2]), heading, RISE_S))
+            rise = crtp.take_off(float(place[2]), heading, RISE_S)
+            if not self.insist(lambda: link.send(rise), lambda: self._is(crtp.FLYING), ARM_S, keep_on):
+                raise PlantError(f"{self.address}: the Crazyflie does not take off{link.said()}")
             self.until(lambda: False, RISE_S, keep_on)
-        way = max(1.0, float(np.linalg.norm(place - self._reading().p)) / SPEED)
-        link.send(crtp.go_to(place, heading, way, link.version))
-        if not self.until(self.staying(place), GO_S + way, keep_on):
-            raise PlantError(
-                f"{self.address}: the Crazyflie is at {self._reading().p.round(2).tolist()} m after {GO_S + way:.0f} "
-                f"s, not at {place.round(2).tolist()}{link.said()}"
-            )
+
+        def go() -> None:
+            way = max(1.0, float(np.linalg.norm(place - self._reading().p)) / SPEED)
+            link.send(crtp.go_to(place, heading, way, link.version))
+
+        patience = GO_S + float(np.linalg.norm(place - self._reading().p)) / SPEED
+        if not self.insist(go, self.staying(place), patience, keep_on, every=0.5 * GO_S):
+            at, wanted = (each.round(2).tolist() for each in (self._reading().p, place))
+            raise PlantError(f"{self.address}: it is at {at} m after {patience:.0f} s, not at {wanted}{link.said()}")
         link.thrusts.clear()
         self.hold(time.monotonic() + THRUST_S)
         thrusts = np.array(link.thrusts)
@@ -124,11 +128,7 @@ class CrazyfliePlant(VehiclePlant):
         now = time.monotonic()
         if now - link.heard > LOST_S:
             raise PlantError(f"the link has been silent for {LOST_S:g} s; a Crazyflie stops its motors then")
-        for bit, what in (
-            (crtp.TUMBLED, "lies on its back"),
-            (crtp.LOCKED, "has locked itself"),
-            (crtp.CRASHED, "has crashed"),
-        ):
+        for bit, what in WRONG.items():
             if self._is(bit):
                 raise PlantError(f"the Crazyflie says that it {what}{link.said()}")
         if self._flies and not self._is(crtp.ARMED):

@@ -184,17 +184,12 @@ class MavlinkPlant(VehiclePlant):
         self, done: KeepOn, number: int, parameters: tuple[float, ...], patience: float, keep_on: KeepOn, what: str
     ) -> None:
         """Ask again and again until it is so."""
-        asked = -math.inf
 
         def obeyed() -> bool:
-            nonlocal asked
             self._tell()
-            if not done() and time.monotonic() - asked > ASK_AGAIN_S:
-                asked = time.monotonic()
-                self.link.command(number, *parameters)
             return done()
 
-        if not self.until(obeyed, patience, keep_on):
+        if not self.insist(lambda: self.link.command(number, *parameters), obeyed, patience, keep_on):
             raise PlantError(f"{self.address}: the autopilot refuses {what}{self._said()}")
 
     def _said(self) -> str:

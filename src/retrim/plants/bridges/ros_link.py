@@ -4,7 +4,9 @@ Nothing here decides who flies; :mod:`.ros` does.
 """
 
 import math
+import threading
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -72,7 +74,8 @@ class RosLink:
         """
         rospy = join(master)
         self._rospy, self._target = rospy, attitude_target()
-        self._clock, self._odometry_at = ArrivalClock(), -math.inf
+        self._clock, self._odometry_at, self._stamp = ArrivalClock(), -math.inf, 0.0
+        self._one_at_a_time = threading.Lock()
         self.reading: Reading | None = None
         self.heard = -math.inf
         """When a state that makes sense came last, monotonic clock [s]."""
@@ -80,7 +83,7 @@ class RosLink:
         """States that make no sense."""
         odometry, pose = system_module("nav_msgs.msg").Odometry, system_module("geometry_msgs.msg").PoseStamped
         self._ends = [
-            rospy.Subscriber(f"{namespace}/{topic}", kind, take, queue_size=1, tcp_nodelay=True)
+            rospy.Subscriber(f"{namespace}/{topic}", kind, self._alone(take), queue_size=1, tcp_nodelay=True)
             for topic, kind, take in ((ODOMETRY, odometry, self._odometry), (POSE, pose, self._pose))
         ]
         self._publisher = rospy.Publisher(f"{namespace}/{TARGET}", self._target, queue_size=1, tcp_nodelay=True)
@@ -103,6 +106,15 @@ class RosLink:
         """Leave the topics; the node stays as long as the process."""
         for end in self._ends:
             end.unregister()
+
+    def _alone(self, take: Callable[[Any], None]) -> Callable[[Any], None]:
+        """Return a callback that waits for those of other topics, whose threads are others."""
+
+        def taken(message: Any) -> None:
+            with self._one_at_a_time:
+                take(message)
+
+        return taken
 
     def _odometry(self, message: Any) -> None:
         """Take nav_msgs/Odometry: pose in its frame, twist in its child's frame, the body, unless that is the same."""
@@ -129,8 +141,7 @@ class RosLink:
             return
         p, R = found
         stamp = message.header.stamp.to_sec()
-        here = self._clock.here(stamp)
-        if last is None or here is None or not 1e-4 < (dt := here - last.stamp) < FRESH_S:
+        if last is None or not 1e-4 < (dt := stamp - self._stamp) < FRESH_S:
             self._take(stamp, p, R, np.zeros(3), np.zeros(3))
             return
         new = dt / (dt + SMOOTH_S)
@@ -144,7 +155,7 @@ class RosLink:
         here = self._clock.here(stamp)
         assert here is not None
         if self.reading is None or here >= self.reading.stamp or now - self.heard > FRESH_S:
-            self.reading, self.heard = Reading(here, p, R, v, omega), now
+            self.reading, self.heard, self._stamp = Reading(here, p, R, v, omega), now, stamp
 
 
 def _pose(pose: Any) -> tuple[np.ndarray, np.ndarray] | None:

@@ -115,6 +115,34 @@ class VehiclePlant(Plant, abc.ABC):
             self.wait(time.monotonic() + NAP_S)
         return False
 
+    def insist(
+        self, order: Callable[[], object], done: KeepOn, patience: float, keep_on: KeepOn, *, every: float = 1.0
+    ) -> bool:
+        """Give an order again and again, since it may be lost, until something is so; return whether it is.
+
+        Args:
+            order: Gives it.
+            done: Asked before each time.
+            patience: For how long [s].
+            keep_on: Asked again and again; False gives up.
+            every: Time between two of them [s].
+
+        Raises:
+            PlantError: ``keep_on`` says no.
+        """
+        given = -math.inf
+
+        def obeyed() -> bool:
+            nonlocal given
+            if done():
+                return True
+            if time.monotonic() - given > every:
+                given = time.monotonic()
+                order()
+            return False
+
+        return self.until(obeyed, patience, keep_on)
+
     def staying(self, place: np.ndarray, meanwhile: Callable[[], object] = lambda: None) -> KeepOn:
         """Return what tells whether the vehicle has been at a place [m] for a while.
 
