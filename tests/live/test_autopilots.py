@@ -3,7 +3,6 @@
 PX4 listens on every address of the machine: run its tests in a network namespace (`make test-px4` makes one).
 """
 
-import contextlib
 import json
 import os
 import signal
@@ -15,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from peers import peer, started
 from retrim.onboard.guard import Mode
 from retrim.onboard.recorder import read_log
 from retrim.plants.bridges import crtp
@@ -42,19 +42,6 @@ def trained(tmp_path_factory, task, *words):
 @pytest.fixture(scope="module")
 def small(tmp_path_factory):
     return trained(tmp_path_factory, "hover")
-
-
-@contextlib.contextmanager
-def started(*words):
-    """Another process, once it has said a line; ended by the signal that Ctrl-C is to it."""
-    process = subprocess.Popen([sys.executable, "-m", *words], stdout=subprocess.PIPE, text=True)
-    try:
-        assert "Ctrl-C ends it" in process.stdout.readline()
-        yield process
-    finally:
-        process.terminate()
-        process.wait(10.0)
-        process.stdout.close()
 
 
 def live(policy, plant, out, *words, seconds=20):
@@ -89,13 +76,13 @@ PEERS = {"mavlink": f"mavlink:udp:127.0.0.1:{PORT}", "crazyflie": f"crazyflie:ud
 each_peer = pytest.mark.parametrize("speaks", PEERS)
 
 
-def peer(speaks, *words):
-    return started(f"retrim.testing.{speaks}_peer", "--port", str(PORT), *words)
+def flown_by(speaks, *words):
+    return peer(speaks, "--port", PORT, *words)
 
 
 @each_peer
 def test_a_flight_adapts_under_a_large_disturbance(speaks, small, tmp_path):
-    with peer(speaks, "--disturbance", "large"):
+    with flown_by(speaks, "--disturbance", "large"):
         said = said_by(live(small, PEERS[speaks], tmp_path))
     figures, rows = found(tmp_path)
     assert "flight over: landed" in said
@@ -108,7 +95,7 @@ def test_a_flight_adapts_under_a_large_disturbance(speaks, small, tmp_path):
 @each_peer
 def test_a_link_that_is_cut_for_a_second_ends_in_a_landing(speaks, small, tmp_path):
     """The guard sinks blindly, holds when it sees again, and lands; the log goes on."""
-    with peer(speaks, "--cut", "5", "1"):
+    with flown_by(speaks, "--cut", "5", "1"):
         said = said_by(live(small, PEERS[speaks], tmp_path))
     _, rows = found(tmp_path)
     modes = rows[:, -1]
@@ -122,7 +109,7 @@ def test_a_link_that_is_cut_for_a_second_ends_in_a_landing(speaks, small, tmp_pa
 @each_peer
 def test_a_link_that_is_cut_for_five_seconds_is_lost_and_the_log_is_kept(speaks, small, tmp_path):
     """The vehicle is its autopilot's, which holds its place, or lets it fall; nobody takes it back."""
-    with peer(speaks, "--cut", "5", "5"):
+    with flown_by(speaks, "--cut", "5", "5"):
         said = said_by(live(small, PEERS[speaks], tmp_path), fails=True)
     figures, rows = found(tmp_path)
     assert "plant lost: the link has been silent for 2 s" in said
@@ -141,7 +128,7 @@ def killed_in_flight(speaks, policy, out):
 
 
 def test_a_bridge_that_is_killed_leaves_the_vehicle_to_its_autopilot(small, tmp_path):
-    with peer("mavlink") as autopilot:
+    with flown_by("mavlink") as autopilot:
         killed_in_flight("mavlink", small, tmp_path)
         assert autopilot.poll() is None
         listener = MavlinkLink(UdpEndpoint("127.0.0.1", PORT))
@@ -158,7 +145,7 @@ def test_a_bridge_that_is_killed_leaves_the_vehicle_to_its_autopilot(small, tmp_
 
 def test_a_crazyflie_whose_bridge_is_killed_falls(small, tmp_path):
     """There is nothing on board that would hold it: after two seconds without a setpoint its motors stop."""
-    with peer("crazyflie"):
+    with flown_by("crazyflie"):
         killed_in_flight("crazyflie", small, tmp_path)
         listener = CrazyflieLink(UdpEndpoint("127.0.0.1", 0), ("127.0.0.1", PORT))
         try:
@@ -204,7 +191,7 @@ class Changes:
 @pytest.mark.px4
 def test_px4_hovers_and_a_load_and_a_weak_battery_are_felt_for_less_than_three_seconds(tmp_path_factory, tmp_path):
     policy = trained(tmp_path_factory, "hover", "--vehicle", SIH)
-    with started("retrim.testing.px4", PX4):
+    with started(sys.executable, "-m", "retrim.testing.px4", PX4):
         changes, flight = Changes(), live(policy, ADDRESS, tmp_path, seconds=90)
         try:
             changes.set_at(tmp_path / "flight.csv", 30.0, flight, SIH_MASS=1.3)
@@ -226,7 +213,7 @@ def test_px4_hovers_and_a_load_and_a_weak_battery_are_felt_for_less_than_three_s
 @pytest.mark.px4
 def test_px4_flies_a_circle(tmp_path_factory, tmp_path):
     policy = trained(tmp_path_factory, "track", "--vehicle", SIH, "--reference", "circle")
-    with started("retrim.testing.px4", PX4):
+    with started(sys.executable, "-m", "retrim.testing.px4", PX4):
         said = said_by(live(policy, ADDRESS, tmp_path, "--reference", "circle", seconds=30))
     figures, rows = found(tmp_path)
     flown = rows[(rows[:, 1] > 6.0) & (rows[:, -1] == Mode.POLICY)]

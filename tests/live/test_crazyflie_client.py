@@ -3,16 +3,15 @@
 RETRIM_CFLIB names a Python that has cflib, which asks for other versions of libraries than our tools do.
 """
 
-import contextlib
 import json
 import os
 import socket
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
+from peers import peer, started
 from retrim import Scenario, testing
 
 CFLIB = os.environ.get("RETRIM_CFLIB", "")
@@ -70,32 +69,20 @@ print(json.dumps(found))
 """
 
 
-@contextlib.contextmanager
-def started(*words):
-    process = subprocess.Popen([*map(str, words)], stdout=subprocess.PIPE, text=True)
-    try:
-        assert "Ctrl-C ends it" in process.stdout.readline()
-        yield
-    finally:
-        process.terminate()
-        process.wait(10.0)
-        process.stdout.close()
-
-
 @pytest.fixture
-def peer():
+def port():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    with started(sys.executable, "-m", "retrim.testing.crazyflie_peer", "--plant", "simple", "--port", port):
-        yield port
+        found = free.getsockname()[1]
+    with peer("crazyflie", "--plant", "simple", "--port", found):
+        yield found
 
 
-def test_its_own_client_connects_logs_arms_and_flies_it(peer):
+def test_its_own_client_connects_logs_arms_and_flies_it(port):
     vehicle = Scenario(plant="simple").make_vehicle("small")
     share = float(9.81 * vehicle.mass / vehicle.thrust_max)
     percent = (share * 65_535 - 10_001) / 499.99 if share * 65_535 > 10_001 else 0.0
-    words = [CFLIB, "-c", CLIENT, f"udp://127.0.0.1:{peer}", str(percent)]
+    words = [CFLIB, "-c", CLIENT, f"udp://127.0.0.1:{port}", str(percent)]
     ran = subprocess.run(words, capture_output=True, text=True, timeout=60)
     assert ran.returncode == 0, ran.stderr
     found = json.loads(ran.stdout.splitlines()[-1])
@@ -109,7 +96,7 @@ def test_its_own_client_connects_logs_arms_and_flies_it(peer):
     assert found["landed"]
 
 
-def test_we_fly_it_through_the_script_for_the_radio(peer):
-    port = peer + 1 if peer < 65_000 else peer - 1
-    with started(CFLIB, RADIO, f"udp://127.0.0.1:{peer}", port):
-        testing.check_vehicle(lambda: Scenario(plant=f"crazyflie:udp:127.0.0.1:{port}").make("small"))
+def test_we_fly_it_through_the_script_for_the_radio(port):
+    ours = port + 1 if port < 65_000 else port - 1
+    with started(CFLIB, RADIO, f"udp://127.0.0.1:{port}", ours):
+        testing.check_vehicle(lambda: Scenario(plant=f"crazyflie:udp:127.0.0.1:{ours}").make("small"))

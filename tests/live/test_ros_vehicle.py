@@ -1,6 +1,5 @@
 """A vehicle behind ROS 1: conformance, and a whole flight that adapts. `make test-ros` installs ROS and runs them."""
 
-import contextlib
 import json
 import subprocess
 import sys
@@ -8,6 +7,7 @@ import sys
 import numpy as np
 import pytest
 
+from peers import peer
 from retrim import PlantError, Scenario, testing
 from retrim.experiments.latency import rosmaster
 from retrim.onboard.guard import Mode
@@ -28,19 +28,6 @@ def master():
         yield f"{found.host}:{found.port}"
 
 
-@contextlib.contextmanager
-def peer(master, *words):
-    command = [sys.executable, "-m", "retrim.testing.ros_peer", f"http://{master}", *words]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    try:
-        assert "Ctrl-C ends it" in process.stdout.readline()
-        yield process
-    finally:
-        process.kill()
-        process.wait(10.0)
-        process.stdout.close()
-
-
 def test_targets_are_those_of_mavros(master):
     assert attitude_target()._md5sum == "456f3af666b22ccd0222ea053a86b548"
 
@@ -48,7 +35,7 @@ def test_targets_are_those_of_mavros(master):
 @pytest.mark.parametrize("more", [(), ("--poses",)], ids=["odometry", "poses alone"])
 def test_it_is_a_link_to_a_vehicle(master, more):
     place = (0.3, -0.2, 1.5)
-    with peer(master, "--plant", "simple", "--place", *map(str, place), "--yaw", str(HEADING), *more):
+    with peer("ros", f"http://{master}", "--plant", "simple", "--place", *place, "--yaw", HEADING, *more):
         testing.check_vehicle(lambda: Scenario(plant=f"ros:{master}").make("small"), place=place)
 
 
@@ -63,7 +50,7 @@ def test_a_flight_adapts_under_a_large_disturbance(master, tmp_path):
     policy, flight = tmp_path / "policy", tmp_path / "flight"
     words = [*RETRIM, "pretrain", "hover", "--preset", "hover/retrim", "--out", str(policy)]
     subprocess.run(words, check=True, capture_output=True, timeout=300)
-    with peer(master, "--disturbance", "large"):
+    with peer("ros", f"http://{master}", "--disturbance", "large"):
         words = [*RETRIM, "live", "--policy", str(policy), "--plant", f"ros:{master}", "--seconds", "20"]
         ran = subprocess.run([*words, "--out", str(flight)], capture_output=True, text=True, timeout=240)
     assert ran.returncode == 0, ran.stdout

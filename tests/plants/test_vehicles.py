@@ -1,53 +1,49 @@
-"""Conformance of links to vehicles, each flown against a peer that speaks its language. Time does not wait here."""
+"""Conformance of links to vehicles, each flown against a peer that speaks its language.
 
-import contextlib
+What flies against the clock is slow, and wants the machine for itself: `make test-links` runs it, and so does CI.
+"""
+
 import importlib.util
-import subprocess
-import sys
 import time
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from peers import peer
 from retrim import Command, ConfigError, PlantError, Scenario, State, testing
 from retrim.config.plants import find_plant, is_vehicle
 from retrim.plants.bridges import crazyflie, mavlink
 from retrim.plants.bridges.mavlink_link import MavlinkLink
 
 PORT = 24560
+against_the_clock = pytest.mark.slow
 
 
-@contextlib.contextmanager
-def peer(*words, port=PORT, speaks="mavlink"):
+def flown_by(speaks="mavlink", *words, port=PORT):
     """A process that stands in for an autopilot and its vehicle."""
     if speaks == "mavlink" and importlib.util.find_spec("pymavlink") is None:
         pytest.skip("the extra mavlink is not installed")
-    command = [sys.executable, "-m", f"retrim.testing.{speaks}_peer", "--plant", "simple", "--port", str(port), *words]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    try:
-        assert "Ctrl-C ends it" in process.stdout.readline()
-        yield process
-    finally:
-        process.terminate()
-        process.wait()
-        process.stdout.close()
+    return peer(speaks, "--plant", "simple", "--port", port, *words)
 
 
 def link(port=PORT, speaks="mavlink", **changes):
     return Scenario(plant=f"{speaks}:udp:127.0.0.1:{port}", **changes).make("small")
 
 
+@against_the_clock
 def test_mavlink_conforms():
-    with peer():
+    with flown_by():
         testing.check_vehicle(link)
 
 
+@against_the_clock
 def test_a_crazyflie_conforms():
-    with peer(port=PORT + 5, speaks="crazyflie"):
+    with flown_by("crazyflie", port=PORT + 5):
         testing.check_vehicle(lambda: link(PORT + 5, "crazyflie"))
 
 
+@against_the_clock
 def test_another_vehicle_conforms():
     testing.check_vehicle(lambda: Scenario(plant="made_up_vehicle:calm").make("small"))
 
@@ -64,11 +60,12 @@ def step_for(plant, seconds):
         plant.step(Command.hover())
 
 
+@against_the_clock
 def test_hover_thrust_is_learnt_and_a_pilot_who_takes_over_is_left_alone():
-    with peer("--takes-over", "1.0"):
+    with flown_by("mavlink", "--takes-over", "1.0"):
         plant = hovering(link())
         vehicle = Scenario(plant="simple").make_vehicle("small")  # whose thrust is 3.5 % more than commanded
-        assert plant.hover == pytest.approx(float(9.81 * vehicle.mass / vehicle.thrust_max / 1.035), rel=0.02)
+        assert plant.thrust.hover == pytest.approx(float(9.81 * vehicle.mass / vehicle.thrust_max / 1.035), rel=0.02)
         with pytest.raises(PlantError, match="left offboard mode"):
             step_for(plant, 5.0)
         began = time.monotonic()
@@ -76,20 +73,22 @@ def test_hover_thrust_is_learnt_and_a_pilot_who_takes_over_is_left_alone():
         assert time.monotonic() - began < 1.0  # nothing was asked of it
 
 
+@against_the_clock
 def test_silence_is_noticed():
-    with peer("--cut", "0.5", "60"):
+    with flown_by("mavlink", "--cut", "0.5", "60"):
         plant = hovering(link())
         with pytest.raises(PlantError, match="silent for 2 s"):
             step_for(plant, 10.0)
         plant.stop()
 
 
+@against_the_clock
 def test_a_crazyflie_that_is_silent_is_noticed():
-    with peer("--cut", "0.5", "60", port=PORT + 6, speaks="crazyflie"):
+    with flown_by("crazyflie", "--cut", "0.5", "60", port=PORT + 6):
         plant = hovering(link(PORT + 6, "crazyflie"))
         vehicle = Scenario(plant="simple").make_vehicle("small")
         share = float(9.81 * vehicle.mass / vehicle.thrust_max / 1.035)
-        assert plant.hover / 65_535 == pytest.approx(share, rel=0.02)
+        assert plant.thrust.hover / 65_535 == pytest.approx(share, rel=0.02)
         with pytest.raises(PlantError, match="silent for 2 s; a Crazyflie stops its motors"):
             step_for(plant, 10.0)
         plant.stop()
@@ -181,7 +180,7 @@ def test_a_rate_that_an_autopilot_does_not_take_is_refused(plant, why):
 
 def test_commands_stay_within_what_the_vehicle_takes():
     plant = link()
-    plant.hover = 0.5
+    plant.thrust.learn(np.full(5, 0.5))
 
     class Deaf(MavlinkLink):
         def __init__(self):

@@ -3,6 +3,8 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
+
 from ..errors import ConfigError
 from ..physics.bem import BemQuadrotor
 from ..physics.disturbance import Disturbance
@@ -108,24 +110,27 @@ def is_vehicle(plant: str) -> bool:
     return isinstance(entry, PlantEntry) and entry.is_vehicle
 
 
+def _limits(vehicle: Vehicle) -> tuple[np.ndarray, np.ndarray]:
+    """Return the smallest and the largest command [c, omega]."""
+    low, high = (as_numpy(u).astype(float) for u in (vehicle.command_min, vehicle.command_max))
+    return low, high
+
+
 def _mavlink(r: PlantRequest) -> Plant:
-    low, high = (as_numpy(u).astype(float) for u in (r.vehicle.command_min, r.vehicle.command_max))
-    return MavlinkPlant(r.address, r.dt, low, high)
+    return MavlinkPlant(r.address, r.dt, *_limits(r.vehicle))
 
 
 def _crazyflie(r: PlantRequest) -> Plant:
-    low, high = (as_numpy(u).astype(float) for u in (r.vehicle.command_min, r.vehicle.command_max))
-    return CrazyfliePlant(r.address, r.dt, low, high)
+    return CrazyfliePlant(r.address, r.dt, *_limits(r.vehicle))
 
 
 def _ros(r: PlantRequest) -> Plant:
-    low, high = (as_numpy(u).astype(float) for u in (r.vehicle.command_min, r.vehicle.command_max))
-    return RosPlant(r.address, r.dt, low, high, float(r.vehicle.thrust_max / r.vehicle.mass))
+    return RosPlant(r.address, r.dt, *_limits(r.vehicle), float(r.vehicle.thrust_max / r.vehicle.mass))
 
 
 def _betaflight(r: PlantRequest) -> Plant:
-    low, high = (as_numpy(u).astype(float) for u in (r.vehicle.command_min, r.vehicle.command_max))
-    return BetaflightPlant(BemQuadrotor.of(r.vehicle, r.dt, thrust_error=r.thrust_error), r.disturbance, low, high)
+    model = BemQuadrotor.of(r.vehicle, r.dt, thrust_error=r.thrust_error)
+    return BetaflightPlant(model, r.disturbance, *_limits(r.vehicle))
 
 
 def _no_address(address: str) -> None:

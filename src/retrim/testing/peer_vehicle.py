@@ -12,6 +12,7 @@ import numpy as np
 from ..config.scenario import Scenario
 from ..onboard.guard import GeometricHover, Limits
 from ..onboard.realtime import be_punctual, sleep_until
+from ..physics.so3 import rotz
 from ..physics.state import STANDARD_GRAVITY, Command, State
 from ..plants.bridges import frames
 from ..plants.plant import as_numpy
@@ -33,9 +34,7 @@ class PeerVehicle:
         """
         vehicle = scenario.make_vehicle("small")
         self._plant = scenario.make("small", dt=DT, seed=seed)
-        c, s = math.cos(heading), math.sin(heading)
-        R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        self.x, self.omega = np.concatenate([np.zeros(3), R.ravel(), np.zeros(3)]), np.zeros(3)
+        self.x, self.omega = _standing(0.0, 0.0, heading), np.zeros(3)
         """State p, R, v, and body rates."""
         self.flies = False
         low, high = (as_numpy(u).astype(float) for u in (vehicle.command_min, vehicle.command_max))
@@ -77,9 +76,7 @@ class PeerVehicle:
     def stand(self) -> None:
         """Be on the ground, upright, where it is."""
         self.flies, self.omega = False, np.zeros(3)
-        yaw = frames.heading_of(self.R)
-        R = np.array([[math.cos(yaw), -math.sin(yaw), 0.0], [math.sin(yaw), math.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
-        self.x = np.concatenate([[*self.p[:2], 0.0], R.ravel(), np.zeros(3)])
+        self.x = _standing(self.p[0], self.p[1], frames.heading_of(self.R))
 
     def towards(self, place: np.ndarray, yaw: float) -> np.ndarray:
         """Return the command [c, omega] that flies it to a place [m] and heading [rad]."""
@@ -103,6 +100,12 @@ class PeerVehicle:
     def _step_plant(self, u: np.ndarray) -> State:
         dtype = jnp.result_type(float)
         return self._plant.step(Command(jnp.asarray(u[0], dtype), jnp.asarray(u[1:], dtype)))[0].x
+
+
+def _standing(x: float, y: float, yaw: float) -> np.ndarray:
+    """Return the state p, R, v of a vehicle that stands upright."""
+    R = np.asarray(rotz(jnp.asarray(yaw, jnp.result_type(float))), dtype=float)
+    return np.concatenate([[x, y, 0.0], R.ravel(), np.zeros(3)])
 
 
 def fly_until_interrupted(step: Callable[[], None], address: str) -> None:

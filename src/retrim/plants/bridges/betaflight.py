@@ -15,7 +15,8 @@ from ...physics.state import STANDARD_GRAVITY, State
 from .betaflight_firmware import Firmware, find_firmware
 from .betaflight_wire import IDLE, throttle_of
 from .betaflight_world import World
-from .vehicle_plant import KeepOn, VehiclePlant
+from .patience import KeepOn
+from .vehicle_plant import VehiclePlant
 from .vehicle_state import VehicleState
 
 HEARD_S, ARMS_S, SPINS_S = 2.0, 6.0, 0.4  # [s]: the receiver is up; arming; motors reach hover
@@ -81,10 +82,10 @@ class BetaflightPlant(VehiclePlant):
 
     def read(self) -> VehicleState:
         """Return the state of the vehicle."""
-        now = self._running().state()
+        world = self._running()
+        now, self.lost = world.state(), world.slipped
         if now.p[2] < 0.0 or not np.isfinite(now.p).all():
             raise PlantError("the vehicle is on the ground")
-        self.lost = self._running().slipped
         return now
 
     def transmit(self, u: np.ndarray) -> np.ndarray:

@@ -6,16 +6,17 @@ import time
 import numpy as np
 
 from ...errors import ConfigError, PlantError
-from ...physics.state import STANDARD_GRAVITY
 from . import crtp
 from .crazyflie_link import CrazyflieLink
 from .endpoint import UdpEndpoint, address_of
 from .frames import heading_of
-from .vehicle_plant import KeepOn, VehiclePlant
-from .vehicle_state import Reading, VehicleState
+from .linked_plant import LinkedPlant, ThrustScale
+from .patience import KeepOn, insisting
+from .vehicle_state import VehicleState
 
 ADDRESS = "udp:127.0.0.1:19850"  # where a simulated one, or a bridge to the radio, listens on this machine
 ANSWERS_S, READY_S, STILL_S, ARM_S, GO_S, LANDING_S = 5.0, 20.0, 2.0, 5.0, 20.0, 15.0  # [s]
+AGAIN_S = 1.0  # [s] after which an order that is not obeyed is given again
 LOST_S = 2.0  # [s] of silence; by then it has stopped its motors
 WANDERS = 0.1  # [m] by which the place of one who stands may change
 SPEED, RISE_S = 0.5, 2.0  # [m/s] on the way to the start; [s] of a take-off
@@ -24,7 +25,7 @@ GROUND = 0.1  # [m] above where it took off
 WRONG = {crtp.TUMBLED: "lies on its back", crtp.LOCKED: "has locked itself", crtp.CRASHED: "has crashed"}
 
 
-class CrazyfliePlant(VehiclePlant):
+class CrazyfliePlant(LinkedPlant[CrazyflieLink]):
     """A Crazyflie, by CRTP over UDP: thrust and body rates as its manual setpoint, states from its log.
 
     World and body are its own, which are ours. Thrust per mass is a share of the range of its thrust command, g over
@@ -43,25 +44,11 @@ class CrazyfliePlant(VehiclePlant):
         Raises:
             ConfigError: The address is none, or the period is not one that it can be flown at.
         """
-        super().__init__(dt, low, high)
+        super().__init__(check_address(address), dt, low, high)
         if not 0.01 <= dt <= 0.1:
             raise ConfigError(f"dt = {dt} s: a Crazyflie is commanded at 10 to 100 Hz")
-        self.address = check_address(address)
-        self.hover: float | None = None
-        """Thrust command that carries the vehicle, 0 to 65535; known once it has hovered."""
-        self._link: CrazyflieLink | None = None
+        self.thrust = ThrustScale(*crtp.THRUST)
         self._flies, self._floor = False, 0.0
-
-    @property
-    def link(self) -> CrazyflieLink:
-        """The connection.
-
-        Raises:
-            PlantError: There is none.
-        """
-        if self._link is None:
-            raise PlantError(f"{self.address}: not connected; call connect or reset first")
-        return self._link
 
     def connect(self, keep_on: KeepOn = lambda: True) -> None:
         """Wait for it, and until it knows where it is and could be armed."""
@@ -87,35 +74,34 @@ class CrazyfliePlant(VehiclePlant):
 
     def take_off(self, p: np.ndarray | None, yaw: float | None, keep_on: KeepOn = lambda: True) -> None:
         """Let it fly to a place by its own commander, and learn what thrust it takes to hover there."""
-        link, x = self.link, self._reading()
+        link, x = self.link, self.reading()
         if not self._is(crtp.FLYING):
             self._floor = float(x.p[2])
         place = x.p + np.array([0.0, 0.0, 1.0]) if p is None else np.asarray(p, dtype=float)
         heading = heading_of(x.R) if yaw is None else yaw
         self._flies = True  # from here on it has to be landed and disarmed
         ready = lambda: self._is(crtp.ARMED) and self._is(crtp.CAN_FLY)  # noqa: E731
-        if not self.insist(lambda: link.send(crtp.arm(True, link.version)), ready, ARM_S, keep_on):
+        arming = insisting(lambda: link.send(crtp.arm(True, link.version)), ready, AGAIN_S)
+        if not self.until(arming, ARM_S, keep_on):
             raise PlantError(f"{self.address}: the Crazyflie refuses to be armed{link.said()}")
         if not self._is(crtp.FLYING):
             rise = crtp.take_off(float(place[2]), heading, RISE_S)
-            if not self.insist(lambda: link.send(rise), lambda: self._is(crtp.FLYING), ARM_S, keep_on):
+            rising = insisting(lambda: link.send(rise), lambda: self._is(crtp.FLYING), AGAIN_S)
+            if not self.until(rising, ARM_S, keep_on):
                 raise PlantError(f"{self.address}: the Crazyflie does not take off{link.said()}")
             self.until(lambda: False, RISE_S, keep_on)
 
         def go() -> None:
-            way = max(1.0, float(np.linalg.norm(place - self._reading().p)) / SPEED)
+            way = max(1.0, float(np.linalg.norm(place - self.reading().p)) / SPEED)
             link.send(crtp.go_to(place, heading, way, link.version))
 
-        patience = GO_S + float(np.linalg.norm(place - self._reading().p)) / SPEED
-        if not self.insist(go, self.staying(place), patience, keep_on, every=0.5 * GO_S):
-            at, wanted = (each.round(2).tolist() for each in (self._reading().p, place))
+        patience = GO_S + float(np.linalg.norm(place - self.reading().p)) / SPEED
+        if not self.until(insisting(go, self.staying(place), 0.5 * GO_S), patience, keep_on):
+            at, wanted = (each.round(2).tolist() for each in (self.reading().p, place))
             raise PlantError(f"{self.address}: it is at {at} m after {patience:.0f} s, not at {wanted}{link.said()}")
         link.thrusts.clear()
         self.hold(time.monotonic() + THRUST_S)
-        thrusts = np.array(link.thrusts)
-        if len(thrusts) < 5 or not 0.05 < np.median(thrusts) / crtp.THRUST[1] < 0.95:
-            raise PlantError(f"the thrust at hover is not known: the log said {thrusts.round().tolist()}")
-        self.hover = float(np.mean(thrusts))
+        self.thrust.learn(link.thrusts)
 
     def hold(self, until: float) -> None:
         """Let its commander hold the place of the take-off."""
@@ -133,16 +119,13 @@ class CrazyfliePlant(VehiclePlant):
                 raise PlantError(f"the Crazyflie says that it {what}{link.said()}")
         if self._flies and not self._is(crtp.ARMED):
             raise PlantError(f"the Crazyflie is not armed any more{link.said()}")
-        return self._reading().at(now)
+        return self.reading().at(now)
 
     def transmit(self, u: np.ndarray) -> np.ndarray:
         """Send thrust and body rates."""
-        if self.hover is None:
-            raise PlantError(f"{self.address}: the vehicle has not taken off; call take_off or reset first")
-        per_c = self.hover / STANDARD_GRAVITY
-        thrust = round(float(np.clip(u[0] * per_c, *crtp.THRUST)))
+        thrust = round(self.thrust.command(float(u[0])))
         self.link.send(crtp.rates_setpoint(thrust, u[1:]))
-        return np.concatenate([[thrust / per_c], u[1:]])
+        return np.concatenate([[self.thrust.per_mass(thrust)], u[1:]])
 
     def wait(self, until: float) -> None:
         """Keep the link alive."""
@@ -158,7 +141,7 @@ class CrazyfliePlant(VehiclePlant):
                 self._sink(link)
             link.stop_logs()
         finally:
-            self._flies, self.hover = False, None
+            self._flies = False
             link.close()
 
     def _sink(self, link: CrazyflieLink) -> None:
@@ -186,19 +169,14 @@ class CrazyfliePlant(VehiclePlant):
         status = self.link.status
         return status is not None and bool(status.info & bits)
 
-    def _reading(self) -> Reading:
-        if self.link.reading is None:
-            raise PlantError(f"{self.address}: the Crazyflie has sent no state")
-        return self.link.reading
-
     def _stands_still(self, keep_on: KeepOn) -> None:
         """Check that its estimate does not wander, as one without a positioning system does."""
-        first = self._reading().p
+        first = self.reading().p
         wanders = 0.0
 
         def wandered() -> bool:
             nonlocal wanders
-            wanders = max(wanders, float(np.abs(self._reading().p - first).max()))
+            wanders = max(wanders, float(np.abs(self.reading().p - first).max()))
             return False
 
         self.until(wandered, STILL_S, keep_on)

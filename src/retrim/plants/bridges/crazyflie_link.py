@@ -7,13 +7,13 @@ import math
 import struct
 import time
 from collections import deque
-from collections.abc import Callable
 
 from ...errors import MessageError, PlantError
 from . import crtp
 from .clock import ArrivalClock
 from .crtp import Packet
 from .endpoint import Endpoint, pump
+from .patience import KeepOn, insisting, wait_until
 from .vehicle_state import Reading
 
 STATES, STATUSES = 1, 2  # numbers of our blocks of the log
@@ -23,7 +23,6 @@ AGAIN_S = 0.2  # [s] after which a question that is not answered is asked again
 WRAP_MS = 1 << 24  # of its time
 LATE_S, EARLY_S = 0.5, 1.0  # [s] by which its time may go back and ahead of ours, from one message to the next
 LEAP, LEAPS_S, FASTEST = 1.0, 0.5, 20.0  # [m] that no state is from the last one; [s] it is believed for; [m/s]
-KeepOn = Callable[[], bool]
 
 
 class CrazyflieLink:
@@ -79,17 +78,10 @@ class CrazyflieLink:
             PlantError: There is no answer, or the flight was given up.
         """
         self._awaited, self._answer = question._replace(body=question.body[:same]), None
-        until = time.monotonic() + patience
+        asking = insisting(lambda: self.send(question), lambda: self._answer is not None, AGAIN_S)
         try:
-            while self._answer is None:
-                if not keep_on():
-                    raise PlantError("the flight was given up before the hand-over")
-                if time.monotonic() > until:
-                    raise PlantError(f"the Crazyflie does not answer on port {question.port} in {patience:g} s")
-                self.send(question)
-                again = time.monotonic() + AGAIN_S
-                while self._answer is None and time.monotonic() < again:
-                    self.pump(min(again, time.monotonic() + 0.01))
+            if not wait_until(asking, patience, keep_on, self.pump) or self._answer is None:
+                raise PlantError(f"the Crazyflie does not answer on port {question.port} in {patience:g} s")
             return self._answer
         finally:
             self._awaited = None

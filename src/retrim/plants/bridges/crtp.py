@@ -18,11 +18,11 @@ ITEM, INFO = 2, 3  # commands of a table of contents
 RESET, CREATE, APPEND, START = 5, 6, 7, 3  # commands of LOG's CONTROL
 LISTED = 9  # variables that one of them has room for
 LOG_MS = 10  # of START's unit
-STOP, MANUAL, RELAX = 0, 11, 0  # of SETPOINT's channels 0, 0 and 1
+MANUAL, RELAX = 11, 0  # of SETPOINT's channels 0 and 1
 HL_STOP, GO_TO, TAKE_OFF, LAND, GO_TO_LINEAR = 3, 4, 7, 8, 12  # commands of HIGH_LEVEL
 NEW_GO_TO, OWN_SUPERVISOR = 8, 12  # protocol versions since which there is GO_TO_LINEAR, and the port SUPERVISOR
-CAN_ARM, ARMED, AUTO_ARMED, CAN_FLY, FLYING, TUMBLED, LOCKED, CRASHED = (1 << bit for bit in range(8))
-THRUST = (1, 65_535)  # at 0 the motors stop and its controllers begin anew
+CAN_ARM, ARMED, _, CAN_FLY, FLYING, TUMBLED, LOCKED, CRASHED = (1 << bit for bit in range(8))
+THRUST = (1.0, 65_535.0)  # at 0 the motors stop and its controllers begin anew
 STATE_LOG = {
     **{f"stateEstimateZ.{name}": "h" for name in ("x", "y", "z", "vx", "vy", "vz")},
     "stateEstimateZ.quat": "I",

@@ -6,12 +6,12 @@ import time
 import numpy as np
 
 from ...errors import ConfigError, PlantError
-from ...physics.state import STANDARD_GRAVITY
 from .endpoint import address_of, open_endpoint
 from .frames import heading_of
+from .linked_plant import LinkedPlant, ThrustScale
 from .mavlink_link import MavlinkLink
-from .vehicle_plant import KeepOn, VehiclePlant
-from .vehicle_state import Reading, VehicleState
+from .patience import KeepOn, insisting, wait_until
+from .vehicle_state import VehicleState
 
 ADDRESS = "udp:127.0.0.1:14540"  # to which PX4 sends on the machine that it runs on
 PX4 = 12  # MAV_AUTOPILOT
@@ -27,7 +27,7 @@ THRUST_S = 2.0  # [s] over which the thrust at hover is learnt
 TELL_EVERY_S = 0.05  # [s] between two setpoints of where to go
 
 
-class MavlinkPlant(VehiclePlant):
+class MavlinkPlant(LinkedPlant[MavlinkLink]):
     """A vehicle that PX4 flies: offboard mode, thrust and body rates.
 
     World: east, north, up from the origin of the autopilot's local frame. Thrust per mass is a share of the motors'
@@ -47,27 +47,14 @@ class MavlinkPlant(VehiclePlant):
         Raises:
             ConfigError: The address is none, or the period is not one that PX4 can be flown at.
         """
-        super().__init__(dt, low, high)
+        super().__init__(address or ADDRESS, dt, low, high)
         if not 0.004 <= dt <= 0.1:
             raise ConfigError(f"dt = {dt} s: PX4 is commanded at 10 to 250 Hz")
-        self.address = address or ADDRESS
         address_of(self.address)
-        self.hover: float | None = None
-        """Share of the motors' thrust that carries the vehicle; known once it has hovered."""
-        self._link: MavlinkLink | None = None
+        self.thrust = ThrustScale(0.0, 1.0)
+        """From what the motors can give."""
         self._engaged = False
         self._place, self._heading, self._told = np.zeros(3), 0.0, -math.inf
-
-    @property
-    def link(self) -> MavlinkLink:
-        """The connection.
-
-        Raises:
-            PlantError: There is none.
-        """
-        if self._link is None:
-            raise PlantError(f"{self.address}: not connected; call connect or reset first")
-        return self._link
 
     def connect(self, keep_on: KeepOn = lambda: True) -> None:
         """Wait for PX4, and until it can be armed."""
@@ -97,7 +84,7 @@ class MavlinkPlant(VehiclePlant):
 
     def take_off(self, p: np.ndarray | None, yaw: float | None, keep_on: KeepOn = lambda: True) -> None:
         """Let PX4 fly to a place, and learn how much thrust it takes to hover there."""
-        x, link = self._reading(), self.link
+        x, link = self.reading(), self.link
         up = np.array([0.0, 0.0, 0.0 if link.armed else 1.0])
         self._place = x.p + up if p is None else np.asarray(p, dtype=float)
         self._heading = heading_of(x.R) if yaw is None else yaw
@@ -107,15 +94,12 @@ class MavlinkPlant(VehiclePlant):
         self._ask(lambda: link.armed, ARM_DISARM, (1.0,), ARM_S, keep_on, "to be armed")
         if not self.until(self.staying(self._place, self._tell), GO_S, keep_on):
             raise PlantError(
-                f"the autopilot is at {self._reading().p.round(2).tolist()} m after {GO_S:g} s, not at "
+                f"the autopilot is at {self.reading().p.round(2).tolist()} m after {GO_S:g} s, not at "
                 f"{self._place.round(2).tolist()}{self._said()}"
             )
         link.thrusts.clear()
         self.hold(time.monotonic() + THRUST_S)
-        thrusts = np.array(link.thrusts)
-        if len(thrusts) < 5 or not 0.05 < np.median(thrusts) < 0.95:
-            raise PlantError(f"the thrust at hover is not known: ATTITUDE_TARGET said {thrusts.round(2).tolist()}")
-        self.hover = float(np.mean(thrusts))
+        self.thrust.learn(link.thrusts)
 
     def hold(self, until: float) -> None:
         """Let PX4 hold the place of the take-off until an instant of the monotonic clock [s]."""
@@ -127,7 +111,7 @@ class MavlinkPlant(VehiclePlant):
         """Return the newest state that PX4 has sent."""
         link = self.link
         link.pump(0.0)
-        now, x, truth = time.monotonic(), self._reading(), link.truth
+        now, x, truth = time.monotonic(), self.reading(), link.truth
         if now - link.heard > LOST_S:
             raise PlantError(f"the link has been silent for {LOST_S:g} s; the autopilot does what its failsafe says")
         if self._engaged and not (self._offboard() and link.armed):
@@ -137,12 +121,9 @@ class MavlinkPlant(VehiclePlant):
 
     def transmit(self, u: np.ndarray) -> np.ndarray:
         """Send thrust and body rates."""
-        if self.hover is None:
-            raise PlantError(f"{self.address}: the vehicle has not taken off; call take_off or reset first")
-        per_c = self.hover / STANDARD_GRAVITY
-        thrust = float(np.clip(u[0] * per_c, 0.0, 1.0))
+        thrust = self.thrust.command(float(u[0]))
         self.link.fly_rates(thrust, u[1:])
-        return np.concatenate([[thrust / per_c], u[1:]])
+        return np.concatenate([[self.thrust.per_mass(thrust)], u[1:]])
 
     def wait(self, until: float) -> None:
         """Keep the link alive."""
@@ -156,23 +137,19 @@ class MavlinkPlant(VehiclePlant):
         try:
             link.pump(0.0)
             if self._engaged and link.mode[0] == OFFBOARD[0] and link.armed:
-                asked, until = -math.inf, time.monotonic() + LANDING_S
-                while link.armed and time.monotonic() < min(until, link.heard + LOST_S):
-                    if link.mode[0] == OFFBOARD[0] and time.monotonic() - asked > ASK_AGAIN_S:
-                        asked = time.monotonic()
+
+                def order() -> None:
+                    if link.mode[0] == OFFBOARD[0]:
                         link.command(SET_MODE, 1.0, *map(float, LAND))
-                    link.pump(time.monotonic() + TELL_EVERY_S)
+
+                over = lambda: not link.armed or time.monotonic() - link.heard > LOST_S  # noqa: E731
+                wait_until(insisting(order, over, ASK_AGAIN_S), LANDING_S, lambda: True, link.pump)
         finally:
             self._engaged = False
             link.close()
 
     def _offboard(self) -> bool:
         return self.link.mode[0] == OFFBOARD[0]
-
-    def _reading(self) -> Reading:
-        if self.link.reading is None:
-            raise PlantError(f"{self.address}: the autopilot has sent no state")
-        return self.link.reading
 
     def _tell(self) -> None:
         """Say where to go, now and then."""
@@ -189,7 +166,8 @@ class MavlinkPlant(VehiclePlant):
             self._tell()
             return done()
 
-        if not self.insist(lambda: self.link.command(number, *parameters), obeyed, patience, keep_on):
+        asking = insisting(lambda: self.link.command(number, *parameters), obeyed, ASK_AGAIN_S)
+        if not self.until(asking, patience, keep_on):
             raise PlantError(f"{self.address}: the autopilot refuses {what}{self._said()}")
 
     def _said(self) -> str:

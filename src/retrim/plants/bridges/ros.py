@@ -8,9 +8,10 @@ import numpy as np
 
 from ...errors import ConfigError, PlantError
 from .frames import heading_of
+from .linked_plant import LinkedPlant
+from .patience import KeepOn
 from .ros_link import ODOMETRY, POSE, RosLink
-from .vehicle_plant import KeepOn, VehiclePlant
-from .vehicle_state import Reading, VehicleState
+from .vehicle_state import VehicleState
 
 MASTER, NAMESPACE = "127.0.0.1:11311", "/mavros"
 HEARD_S, GO_S = 10.0, 120.0  # [s] to be heard; to be flown to the start
@@ -19,7 +20,7 @@ ADDRESS = re.compile(r"(?P<master>[\w.-]+:\d{1,5})(?P<namespace>(/\w+)*)")
 HEADING = math.radians(20.0)
 
 
-class RosPlant(VehiclePlant):
+class RosPlant(LinkedPlant[RosLink]):
     """A vehicle whose states and targets are topics of ROS 1.
 
     World and body are those of ROS, which are ours. Who flies it (mavros, a pilot of a flight stack) takes off, flies
@@ -40,21 +41,9 @@ class RosPlant(VehiclePlant):
         Raises:
             ConfigError: The address is none.
         """
-        super().__init__(dt, low, high)
         self.master, self.namespace = parts_of(address)
+        super().__init__(f"ros:{self.master}", dt, low, high)
         self._strongest = strongest
-        self._link: RosLink | None = None
-
-    @property
-    def link(self) -> RosLink:
-        """The connection.
-
-        Raises:
-            PlantError: There is none.
-        """
-        if self._link is None:
-            raise PlantError(f"ros:{self.master}: not connected; call connect or reset first")
-        return self._link
 
     def connect(self, keep_on: KeepOn = lambda: True) -> None:
         """Wait for the first state."""
@@ -66,24 +55,23 @@ class RosPlant(VehiclePlant):
         link = self._link
         if not self.until(lambda: link.reading is not None, HEARD_S, keep_on):
             raise PlantError(
-                f"ros:{self.master}: neither {self.namespace}/{ODOMETRY} nor {self.namespace}/{POSE} came in "
-                f"{HEARD_S:g} s"
+                f"{self.address}: neither {self.namespace}/{ODOMETRY} nor {self.namespace}/{POSE} came in {HEARD_S:g} s"
             )
 
     def take_off(self, p: np.ndarray | None, yaw: float | None, keep_on: KeepOn = lambda: True) -> None:
         """Wait until somebody has flown it to the start, and it stays there."""
-        x = self._reading()
+        x = self.reading()
         place = x.p if p is None else np.asarray(p, dtype=float)
         stays = self.staying(place)
 
         def ready() -> bool:
-            away = 0.0 if yaw is None else heading_of(self._reading().R) - yaw
+            away = 0.0 if yaw is None else heading_of(self.reading().R) - yaw
             return stays() and abs(math.remainder(away, math.tau)) < HEADING
 
         if not self.until(ready, GO_S, keep_on):
-            x = self._reading()
+            x = self.reading()
             raise PlantError(
-                f"ros:{self.master}: nobody has flown the vehicle to {place.round(2).tolist()} m"
+                f"{self.address}: nobody has flown the vehicle to {place.round(2).tolist()} m"
                 f"{'' if yaw is None else f', heading {math.degrees(yaw):.0f} deg'}, in {GO_S:g} s; it is at "
                 f"{x.p.round(2).tolist()} m, {math.degrees(heading_of(x.R)):.0f} deg"
             )
@@ -97,7 +85,7 @@ class RosPlant(VehiclePlant):
         now, link = time.monotonic(), self.link
         if now - link.heard > LOST_S:
             raise PlantError(f"no state has come for {LOST_S:g} s; who else flies the vehicle has it back")
-        return self._reading().at(now)
+        return self.reading().at(now)
 
     def transmit(self, u: np.ndarray) -> np.ndarray:
         """Publish a target."""
@@ -114,11 +102,6 @@ class RosPlant(VehiclePlant):
         link, self._link = self._link, None
         if link is not None:
             link.close()
-
-    def _reading(self) -> Reading:
-        if self.link.reading is None:
-            raise PlantError(f"ros:{self.master}: no state has come")
-        return self.link.reading
 
 
 def parts_of(address: str) -> tuple[str, str]:

@@ -12,11 +12,9 @@ from ...errors import PlantError
 from ...physics.state import STANDARD_GRAVITY, Command, State
 from ..plant import Measurement, Plant, as_numpy, check_command, limited
 from .frames import heading_of
+from .patience import KeepOn, wait_until
 from .vehicle_state import VehicleState
 
-KeepOn = Callable[[], bool]
-"""Asked again and again."""
-NAP_S = 0.01  # [s] between two questions
 THERE, STILL, STAY_S = 0.2, 0.25, 1.0  # [m], [m/s], [s] of one who has arrived
 
 
@@ -43,7 +41,7 @@ class VehiclePlant(Plant, abc.ABC):
         self._thrust = STANDARD_GRAVITY
 
     @abc.abstractmethod
-    def connect(self, keep_on: Callable[[], bool] = lambda: True) -> None:
+    def connect(self, keep_on: KeepOn = lambda: True) -> None:
         """Return when the vehicle could be armed; at once if it was before.
 
         Args:
@@ -54,7 +52,7 @@ class VehiclePlant(Plant, abc.ABC):
         """
 
     @abc.abstractmethod
-    def take_off(self, p: np.ndarray | None, yaw: float | None, keep_on: Callable[[], bool] = lambda: True) -> None:
+    def take_off(self, p: np.ndarray | None, yaw: float | None, keep_on: KeepOn = lambda: True) -> None:
         """Return when the vehicle hovers by its autopilot and is ready for commands.
 
         Args:
@@ -101,47 +99,12 @@ class VehiclePlant(Plant, abc.ABC):
         """Keep the link alive until an instant of the monotonic clock [s]."""
 
     def until(self, done: KeepOn, patience: float, keep_on: KeepOn) -> bool:
-        """Wait until something is so, for ``patience`` [s] at most; return whether it is.
+        """Keep the link alive until something is so, for ``patience`` [s] at most; return whether it is.
 
         Raises:
             PlantError: ``keep_on`` says no: the flight was given up.
         """
-        until = time.monotonic() + patience
-        while time.monotonic() < until:
-            if done():
-                return True
-            if not keep_on():
-                raise PlantError("the flight was given up before the hand-over")
-            self.wait(time.monotonic() + NAP_S)
-        return False
-
-    def insist(
-        self, order: Callable[[], object], done: KeepOn, patience: float, keep_on: KeepOn, *, every: float = 1.0
-    ) -> bool:
-        """Give an order again and again, since it may be lost, until something is so; return whether it is.
-
-        Args:
-            order: Gives it.
-            done: Asked before each time.
-            patience: For how long [s].
-            keep_on: Asked again and again; False gives up.
-            every: Time between two of them [s].
-
-        Raises:
-            PlantError: ``keep_on`` says no.
-        """
-        given = -math.inf
-
-        def obeyed() -> bool:
-            nonlocal given
-            if done():
-                return True
-            if time.monotonic() - given > every:
-                given = time.monotonic()
-                order()
-            return False
-
-        return self.until(obeyed, patience, keep_on)
+        return wait_until(done, patience, keep_on, self.wait)
 
     def staying(self, place: np.ndarray, meanwhile: Callable[[], object] = lambda: None) -> KeepOn:
         """Return what tells whether the vehicle has been at a place [m] for a while.

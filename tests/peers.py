@@ -1,0 +1,23 @@
+"""Processes that stand in for an autopilot and its vehicle."""
+
+import contextlib
+import subprocess
+import sys
+
+
+@contextlib.contextmanager
+def started(*command):
+    """A process, once it has said that it is there; ended by the signal that Ctrl-C is to it."""
+    process = subprocess.Popen([*map(str, command)], stdout=subprocess.PIPE, text=True)
+    try:
+        assert "Ctrl-C ends it" in process.stdout.readline()
+        yield process
+    finally:
+        process.terminate()
+        process.wait(10.0)
+        process.stdout.close()
+
+
+def peer(speaks, *words):
+    """A peer of ours that speaks the language of an autopilot."""
+    return started(sys.executable, "-m", f"retrim.testing.{speaks}_peer", *words)
