@@ -7,7 +7,7 @@ STAMP := $(VENV)/.installed
 
 DEV := $(VENV)/.installed-dev
 
-.PHONY: setup dev demo test check docs wheel mutants drill test-page test-ros test-px4 test-crazyflie betaflight test-betaflight bench tables pins clean
+.PHONY: setup dev demo test check docs wheel mutants drill test-page test-links test-ros test-px4 test-crazyflie betaflight test-betaflight bench tables pins clean
 
 setup: $(STAMP)
 
@@ -51,6 +51,10 @@ test-page: dev
 	command -v chromium >/dev/null || apt-get install --yes --no-install-recommends chromium
 	$(UV) pip install --quiet --python $(VENV) --constraints constraints.txt --group browser
 	$(BIN)/pytest -n 0 tests/live/test_page.py
+
+# Links to vehicles, flown against peers, and learners in another network namespace: against the clock, one at a time.
+test-links: dev
+	$(BIN)/pytest -n 0 -m "slow and not px4 and not betaflight" -k "namespaces or autopilots or test_vehicles"
 
 # Flights through PX4's own simulation, in a network namespace, since it listens on every address. RETRIM_PX4 names the
 # folder of an unpacked PX4, with bin/px4 and etc.

@@ -65,7 +65,7 @@ def keep_programs():
     What stays is not looked through for garbage again.
     """
     yield
-    if release_programs(above=45_000):
+    if release_programs(above=8_000):
         gc.unfreeze()
     gc.collect()
     gc.freeze()

@@ -1,8 +1,10 @@
 """Plant faults in the wiring, one at a time, and report the share that the tests notice.
 
 ``make mutants`` draws faults at random (seeded) from config, adapt, runtime and experiments: a comparison turned round,
-a number changed, two arguments exchanged, a keyword left out, a condition negated. Each is planted in a copy of the
-tree, and the tests of its room run until one fails. A survivor wants a test, or is equivalent to the original.
+a number changed, two arguments exchanged, a keyword left out, a condition negated. The suite runs once to learn which
+tests reach which line. Then each fault is planted in a copy of the tree, and the tests that reach it run until one
+fails: those of its own room first, the quick ones before the slow ones. A line that runs at import belongs to no test;
+the tests of its room run instead. A survivor wants a test, or is equivalent to the original.
 """
 
 import argparse
@@ -14,19 +16,23 @@ import random
 import shutil
 import subprocess
 import sys
-import tempfile
 import time
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+from coverage import CoverageData
+
 ROOT = Path(__file__).parent.parent
+PLACE = ROOT / "build" / "mutants"
 TESTS = {
     "adapt": ("tests/adapt", "tests/runtime", "tests/control"),
     "runtime": ("tests/runtime", "tests/plants"),
     "config": ("tests/config", "tests/runtime", "tests/io"),
     "experiments": ("tests/experiments", "tests/cli"),
 }
+MOST = 300  # tests that run for one fault
 SWAPS: dict[type, type] = {
     ast.Lt: ast.GtE, ast.GtE: ast.Lt, ast.Gt: ast.LtE, ast.LtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
     ast.Is: ast.IsNot, ast.IsNot: ast.Is, ast.In: ast.NotIn, ast.NotIn: ast.In,
@@ -40,80 +46,129 @@ class Mutant(NamedTuple):
     """One fault."""
 
     path: Path
+    statement: int
+    """First line of the statement that it is in."""
     line: int
     what: str
     source: str
     """The whole file with the fault."""
 
+    @property
+    def name(self) -> str:
+        """Path below the root."""
+        return self.path.relative_to(ROOT).as_posix()
+
+    @property
+    def room(self) -> str:
+        """Name of its package."""
+        return self.path.relative_to(ROOT / "src/retrim").parts[0]
+
 
 def main() -> None:
     """Run as a command."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--count", type=int, default=40, help="faults to plant")
+    parser.add_argument("--count", type=int, default=60, help="faults to plant")
     parser.add_argument("--seed", type=int, default=0, help="seed of their choice")
     parser.add_argument("--rooms", nargs="*", default=list(TESTS), choices=list(TESTS), help="where to plant them")
-    parser.add_argument("--timeout", type=float, default=600.0, help="seconds for the tests of one fault")
-    parser.add_argument("--out", type=Path, help="file for the results as JSON")
+    parser.add_argument("--again", action="store_true", help="believe what the last run found of who reaches what")
+    parser.add_argument("--out", type=Path, default=PLACE / "results.json", help="file for the results")
     chosen = parser.parse_args()
     everything = [m for room in chosen.rooms for path in sorted((ROOT / "src/retrim" / room).rglob("*.py"))
                   for m in mutants(path)]  # fmt: skip
     sample = random.Random(chosen.seed).sample(everything, min(chosen.count, len(everything)))
+    if not chosen.again:
+        watch()
+    reached = Reached()
     print(f"{len(sample)} of {len(everything)} possible faults, seed {chosen.seed}", flush=True)
     rows = []
-    with tempfile.TemporaryDirectory() as place:
-        for i, mutant in enumerate(sample, start=1):
-            began = time.monotonic()
-            seen = noticed(mutant, Path(place), chosen.timeout)
-            rows.append({"file": str(mutant.path.relative_to(ROOT)), "line": mutant.line, "fault": mutant.what,
-                         "noticed": seen})  # fmt: skip
-            shown = "noticed " if seen else "SURVIVED"
-            print(f"{i:3d} {shown} {rows[-1]['file']}:{mutant.line} {mutant.what} ({time.monotonic() - began:.0f} s)",
-                  flush=True)  # fmt: skip
-            if chosen.out:
-                chosen.out.write_text(json.dumps({"seed": chosen.seed, "rows": rows}, indent=2) + "\n")
+    for i, mutant in enumerate(sample, start=1):
+        began = time.monotonic()
+        tests, seconds = reached.tests(mutant)
+        seen = noticed(mutant, tests, 120.0 + 5.0 * seconds)
+        rows.append({"file": mutant.name, "line": mutant.line, "fault": mutant.what, "noticed": seen})
+        shown = "noticed " if seen else "SURVIVED"
+        print(f"{i:3d} {shown} {mutant.name}:{mutant.line} {mutant.what} ({len(tests)} tests, "
+              f"{time.monotonic() - began:.0f} s)", flush=True)  # fmt: skip
+        chosen.out.write_text(json.dumps({"seed": chosen.seed, "rows": rows}, indent=2) + "\n")
     share = sum(row["noticed"] for row in rows) / max(1, len(rows))
     print(f"noticed: {100 * share:.0f} % of {len(rows)}")
     sys.exit(share < 0.9)
 
 
-def noticed(mutant: Mutant, place: Path, timeout: float) -> bool:
-    """Plant a fault in a copy of the tree; return whether the tests of its room notice it."""
-    tree = place / "tree"
+def watch() -> None:
+    """Run the suite once, and write down which test reaches which line, and how long each takes."""
+    shutil.rmtree(PLACE, ignore_errors=True)
+    PLACE.mkdir(parents=True)
+    environment = {**os.environ, "COVERAGE_FILE": str(PLACE / "reached")}
+    command = [sys.executable, "-m", "pytest", "--cov=retrim", "--cov-context=test", "--cov-report=",
+               f"--junitxml={PLACE / 'times.xml'}"]  # fmt: skip
+    subprocess.run(command, cwd=ROOT, env=environment, check=True)
+
+
+class Reached:
+    """Which tests reach a line, as the suite's run found."""
+
+    def __init__(self) -> None:
+        self._data = CoverageData(str(PLACE / "reached"))
+        self._data.read()
+        self._seconds: dict[str, float] = {}
+        for case in ElementTree.parse(PLACE / "times.xml").iter("testcase"):
+            file = case.attrib["classname"].replace(".", "/") + ".py"
+            self._seconds[f"{file}::{case.attrib['name']}"] = float(case.attrib["time"])
+
+    def tests(self, mutant: Mutant) -> tuple[list[str], float]:
+        """Return the tests to run for a fault, or folders of tests, and how long they take without it [s]."""
+        by_line = self._data.contexts_by_lineno(str(mutant.path))
+        contexts = [c for line in range(mutant.statement, mutant.line + 1) for c in by_line.get(line, [])]
+        found = {context.partition("|")[0] for context in contexts} & self._seconds.keys()
+        if not found:
+            folders = TESTS[mutant.room]
+            return list(folders), sum(s for test, s in self._seconds.items() if test.startswith(folders))
+        near = TESTS[mutant.room][0]
+        ordered = sorted(found, key=lambda test: (not test.startswith(near), self._seconds[test]))[:MOST]
+        return ordered, sum(self._seconds[test] for test in ordered)
+
+
+def noticed(mutant: Mutant, tests: list[str], timeout: float) -> bool:
+    """Plant a fault in a copy of the tree; return whether tests notice it, which take far less than ``timeout`` [s]."""
+    tree = PLACE / "tree"
     shutil.rmtree(tree, ignore_errors=True)
-    for name in ("src", "tests", "examples"):
+    for name in ("src", "tests", "examples", "docs"):
         shutil.copytree(ROOT / name, tree / name, ignore=shutil.ignore_patterns("__pycache__"))
-    for name in ("pyproject.toml", "README.md"):
+    for name in ("pyproject.toml", "README.md", "CONTRIBUTING.md"):
         shutil.copy(ROOT / name, tree / name)
-    (tree / mutant.path.relative_to(ROOT)).write_text(mutant.source)
-    room = mutant.path.relative_to(ROOT / "src/retrim").parts[0]
+    (tree / mutant.name).write_text(mutant.source)
     environment = {**os.environ, "PYTHONPATH": str(tree / "src"), "PYTHONDONTWRITEBYTECODE": "1"}
-    command = [sys.executable, "-m", "pytest", "-q", "-x", "-n", "0", "-p", "no:cacheprovider", *TESTS[room]]
+    command = [sys.executable, "-m", "pytest", "-q", "-x", "-n", "0", "-p", "no:cacheprovider", *tests]
     try:
         ran = subprocess.run(command, cwd=tree, env=environment, capture_output=True, timeout=timeout, check=False)
     except subprocess.TimeoutExpired:
-        return True  # a test run that no longer ends is noticed
+        return True  # tests that no longer end are noticed
+    if ran.returncode not in (0, 1, 2):
+        raise SystemExit(f"pytest itself failed with {ran.returncode}: {ran.stderr.decode()[-500:]}")
     return ran.returncode != 0
 
 
 def mutants(path: Path) -> Iterator[Mutant]:
     """All faults of one file."""
     tree = ast.parse(path.read_text())
-    for node in list(_sites(tree)):
+    for statement, node in list(_sites(tree, 0)):
         for what, change in _changes(node):
             planted = copy.deepcopy(tree)
             twin = next(n for a, n in zip(ast.walk(tree), ast.walk(planted), strict=True) if a is node)
             change(twin)
-            yield Mutant(path, getattr(node, "lineno", 0), what, ast.unparse(planted))
+            yield Mutant(path, statement, getattr(node, "lineno", 0), what, ast.unparse(planted))
 
 
-def _sites(node: ast.AST) -> Iterator[ast.AST]:
-    """Nodes where a fault changes what is computed, rather than a text."""
+def _sites(node: ast.AST, statement: int) -> Iterator[tuple[int, ast.AST]]:
+    """Nodes where a fault changes what is computed, rather than a text, and the first lines of their statements."""
     if isinstance(node, TEXT) or (isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)):
         return
-    yield node
+    statement = node.lineno if isinstance(node, ast.stmt) else statement
+    yield statement, node
     for child in ast.iter_child_nodes(node):
         if not (isinstance(node, ast.FunctionDef) and child is node.returns):
-            yield from _sites(child)
+            yield from _sites(child, statement)
 
 
 def _changes(node: ast.AST) -> Iterator[tuple[str, object]]:
