@@ -7,7 +7,7 @@ STAMP := $(VENV)/.installed
 
 DEV := $(VENV)/.installed-dev
 
-.PHONY: setup dev demo test check docs wheel mutants drill test-page test-links test-ros test-px4 test-crazyflie betaflight test-betaflight bench tables pins clean
+.PHONY: setup dev demo test check docs wheel mutants drill test-page test-links test-cluster test-ros test-px4 test-crazyflie betaflight test-betaflight bench tables pins clean
 
 setup: $(STAMP)
 
@@ -55,6 +55,10 @@ test-page: dev
 # Links to vehicles, flown against peers, and learners in another network namespace: against the clock, one at a time.
 test-links: dev
 	$(BIN)/pytest -n 0 -m "slow and not px4 and not betaflight" -k "namespaces or autopilots or test_vehicles"
+
+# A sweep by a Dask scheduler and three workers, one of which is killed, while the connection is cut for five seconds.
+test-cluster: dev
+	$(BIN)/pytest -n 0 -m slow tests/experiments/test_cluster.py
 
 # Flights through PX4's own simulation, in a network namespace, since it listens on every address. RETRIM_PX4 names the
 # folder of an unpacked PX4, with bin/px4 and etc.
@@ -108,7 +112,7 @@ $(STAMP): pyproject.toml constraints.txt | $(UV)
 
 # The developers' tools, the site's tools, and the independent plants that the tests fly.
 $(DEV): $(STAMP)
-	$(UV) pip install --quiet --python $(VENV) --constraints constraints.txt --group dev --group docs --editable '.[plants,raptor,page,zenoh,logs,export,mavlink]'
+	$(UV) pip install --quiet --python $(VENV) --constraints constraints.txt --group dev --group docs --editable '.[plants,raptor,page,zenoh,logs,export,mavlink,dask]'
 	@touch $@
 
 # After a change of dependencies in pyproject.toml: names, versions and markers only. Versions that still fit stay;

@@ -6,12 +6,15 @@ from pathlib import Path
 
 import tyro
 
+from ..experiments.cluster import joined
 from ..experiments.run import Run
 from ..experiments.sweep import read_sweep, run_sweep
 from .console import RichReporter, show_paths
 
 
-def sweep(file: tyro.conf.Positional[Path], out: Path | None = None) -> Callable[[threading.Event], int]:
+def sweep(
+    file: tyro.conf.Positional[Path], out: Path | None = None, on: str | None = None
+) -> Callable[[threading.Event], int]:
     """Fly every combination of a sweep file: presets x scenarios x methods x seeds.
 
     The folder holds the policies and every flight's row while the sweep runs: the same command with the same --out
@@ -20,13 +23,15 @@ def sweep(file: tyro.conf.Positional[Path], out: Path | None = None) -> Callable
     Args:
         file: TOML file with any of: presets, seeds, methods, disturbances, plants, vehicles, sensors, references,
             starts, seconds, and a table [overlay] with values on top of the presets.
+        on: tcp://HOST:PORT or tls://HOST:PORT of a Dask scheduler, whose workers train and fly.
         out: Folder for sweep.md, sweep.json and sweep.png; by default runs/ and the file's name.
     """
 
     def ordered(stop: threading.Event) -> int:
-        content = read_sweep(file)
-        run = Run("sweep", out or Path("runs") / f"sweep-{file.stem}", stop=stop)
-        run_sweep(content, run, RichReporter())
+        content, reporter = read_sweep(file), RichReporter()
+        with joined(on, reporter) as executor:
+            run = Run("sweep", out or Path("runs") / f"sweep-{file.stem}", stop=stop, executor=executor)
+            run_sweep(content, run, reporter)
         show_paths([path for path in (run.folder / "sweep.md", run.folder / "sweep.png") if path.is_file()])
         return run.exit_code
 

@@ -125,6 +125,7 @@ class Fleet:
         landed: Callable[[Sequence[Flight]], None] | None = None,
         stop: threading.Event | None = None,
         only: Sequence[FlightSpec] | None = None,
+        by_lot: bool = False,
     ) -> Flights:
         """Fly.
 
@@ -136,19 +137,25 @@ class Fleet:
             landed: Receives flights that were flown to their end, in this thread.
             stop: Gives up what is flying. Ctrl-C does the same, and sets it.
             only: Fly these specifications, a part of ``specs``.
+            by_lot: Hand an executor of other processes the lots of the default, whose flights then are the same bit for
+                bit, instead of one flight at a time.
 
         Returns:
-            The flights that were flown to their end, in the order of the specifications.
+            The flights that were flown to their end, in the order of the specifications. A job that failed in another
+            process is told beside them.
 
         Raises:
             PlantError: A plant refused, or its package is not installed.
         """
         stop = stop or threading.Event()
         specs = self.specs if only is None else list(only)
-        if executor is not None:
+        if isinstance(executor, ThreadPoolExecutor):
             lots = [Lot([spec], None) for spec in specs]
-            submit = self._here(executor, stop) if isinstance(executor, ThreadPoolExecutor) else self._away(executor)
-            return gathered(specs, lots, submit, progress=progress, landed=landed, stop=stop)
+            return gathered(specs, lots, self._here(executor, stop), progress=progress, landed=landed, stop=stop)
+        if executor is not None:
+            lots = self.lots(specs) if by_lot else [Lot([spec], None) for spec in specs]
+            submit = self._away(executor)
+            return gathered(specs, lots, submit, progress=progress, landed=landed, stop=stop, outlive=True)
         lots = self.lots(specs)
         self.warm_up([lot.specs[0] for lot in lots if lot.compiled is None])
         with ThreadPoolExecutor(1 if self._latency == "measured" else lanes()) as pool:
@@ -159,8 +166,8 @@ class Fleet:
         return lambda lot, aloft: pool.submit(self._fly, lot, aloft, stop)
 
     def _away(self, executor: Executor) -> Submit:
-        """Lots are one flight each, and flown by whoever gets the job."""
-        return lambda lot, aloft: executor.submit(fly_job, self._job(lot.specs[0]))
+        """Lots are flown by whoever gets the job."""
+        return lambda lot, aloft: executor.submit(fly_job, self._job(lot.specs))
 
     def _fly(self, lot: Lot, aloft: Callable[[float], None], stop: threading.Event) -> list[Flight]:
         """Fly a lot in this process; ``aloft`` is told the share that was flown."""
@@ -186,7 +193,9 @@ class Fleet:
         finally:
             lot.compiled.set()
 
-    def _job(self, spec: FlightSpec) -> Job:
-        x0 = self._starts[spec.scenario.reference, spec.seed][spec.start]
-        policy, preset = self.policies[spec.seed], dump(self.preset)
-        return Job(self._id, preset, policy, spec, x0, self.seconds, self._latency, self._state)
+    def _job(self, specs: Sequence[FlightSpec]) -> Job:
+        policies = tuple(self.policies[spec.seed] for spec in specs)
+        starts = tuple(self._starts[spec.scenario.reference, spec.seed][spec.start] for spec in specs)
+        return Job(
+            self._id, dump(self.preset), policies, tuple(specs), starts, self.seconds, self._latency, self._state
+        )

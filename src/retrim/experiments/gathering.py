@@ -3,9 +3,10 @@
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 
+from ..errors import ConfigError
 from ..runtime.flight import FlightStopped
 from .flights import Flight, FlightSpec
 from .interrupts import interrupts_only_set
@@ -30,7 +31,9 @@ class Flights:
 
     flown: list[Flight]
     interrupted: bool
-    """Some flights are missing: the fleet was stopped."""
+    """Some flights are missing: the fleet was stopped, or a job failed."""
+    failed: dict[FlightSpec, str] = field(default_factory=dict)
+    """Flights whose job failed in another process, and why, in one line."""
 
     def rows(self) -> Rows:
         """Return one row of results per scenario, method and seed."""
@@ -45,6 +48,7 @@ def gathered(
     progress: Progress | None,
     landed: Callable[[Sequence[Flight]], None] | None,
     stop: threading.Event,
+    outlive: bool = False,
 ) -> Flights:
     """Start every lot, and wait until all flights are over or given up.
 
@@ -55,12 +59,14 @@ def gathered(
         progress: Called in this thread when flights are over, and now and then before.
         landed: Receives flights that were flown to their end, in this thread.
         stop: Gives up what is flying. Ctrl-C does the same, and sets it.
+        outlive: Go on where a lot failed, and tell in the end; what does not fit together still ends everything.
 
     Raises:
         PlantError: A plant refused.
     """
     futures: list[Future[list[Flight]]] = []
     aloft, flown = dict[int, float](), dict[FlightSpec, Flight]()
+    failed = dict[FlightSpec, str]()
     try:
         for i, lot in enumerate(lots):
             futures.append(submit(lot, partial(aloft.__setitem__, i)))
@@ -69,16 +75,22 @@ def gathered(
         def told() -> None:
             in_air = sum(len(lots[i].specs) * aloft.get(i, 0.0) for i in waiting.values())
             if progress is not None:
-                progress(len(flown) + in_air, len(specs))
+                progress(len(flown) + len(failed) + in_air, len(specs))
 
         while waiting:
             over = wait(waiting, OFTEN, FIRST_COMPLETED).done
             for future in over:
-                flights = future.result()
-                flown |= {flight.spec: flight for flight in flights}
-                if landed is not None:
-                    with interrupts_only_set(stop):
-                        landed(flights)
+                error = future.exception()
+                if error is not None and (not outlive or isinstance(error, ConfigError | FlightStopped)):
+                    raise error
+                if error is not None:
+                    failed |= dict.fromkeys(lots[waiting[future]].specs, _told(error))
+                else:
+                    flights = future.result()
+                    flown |= {flight.spec: flight for flight in flights}
+                    if landed is not None:
+                        with interrupts_only_set(stop):
+                            landed(flights)
                 del waiting[future]
                 told()
             if not over and aloft:
@@ -98,4 +110,9 @@ def gathered(
             flown |= {flight.spec: flight for flight in new}
             if landed is not None and new:
                 landed(new)
-    return Flights([flown[spec] for spec in specs if spec in flown], interrupted=len(flown) < len(specs))
+    return Flights([flown[spec] for spec in specs if spec in flown], len(flown) < len(specs), failed)
+
+
+def _told(error: BaseException) -> str:
+    """Return an error in one line."""
+    return " ".join(f"{type(error).__name__}: {error}".split())

@@ -1,4 +1,4 @@
-"""A flight as a job for another process: all it needs as a value, and the set-up that the process builds once."""
+"""A lot of flights as a job for another process: all it needs as a value, and the set-up, built once per process."""
 
 import functools
 from dataclasses import dataclass
@@ -8,29 +8,35 @@ from ..adapt.learner import LearnerState
 from ..config.loading import parse
 from ..config.setup import Latency, Setup
 from ..physics.state import State
+from .compile_cache import release_programs
 from .flights import Flight, FlightSpec
-from .flying import fly_one
+from .flying import fly_lot, fly_one
 
 
 @dataclass(frozen=True)
 class Job:
-    """Everything that one flight needs, in a form that can be sent to another process."""
+    """Everything that a lot of flights needs, in a form that can be sent to another process."""
 
     fleet: str
     """Which fleet it belongs to."""
     preset: str
-    policy: Any
-    spec: FlightSpec
-    x0: State
+    policies: tuple[Any, ...]
+    """What flies, one for each flight."""
+    specs: tuple[FlightSpec, ...]
+    starts: tuple[State, ...]
     seconds: float
     latency: Latency
     state: LearnerState | None
 
 
 def fly_job(job: Job) -> list[Flight]:
-    """Fly a job, in another process: a lot of one flight."""
-    setup: Setup = setup_for(job.preset, job.spec.scenario.reference, job.fleet)
-    return [fly_one(setup, job.policy, job.spec, job.x0, job.seconds, latency=job.latency, state=job.state)]
+    """Fly a job, in another process: several flights as one program, one by itself."""
+    setup: Setup = setup_for(job.preset, job.specs[0].scenario.reference, job.fleet)
+    if len(job.specs) > 1:
+        release_programs()
+        return fly_lot(setup, job.policies, job.specs, job.starts, job.seconds, state=job.state, cold=True)
+    (policy,), (spec,), (x0,) = job.policies, job.specs, job.starts
+    return [fly_one(setup, policy, spec, x0, job.seconds, latency=job.latency, state=job.state)]
 
 
 @functools.lru_cache(maxsize=16)

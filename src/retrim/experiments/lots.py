@@ -9,7 +9,7 @@ import jax
 from .flights import FlightSpec
 from .provenance import cores
 
-LOT = 64  # flights of one program
+LOT = 64  # flights of one program on one device
 
 
 class Lot(NamedTuple):
@@ -34,7 +34,7 @@ def in_lots(groups: Iterable[list[FlightSpec]], program: Callable[[list[FlightSp
     first, others = dict[Hashable, Lot](), list[Lot]()
     for group in groups:
         of_group = program(group)
-        size = 1 if of_group is None else min(LOT, -(-len(group) // lanes()))
+        size = 1 if of_group is None else min(LOT * jax.device_count(), -(-len(group) // lanes()))
         for i in range(0, len(group), size):
             part = group[i : i + size]
             if len(part) == 1:
@@ -47,5 +47,5 @@ def in_lots(groups: Iterable[list[FlightSpec]], program: Callable[[list[FlightSp
 
 
 def lanes() -> int:
-    """Return how many lots fly at once: one for each core, and one on an accelerator, which likes them large."""
-    return cores() if jax.default_backend() == "cpu" else 1
+    """Return how many lots fly at once: one for each core, and one where several devices or an accelerator share it."""
+    return cores() if jax.default_backend() == "cpu" and jax.device_count() == 1 else 1

@@ -7,7 +7,7 @@ import numpy as np
 
 from ..config.methods import find_method
 from ..config.presets import Preset
-from .flights import Flight
+from .flights import Flight, FlightSpec
 
 
 class Rows(list[dict[str, Any]]):
@@ -22,6 +22,10 @@ class Rows(list[dict[str, Any]]):
 
 CONDITIONS = ("disturbance", "method", "plant", "vehicle", "sensors", "thrust_error", "delay", "reference")
 """What the flights of one row have in common."""
+FIGURES = (
+    "error", "peak_after_5s", "settle_s", "cross_track_m", "behind_s", "unshifted_m", "rates_rms", "rates_change_rms",
+)  # fmt: skip
+"""What a flight is told by, but whether it crashed."""
 EFFORT = ("rates_rms", "rates_change_rms")
 """Commanded body rates, and their change in a tick [rad/s]."""
 BEHIND = ("behind_s", "unshifted_m")
@@ -55,7 +59,22 @@ def record(flight: Flight) -> dict[str, Any]:
         "rates_rms": _finite(effort[0]),
         "rates_change_rms": _finite(effort[1]),
         "crashed": crashed,
+        "failed": None,
     }
+
+
+def failed_record(spec: FlightSpec, vehicle: str, metric: str, why: str) -> dict[str, Any]:
+    """Return the figures of a flight whose job failed: none but its conditions, and why.
+
+    Args:
+        spec: What was to be flown.
+        vehicle: Name of the vehicle.
+        metric: Name of the task's error.
+        why: The error, in one line.
+    """
+    conditions = {name: getattr(spec.scenario, name) for name in CONDITIONS if hasattr(spec.scenario, name)}
+    about = {**conditions, "method": spec.method, "vehicle": vehicle, "seed": spec.seed, "start": spec.start}
+    return {**dict.fromkeys(FIGURES), **about, "metric": metric, "crashed": False, "failed": why}
 
 
 def rows(flights: Sequence[Flight], *, by_seed: bool = False) -> Rows:
@@ -102,6 +121,7 @@ def summary(records: Sequence[Mapping[str, Any]], keys: Sequence[str] = CONDITIO
         "interval": interval(records),
         "n": len(records),
         "crashes": sum(each["crashed"] for each in records),
+        **({"failures": why} if (why := [each["failed"] for each in records if each.get("failed")]) else {}),
         "errors": [each["error"] for each in records],
     }
 
@@ -140,11 +160,12 @@ def _column(records: Sequence[Mapping[str, Any]], name: str) -> np.ndarray:
 
 
 def cell(row: dict[str, Any], digits: int = 3) -> str:
-    """Return mean +- standard deviation [m], with the flights that were terminated."""
+    """Return mean +- standard deviation [m], with the flights that were terminated, or whose job failed."""
+    failed = f", {len(row['failures'])} of {row['n']} failed" if row.get("failures") else ""
     if row["mean"] is None:
-        return f"crashed, {row['crashes']} of {row['n']}"
+        return f"crashed, {row['crashes']} of {row['n']}" + failed if row["crashes"] else failed.removeprefix(", ")
     text = f"{row['mean']:.{digits}f}" + (f" ± {row['std']:.{digits}f}" if row["std"] is not None else "")
-    return text + (f", {row['crashes']} of {row['n']} crashed" if row["crashes"] else "")
+    return text + (f", {row['crashes']} of {row['n']} crashed" if row["crashes"] else "") + failed
 
 
 def _finite(value: float) -> float | None:

@@ -5,6 +5,7 @@ import json
 import sys
 import threading
 from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,7 @@ class Run:
         stop: threading.Event | None = None,
         remark: str = "",
         trained: Path | None = None,
+        executor: Executor | None = None,
     ) -> None:
         """Choose the folder and check that it can be written.
 
@@ -40,6 +42,7 @@ class Run:
             stop: Set when the run should end early.
             remark: What its documents say of how they were made.
             trained: Folder of networks that take long to train, for several runs; the run's own by default.
+            executor: Who trains and flies, in other processes; by default this one does.
 
         Raises:
             ConfigError: The folder cannot be written.
@@ -47,6 +50,7 @@ class Run:
         self.folder = out or Path("runs") / f"{command}-{datetime.now():%Y%m%d-%H%M%S}"
         self.remark = remark
         self.trained = trained or self.folder
+        self.executor = executor
         self.watch = Stopwatch()
         self.replaces = out is not None and any(self.folder.glob("*.json"))
         self.stop = stop or threading.Event()

@@ -25,11 +25,11 @@ from .fleet import Fleet
 from .flights import Flight, FlightSpec
 from .gathering import told_by
 from .limits import check_seeds
-from .metrics import Rows, cell, record, summary
+from .metrics import Rows, cell, failed_record, record, summary
 from .reporter import Reporter
 from .run import Run
 from .tables.document import Document, TableSection
-from .training import train
+from .training import train, trained_elsewhere
 
 STRICT = ConfigDict(extra="forbid")
 
@@ -126,7 +126,13 @@ def _fly(fleet: Fleet, kept: "_Kept", run: Run, reporter: Reporter) -> None:
 
     with reporter.progress(f"flying {fleet.preset.name}") as advance:
         advance(0.0, "compiling the programs of a flight")
-        fleet.run(stop=run.stop, only=missing, landed=keep, progress=told_by(advance))
+        flights = fleet.run(
+            run.executor, stop=run.stop, only=missing, landed=keep, progress=told_by(advance), by_lot=True
+        )
+    for spec, why in flights.failed.items():
+        vehicle = spec.scenario.vehicle_name(fleet.preset.vehicle)
+        row = failed_record(spec, vehicle, fleet.setups[spec.scenario.reference].flown.metric, why)
+        kept.add({keys[spec]: {"preset": fleet.preset.name, **row}})
 
 
 def _trained(preset: Preset, sweep: Sweep, run: Run, reporter: Reporter) -> dict[int, Policy]:
@@ -135,31 +141,39 @@ def _trained(preset: Preset, sweep: Sweep, run: Run, reporter: Reporter) -> dict
     Raises:
         KeyboardInterrupt: The run was interrupted before all were trained.
     """
-    found = dict[int, Policy]()
-    for seed in sweep.seeds:
-        digest = hashlib.sha256(dump(preset).encode()).hexdigest()[:8]
-        path = run.folder / "policies" / f"{preset.name.replace('/', '-')}-{digest}-seed{seed}.safetensors"
-        if path.is_file():
-            found[seed], _ = load_policy(path)
-            continue
+    digest = hashlib.sha256(dump(preset).encode()).hexdigest()[:8]
+    stem = f"{preset.name.replace('/', '-')}-{digest}"
+    paths = {seed: run.folder / "policies" / f"{stem}-seed{seed}.safetensors" for seed in sweep.seeds}
+    found = {seed: load_policy(path)[0] for seed, path in paths.items() if path.is_file()}
+    missing = [seed for seed in sweep.seeds if seed not in found]
+    if missing and run.executor is not None:
+        elsewhere = trained_elsewhere(preset, missing, run.executor, reporter=reporter, stop=run.stop)
+        for seed, (policy, _) in elsewhere.items():
+            save_policy(paths[seed], policy, preset)
+            found[seed] = policy
+        if run.interrupted:
+            raise KeyboardInterrupt
+        missing = []
+    for seed in missing:
         reporter.say(f"preset {preset.name}, seed {seed}")
         policy, _ = train(Setup.of(preset), seed, reporter=reporter, stop=run.stop)
         if run.interrupted:
             raise KeyboardInterrupt
-        save_policy(path, policy, preset)
+        save_policy(paths[seed], policy, preset)
         found[seed] = policy
-    return found
+    return {seed: found[seed] for seed in sweep.seeds}
 
 
 class _Kept:
-    """Rows of flights that are over, one line of JSON each; a torn last line is flown again."""
+    """Rows of flights that are over, one line of JSON each; a torn last line, and what failed, is flown again."""
 
     def __init__(self, path: Path) -> None:
         self._path, self.rows = path, dict[str, dict[str, Any]]()
         for line in path.read_text().splitlines() if path.is_file() else ():
             try:
                 row = json.loads(line)
-                self.rows[row["key"]] = row
+                if row["failed"] is None:
+                    self.rows[row["key"]] = row
             except (json.JSONDecodeError, KeyError, TypeError):
                 continue
 

@@ -1,6 +1,8 @@
 """Pretraining with progress, and the error of a policy in its own model."""
 
 import threading
+from collections.abc import Sequence
+from concurrent.futures import FIRST_COMPLETED, Executor, wait
 from typing import NamedTuple
 
 import equinox as eqx
@@ -9,9 +11,11 @@ import jax.numpy as jnp
 from jax import random
 from jaxtyping import Array
 
-from ..config.loading import changed
+from ..config.loading import changed, dump, parse
+from ..config.presets import Preset
 from ..config.setup import Setup
 from ..control.policy import Policy
+from ..errors import RetrimError
 from ..learn.env import Env
 from ..learn.residuals.model import FittedResidual
 from ..learn.rollout import rollout
@@ -55,6 +59,49 @@ def train(
         except KeyboardInterrupt:
             stop.set()
     return Trained(policy, losses)
+
+
+def trained_elsewhere(
+    preset: Preset, seeds: Sequence[int], executor: Executor, *, reporter: Reporter, stop: threading.Event
+) -> dict[int, tuple[Policy, float]]:
+    """Pretrain a policy for each seed, all at once, in other processes.
+
+    Args:
+        preset: What to train.
+        seeds: Seeds of weights and starts.
+        executor: Hands a seed to whoever is free.
+        reporter: Receives the progress.
+        stop: Gives up what is not trained yet.
+
+    Returns:
+        By seed: the policy, and its error in its own model [m]. Complete, but after ``stop``.
+
+    Raises:
+        RetrimError: A training failed.
+    """
+    jobs = {executor.submit(train_job, dump(preset), seed): seed for seed in seeds}
+    found, waiting = dict[int, tuple[Policy, float]](), set(jobs)
+    try:
+        with reporter.progress(f"pretraining {preset.name} elsewhere") as advance:
+            while waiting and not stop.is_set():
+                advance(len(found) / len(jobs), f"{len(found)} of {len(jobs)} seeds")
+                for job in wait(waiting, 1.0, FIRST_COMPLETED).done:
+                    waiting.remove(job)
+                    if (error := job.exception()) is not None:
+                        raise RetrimError(f"training {preset.name}, seed {jobs[job]}, failed: {error}") from error
+                    found[jobs[job]] = job.result()
+            advance(len(found) / len(jobs), f"{len(found)} of {len(jobs)} seeds")
+    finally:
+        for job in waiting:
+            job.cancel()
+    return {seed: found[seed] for seed in seeds if seed in found}
+
+
+def train_job(preset: str, seed: int) -> tuple[Policy, float]:
+    """Pretrain a policy of a preset (JSON), in another process; return it with its error in its own model [m]."""
+    setup = Setup.of(parse(preset, source="preset"))
+    policy, _ = train(setup, seed)
+    return policy, nominal_error(setup, policy)
 
 
 def nominal_error(setup: Setup, policy: Policy, *, n: int = 64, seed: int = 1) -> float:

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Key
 from ..control.policy import Policy
 from ..tasks.task import AbstractTask, Start
 from .bptt import PolicyState, bptt
+from .devices import gathered, spread, whole
 from .env import Env
 
 
@@ -30,9 +31,11 @@ def train_chunk(
 ) -> tuple[PolicyState, Float[Array, " updates"]]:
     """Make ``num_updates`` optimiser steps on fresh starts; compiled once for the same optimiser, sizes and shapes.
 
-    Training is cut into such chunks, so that progress can be shown and an interrupted run keeps what it has.
+    Training is cut into such chunks, so that progress can be shown and an interrupted run keeps what it has. Several
+    devices share the starts of each step.
     """
-    return bptt(state, env, random_starts(env.task, key, num_updates, num_envs), optimiser=optimiser)
+    starts = spread(random_starts(env.task, key, num_updates, num_envs), axis=1)
+    return whole(bptt(state, env, starts, optimiser=optimiser), num_envs)
 
 
 def pretrain(
@@ -66,5 +69,5 @@ def pretrain(
         raise ValueError(f"num_updates = {num_updates} must be a positive multiple of {chunk}")
     state = PolicyState(policy, optimiser.init(policy.params))
     for k in random.split(key, num_updates // chunk):
-        state, losses = train_chunk(state, env, k, optimiser, chunk, num_envs)
+        state, losses = gathered(train_chunk(state, env, k, optimiser, chunk, num_envs))
         yield state, losses

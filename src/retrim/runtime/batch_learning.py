@@ -21,6 +21,7 @@ from ..adapt.updates import Layer, Skip, Update
 from ..adapt.workers import PolicyWorker, ResidualWorker, policy_update, residual_update
 from ..control.controller import AbstractController
 from ..learn.bptt import PolicyState
+from ..learn.devices import spread
 from ..learn.window import Window
 from ..physics.state import where
 from .adaptive import AdaptivePilot
@@ -104,7 +105,7 @@ def fly_and_learn(
     Returns:
         What each has learnt, and the events of each flight.
     """
-    plan, keys = plans[0], jnp.stack([each.key for each in plans])
+    plan, keys = plans[0], spread(jnp.stack([each.key for each in plans]))
     batch.controllers = _controllers(plan, state)
     if cold:
         with ThreadPoolExecutor(1) as beside:

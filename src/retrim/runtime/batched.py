@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from ..learn.devices import spread
 from ..learn.window import Window
 from ..physics.state import Command, State
 from ..plants.sim import SimState, Simulation
@@ -73,7 +74,7 @@ class Batch:
         hover = Command.hover(x.p.dtype)
         u = jax.tree.map(lambda leaf: jnp.asarray(np.broadcast_to(leaf, (n, size, *leaf.shape))), hover)
         nothing, every = jnp.zeros((n, size), x.p.dtype), jnp.ones((n, size), dtype=bool)
-        blank: Window = jax.vmap(Window)(nothing, x, u, every, nothing)
+        blank: Window = spread(jax.vmap(Window)(nothing, x, u, every, nothing))
         return blank
 
     def window(self, tick: int, size: int) -> Window:
@@ -87,7 +88,7 @@ class Batch:
         n = x.p.shape[0]
         t = jnp.asarray(np.broadcast_to(at * self.dt, (n, size)), dtype=x.p.dtype)
         valid, age = jnp.asarray(np.broadcast_to(wanted >= 0, (n, size))), jnp.full_like(t, self._simulations.age)
-        windows: Window = jax.vmap(Window)(t, x, u, valid, age)
+        windows: Window = spread(jax.vmap(Window)(t, x, u, valid, age))
         return windows
 
     def log(self, i: int, events: Sequence[Event]) -> Log:
@@ -114,10 +115,10 @@ class Batch:
 
 
 def stacked(trees: Sequence[T]) -> T:
-    """Return trees of one structure as one, with a leading axis."""
+    """Return trees of one structure as one, with a leading axis that the devices share."""
     arrays = [eqx.filter(tree, eqx.is_array) for tree in trees]
     together = jax.tree.map(lambda *leaves: _stack(leaves), *arrays)
-    whole: T = eqx.combine(together, eqx.filter(trees[0], eqx.is_array, inverse=True))
+    whole: T = spread(eqx.combine(together, eqx.filter(trees[0], eqx.is_array, inverse=True)))
     return whole
 
 

@@ -67,7 +67,8 @@ def everything(run: Run, reporter: Reporter, *, quick: bool = False) -> None:
         folder = f"quick/{name}" if quick else name
         remark = run.remark if name in QUICK else ""
         row: dict[str, Any] = {"table": name, "what": what, "page": f"{folder}/{name}.md"}
-        part = Run("reproduce", run.folder / folder, stop=run.stop, remark=remark, trained=run.folder)
+        place = run.folder / folder
+        part = Run("reproduce", place, stop=run.stop, remark=remark, trained=run.folder, executor=run.executor)
         done = run.folder / FOLDER / f"{section_key(table=name, options=options)}.done"
         if done.is_file() and (run.folder / row["page"]).is_file() and is_committed():
             reporter.say(f"{name}: as an earlier run of this folder has made it")

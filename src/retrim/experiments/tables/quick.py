@@ -3,6 +3,7 @@
 import inspect
 from collections.abc import Callable, Mapping
 from inspect import Parameter
+from pathlib import Path
 from typing import Any
 
 Options = dict[str, Any]
@@ -25,28 +26,34 @@ QUICK: dict[str, Options] = {
     "tuning": {"candidates": 12, "starts": 1, "methods": ("geometric", "geometric-i", "indi")},
 }
 """By table: options that are smaller."""
+ALONE = ("model", "efficiency", "buses", "tuning", "design")
+"""Tables that this process makes alone."""
 REMARK = "A quick look, smaller than the table: figures to look at, not to quote."
 
 
 def options_of(make: Callable[..., None]) -> list[Parameter]:
-    """Return the options of a table's command: the keyword-only ones of the function that makes it, and ``quick``.
+    """Return the options of a table's command: those of the function that makes it, ``on``, ``quick`` and ``out``.
 
-    A function that has no quick look, or one of its own, gets no ``quick``.
+    Its own are the keyword-only parameters. A function that flies no fleets gets no ``on``; one that has no quick look, or one of its own, no ``quick``.
     """
     options = [each for each in inspect.signature(make).parameters.values() if each.kind is Parameter.KEYWORD_ONLY]
+    if make.__name__ not in ALONE:
+        options.append(Parameter("on", Parameter.KEYWORD_ONLY, default=None, annotation=str | None))
     if make.__name__ in QUICK:
         options.append(Parameter("quick", Parameter.KEYWORD_ONLY, default=False, annotation=bool))
-    return options
+    return [*options, Parameter("out", Parameter.KEYWORD_ONLY, default=None, annotation=Path | None)]
 
 
 def help_of(make: Callable[..., None]) -> str:
     """Return the docstring of a table's command."""
     text = inspect.getdoc(make) or ""
+    if make.__name__ not in ALONE:
+        text += "\n    on: tcp://HOST:PORT or tls://HOST:PORT of a Dask scheduler, whose workers train and fly."
     if make.__name__ in QUICK:
         text += (
             "\n    quick: One training seed, two starts, short flights, and less of all else that no option asks for."
         )
-    return text
+    return f"{text}\n    out: Folder of what is made; a new one under runs/ by default."
 
 
 def looked(make: Callable[..., None], chosen: Mapping[str, Any]) -> tuple[Options, str]:

@@ -16,7 +16,7 @@ from ..gathering import Flights, told_by
 from ..limits import check_flights, check_seeds
 from ..reporter import Reporter
 from ..run import Run
-from ..training import nominal_error, train
+from ..training import nominal_error, train, trained_elsewhere
 
 
 @dataclass(frozen=True)
@@ -49,6 +49,13 @@ def table_presets(
 
 def train_all(preset: Preset, seeds: Sequence[int], run: Run, reporter: Reporter) -> Study:
     """Train a policy for each seed; an interruption leaves those that are complete."""
+    if run.executor is not None:
+        with run.interruptible():
+            found = trained_elsewhere(preset, seeds, run.executor, reporter=reporter, stop=run.stop)
+            return Study(
+                preset, {seed: policy for seed, (policy, _) in found.items()}, tuple(e for _, e in found.values())
+            )
+        return Study(preset, {}, ())
     setup, policies, errors = Setup.of(preset), dict[int, Policy](), list[float]()
     for seed in seeds:
         if run.interrupted:
@@ -97,5 +104,10 @@ def fly_all(
     fleet = Fleet(study.preset, study.policies, scenarios, methods=methods, starts=starts, seconds=seconds)
     with run.interruptible(), reporter.progress("flying") as advance:
         advance(0.0, "compiling the programs of a flight (kept in a cache for the next time)")
-        return fleet.run(stop=run.stop, progress=told_by(advance))
+        flights = fleet.run(run.executor, stop=run.stop, progress=told_by(advance), by_lot=True)
+        for spec, why in flights.failed.items():
+            reporter.say(
+                f"failed: {spec.scenario.disturbance}, {spec.method}, seed {spec.seed}, start {spec.start}: {why}"
+            )
+        return flights
     return Flights([], interrupted=True)

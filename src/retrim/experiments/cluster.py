@@ -1,0 +1,170 @@
+"""Jobs for other machines: an executor over Dask's scheduler, which hands them to its workers."""
+
+import re
+import socket
+from collections.abc import Callable, Iterator
+from concurrent.futures import CancelledError, Executor, Future
+from contextlib import contextmanager
+from types import TracebackType
+from typing import Any
+
+from ..errors import ConfigError
+from ..plants.extras import import_extra
+from .provenance import versions
+from .reporter import Reporter
+
+ANSWERS_S = 10.0  # for somebody to be there
+BACK_S = 60.0  # for the scheduler to answer, also after its connection was cut
+WORKERS_S = 30.0  # for the first worker to be there
+ATTEMPTS = 5  # to have a job done whose worker, or whose scheduler's memory of it, was lost
+ADDRESS = re.compile(r"(tcp|tls)://\[?(?P<host>[^\]]+)\]?:(?P<port>\d{1,5})")
+ALIKE = ("retrim", "jax", "jaxlib", "equinox", "optax", "numpy", "python")
+"""What must be the same everywhere, so that a flight is the same wherever it is flown."""
+
+
+class Cluster(Executor):
+    """An executor whose jobs are done by the workers of a Dask scheduler.
+
+    A job whose worker dies is done again elsewhere; so is one that the scheduler forgot while the connection to it was
+    cut. Each job's result comes once. Nothing here listens: the scheduler is called.
+    """
+
+    def __init__(self, address: str) -> None:
+        """Connect, and compare versions.
+
+        Args:
+            address: ``tcp://HOST:PORT``, or ``tls://HOST:PORT`` with the certificates of Dask's own configuration.
+
+        Raises:
+            ConfigError: It is no address, nobody answers there, no worker is there, or one has other versions.
+            PlantError: Dask is not installed.
+        """
+        place = ADDRESS.fullmatch(address)
+        if not place or not 1 <= int(place["port"]) <= 65_535:
+            raise ConfigError(f"--on {address!r}: expected tcp://HOST:PORT or tls://HOST:PORT of a Dask scheduler")
+        self.address = address
+        distributed = import_extra("distributed", "dask", package="distributed", kind="--on")
+        try:
+            socket.create_connection((place["host"], int(place["port"])), ANSWERS_S).close()
+            self._client = distributed.Client(address, timeout=BACK_S, set_as_default=False, name="retrim")
+        except (OSError, TimeoutError, ValueError, TypeError) as error:
+            raise ConfigError(f"--on {address}: no scheduler answers there ({_line(error)})") from error
+        try:
+            self._check()
+        except BaseException:
+            self._client.close()
+            raise
+
+    @property
+    def page(self) -> str:
+        """Address of the scheduler's own page."""
+        return str(self._client.dashboard_link)
+
+    @property
+    def workers(self) -> int:
+        """How many workers there are now."""
+        return len(self._client.nthreads())
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> "Future[Any]":
+        """Have a function called by a worker; see ``concurrent.futures.Executor``."""
+        outer: Future[Any] = Future()
+        self._start(outer, lambda: self._client.submit(call, ours(), fn, args, kwargs, pure=False), ATTEMPTS)
+        return outer
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """Leave the scheduler, which drops what was not waited for."""
+        self._client.close()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Leave the scheduler."""
+        self.shutdown()
+
+    def _start(self, outer: "Future[Any]", submit: Callable[[], Any], attempts: int) -> None:
+        """Start a job, and again where it was lost, until its result is there."""
+        try:
+            inner = submit()
+        except Exception as error:
+            outer.set_exception(ConnectionError(f"the scheduler at {self.address} is gone ({_line(error)})"))
+            return
+
+        def over(done: Any) -> None:
+            if outer.done():
+                return
+            try:
+                if done.status == "error" and not _worker_died(done):
+                    outer.set_exception(done.exception())
+                    return
+                if done.status == "finished":
+                    outer.set_result(done.result())
+                    return
+                lost: object = done.status
+            except (OSError, CancelledError) as error:  # on the way from the worker
+                lost = _line(error)
+            if attempts > 1:
+                self._start(outer, submit, attempts - 1)
+            else:
+                outer.set_exception(ConnectionError(f"the job was lost {ATTEMPTS} times ({lost})"))
+
+        outer.add_done_callback(lambda future: inner.cancel() if future.cancelled() else None)
+        inner.add_done_callback(over)
+
+    def _check(self) -> None:
+        """Compare the versions of all workers with ours."""
+        try:
+            self._client.wait_for_workers(1, timeout=WORKERS_S)
+        except TimeoutError as error:
+            raise ConfigError(f"--on {self.address}: no worker came in {WORKERS_S:g} s") from error
+        for worker, theirs in self._client.run(ours).items():
+            check_alike(theirs, f"worker {worker}")
+
+
+@contextmanager
+def joined(address: str | None, reporter: Reporter) -> Iterator[Cluster | None]:
+    """Yield the cluster at an address, and say how many work there and where its page is; None without an address."""
+    if address is None:
+        yield None
+        return
+    with Cluster(address) as cluster:
+        reporter.say(f"{cluster.workers} workers at {address}; the scheduler's page is {cluster.page}")
+        yield cluster
+
+
+def ours() -> dict[str, str]:
+    """Return the versions that must be the same everywhere."""
+    found = versions()
+    return {name: found[name] for name in ALIKE}
+
+
+def check_alike(theirs: dict[str, str], who: str) -> None:
+    """Compare versions with those of this process.
+
+    Args:
+        theirs: Of :func:`ours`, in another process.
+        who: That process, for the message.
+
+    Raises:
+        ConfigError: They differ, with each difference.
+    """
+    here = ours()
+    if other := [f"{name} {theirs.get(name)}, here {here[name]}" for name in ALIKE if theirs.get(name) != here[name]]:
+        raise ConfigError(f"{who} has other versions: {'; '.join(other)}")
+
+
+def call(theirs: dict[str, str], fn: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+    """Call a function on a worker, which may have come late and have other versions than who asks."""
+    from .compile_cache import enable_compile_cache
+
+    check_alike(theirs, "who sent this job to a worker")
+    enable_compile_cache()
+    return fn(*args, **kwargs)
+
+
+def _worker_died(done: Any) -> bool:
+    """Return whether Dask gave a job up since workers died of it, or beside it."""
+    return done.status == "error" and type(done.exception()).__name__ == "KilledWorker"
+
+
+def _line(error: BaseException) -> str:
+    return " ".join(str(error).split()) or type(error).__name__

@@ -1,0 +1,234 @@
+"""Sweeps by a Dask scheduler: the same table as in one process, whatever is killed or cut on the way."""
+
+import contextlib
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+import jax
+import pytest
+
+from commands import retrim
+from helpers import tiny_preset
+from retrim import ConfigError, Fleet, Scenario, Setup
+from retrim.experiments import cluster, jobs
+from retrim.experiments.cluster import Cluster
+from retrim.experiments.flights import FlightSpec
+from retrim.experiments.metrics import cell, failed_record, summary
+
+distributed = pytest.importorskip("distributed")
+pytestmark = [
+    pytest.mark.usefixtures("as_a_user"),
+    pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning", "ignore:Port .* in use"),
+]
+SWEEP = """
+presets = ["hover/retrim"]
+seeds = [0, 1]
+methods = ["base", "full"]
+disturbances = ["none", "small", "gusts"]
+starts = {starts}
+seconds = 2
+[overlay.pretrain]
+hidden_sizes = [8]
+num_updates = 10
+num_envs = 2
+horizon = 20
+[overlay.adapt]
+window = 20
+fit_every = 0.4
+update_every = 0.6
+fit_latency = 0.1
+update_latency = 0.2
+"""
+
+
+@pytest.fixture(scope="module")
+def here(as_a_user):
+    """The address of a scheduler with two workers, which are threads of this process."""
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=False, protocol="tcp://", dashboard_address=None, host="127.0.0.1"
+    ) as found:
+        yield found.scheduler_address
+
+
+@pytest.fixture(scope="module")
+def fleet(as_a_user):
+    soon = {"window": 20, "fit_every": 0.4, "update_every": 0.6, "fit_latency": 0.1, "update_latency": 0.2}
+    preset = tiny_preset(adapt=soon)
+    policy = Setup.of(preset).new_policy(jax.random.key(0))
+    return Fleet(preset, policy, [Scenario("small", plant="simple")], starts=2, seconds=1.2)
+
+
+def test_lots_that_travel_are_the_flights_of_one_process(here, fleet):
+    with Cluster(here) as there:
+        assert there.workers == 2
+        away = fleet.run(there, by_lot=True)
+    assert away.rows() == fleet.run().rows()
+    assert not away.failed
+
+
+def test_a_job_that_fails_is_told_and_the_others_land(here, fleet, monkeypatch):
+    fly = jobs.fly_lot
+
+    def failing(setup, policies, specs, *rest, **more):
+        if specs[0].method == "full":
+            raise OSError("the disk\nis full")
+        return fly(setup, policies, specs, *rest, **more)
+
+    monkeypatch.setattr(jobs, "fly_lot", failing)
+    monkeypatch.setattr("retrim.experiments.lots.lanes", lambda: 1)
+    with Cluster(here) as there:
+        flights = fleet.run(there, by_lot=True)
+    assert [flight.spec.method for flight in flights.flown] == ["base", "base"]
+    assert {spec.method for spec in flights.failed} == {"full"}
+    assert set(flights.failed.values()) == {"OSError: the disk is full"}
+    assert flights.interrupted
+
+
+def test_a_failed_flight_is_a_row_with_its_error():
+    flown = {**failed_record(FlightSpec(Scenario(), "full", 0), "small", "m", ""), "error": 0.01, "failed": None}
+    lost = failed_record(FlightSpec(Scenario(), "full", 1), "small", "m", "OSError: gone")
+    row = summary([flown, lost])
+    assert (row["n"], row["crashes"], row["failures"]) == (2, 0, ["OSError: gone"])
+    assert cell(row) == "0.010, 1 of 2 failed"
+    assert cell(summary([lost])) == "1 of 1 failed"
+
+
+@pytest.mark.parametrize(
+    "address", ["127.0.0.1:8786", "tcp://127.0.0.1", "http://127.0.0.1:8786", "tcp://127.0.0.1:99999", "tls://:8786"]
+)
+def test_what_is_no_address_is_named(address):
+    with pytest.raises(ConfigError, match=r"expected tcp://HOST:PORT or tls://HOST:PORT of a Dask scheduler"):
+        Cluster(address)
+
+
+def test_nobody_there_is_named():
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    with pytest.raises(ConfigError, match=f"127.0.0.1:{port}: no scheduler answers there"):
+        Cluster(f"tcp://127.0.0.1:{port}")
+
+
+def test_other_versions_are_refused_before_the_first_job(here, monkeypatch):
+    with pytest.raises(ConfigError, match=r"a worker has other versions: jax 0\.1, here"):
+        cluster.check_alike({**cluster.ours(), "jax": "0.1"}, "a worker")
+    with pytest.raises(ConfigError, match="who sent this job"):
+        cluster.call({**cluster.ours(), "retrim": "9"}, int, (), {})
+    monkeypatch.setattr(Cluster, "_check", lambda self: cluster.check_alike({}, "worker w"))
+    with pytest.raises(ConfigError, match="worker w has other versions"):
+        Cluster(here)
+
+
+def test_a_table_says_what_failed_elsewhere(here, tmp_path, monkeypatch):
+    """The policies are trained by the workers, too, and the row of a job that failed is flown again."""
+    (tmp_path / "study.toml").write_text(SWEEP.format(starts=1))
+    said = retrim("sweep", "study.toml", "--on", here, "--out", "there", cwd=tmp_path)
+    assert f"2 workers at {here}" in said
+    retrim("sweep", "study.toml", "--out", "here", cwd=tmp_path)
+    assert rows(tmp_path / "there") == rows(tmp_path / "here")
+    kept = [json.loads(line) for line in (tmp_path / "there/flights.jsonl").read_text().splitlines()]
+    kept[0] |= {"failed": "OSError: gone", "error": None}
+    (tmp_path / "there/flights.jsonl").write_text("".join(json.dumps(row) + "\n" for row in kept))
+    retrim("sweep", "study.toml", "--on", here, "--out", "there", cwd=tmp_path)
+    assert [row["n"] for row in rows(tmp_path / "there")] == [2] * 6
+    assert not any("failures" in row for row in rows(tmp_path / "there"))
+
+
+def rows(folder):
+    return json.loads((folder / "sweep.json").read_text())["rows"]
+
+
+class Wire:
+    """A TCP connection to a scheduler that can be cut."""
+
+    def __init__(self, port):
+        self._to, self._pairs, self._open = port, [], True
+        self._door = socket.create_server(("127.0.0.1", 0))
+        self.port = self._door.getsockname()[1]
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def _accept(self):
+        with contextlib.suppress(OSError):
+            while True:
+                near, _ = self._door.accept()
+                if not self._open:
+                    near.close()
+                    continue
+                far = socket.create_connection(("127.0.0.1", self._to))
+                self._pairs.append((near, far))
+                for a, b in ((near, far), (far, near)):
+                    threading.Thread(target=self._carry, args=(a, b), daemon=True).start()
+
+    def _carry(self, a, b):
+        with contextlib.suppress(OSError):
+            while data := a.recv(65536):
+                b.sendall(data)
+        for end in (a, b):
+            with contextlib.suppress(OSError):
+                end.shutdown(socket.SHUT_RDWR)
+
+    def cut(self, seconds):
+        self._open = False
+        for pair in self._pairs:
+            for end in pair:
+                with contextlib.suppress(OSError):
+                    end.shutdown(socket.SHUT_RDWR)
+        time.sleep(seconds)
+        self._open = True
+
+    def close(self):
+        self._door.close()
+
+
+@contextlib.contextmanager
+def processes(folder):
+    """A scheduler and three workers, each a process of its own; yields its port and the workers."""
+    dask = [sys.executable, "-m", "dask"]
+    place = ["--no-dashboard", "--scheduler-file", str(folder / "scheduler.json")]
+    quiet = {"cwd": folder, "stdout": subprocess.DEVNULL, "stderr": (folder / "dask.log").open("w")}
+    with contextlib.ExitStack() as stack:
+
+        def start(*words):
+            found = subprocess.Popen([*dask, *words], start_new_session=True, **quiet)
+            stack.callback(found.wait, 30)
+            stack.callback(lambda: os.killpg(found.pid, signal.SIGKILL))
+            return found
+
+        start("scheduler", "--host", "127.0.0.1", "--port", "0", *place)
+        while not (folder / "scheduler.json").exists():
+            time.sleep(0.1)
+        address = json.loads((folder / "scheduler.json").read_text())["address"]
+        yield (
+            int(address.rpartition(":")[2]),
+            [start("worker", address, "--nthreads", "1", "--no-dashboard", "--no-nanny") for _ in range(3)],
+        )
+
+
+@pytest.mark.slow
+def test_a_killed_worker_and_a_cut_connection_change_nothing(tmp_path):
+    (tmp_path / "study.toml").write_text(SWEEP.format(starts=5))
+    flights = tmp_path / "there" / "flights.jsonl"
+    with processes(tmp_path) as (port, workers), ThreadPoolExecutor(1) as beside:
+        wire = Wire(port)
+
+        def disturb():
+            while not flights.exists():
+                time.sleep(0.1)
+            workers[0].kill()
+            wire.cut(5.0)
+
+        done = beside.submit(disturb)
+        retrim("sweep", "study.toml", "--on", f"tcp://127.0.0.1:{wire.port}", "--out", "there", cwd=tmp_path)
+        assert done.done()
+        wire.close()
+    retrim("sweep", "study.toml", "--out", "here", cwd=tmp_path)
+    assert rows(tmp_path / "there") == rows(tmp_path / "here")
+    keys = [json.loads(line)["key"] for line in flights.read_text().splitlines()]
+    assert len(keys) == len(set(keys)) == 60

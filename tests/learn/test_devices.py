@@ -1,0 +1,99 @@
+"""One program on eight devices: pretraining, flights and what they learn are those of one device, to rounding."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from retrim.learn.devices import shared_by, spread
+
+HERE = Path(__file__).parent
+WORK = """
+import sys
+
+import jax
+import numpy as np
+
+sys.path.insert(0, "{tests}")
+from helpers import tiny_preset
+from retrim import Fleet, Scenario, Setup
+
+jax.config.update("jax_enable_x64", True)
+assert jax.device_count() == {devices}
+soon = {{"window": 20, "fit_every": 0.2, "update_every": 0.3, "fit_latency": 0.1, "update_latency": 0.1}}
+preset = tiny_preset(
+    pretrain={{"hidden_sizes": (8,), "num_updates": 4, "num_envs": 8, "horizon": 10}}, adapt={{"fit_steps": 3, **soon}}
+)
+setup, losses = Setup.of(preset), []
+for policy, some in setup.pretraining(0):
+    losses += [float(loss) for loss in some]
+gusts = Scenario("gusts", plant="simple", sensors="mocap")
+fleet = Fleet(preset, policy, [gusts], methods=("full",), starts=8, seconds=1.0)
+fleet.lots(fleet.specs)
+flights = fleet.run().flown
+learnt = [jax.tree.leaves(flight.learnt)[0] for flight in flights]
+np.savez(
+    "{out}",
+    losses=losses,
+    weights=policy.layers[0].weight,
+    flown=np.stack([flight.log.p for flight in flights]),
+    commands=np.stack([flight.log.u for flight in flights]),
+    learnt=np.stack([np.asarray(leaf) for leaf in learnt]),
+    swaps=[len(flight.swaps) for flight in flights],
+)
+"""
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory):
+    """What one device and eight devices have computed, each in a process of its own, at the same time."""
+    folder = tmp_path_factory.mktemp("devices")
+
+    def start(devices):
+        flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count={devices}"
+        code = WORK.format(tests=HERE.parent, devices=devices, out=folder / f"{devices}.npz")
+        environment = {**os.environ, "XLA_FLAGS": flags, "JAX_NUMPY_DTYPE_PROMOTION": "standard"}
+        return subprocess.Popen([sys.executable, "-c", code], env=environment, stderr=subprocess.PIPE, text=True)
+
+    processes = [start(1), start(8)]
+    said = [process.communicate(timeout=400)[1] for process in processes]
+    assert [process.returncode for process in processes] == [0, 0], said
+    return [dict(np.load(folder / f"{devices}.npz")) for devices in (1, 8)]
+
+
+def test_pretraining_is_that_of_one_device(found):
+    one, eight = found
+    assert len(one["losses"]) == 4
+    np.testing.assert_allclose(eight["losses"], one["losses"], rtol=1e-9)
+    np.testing.assert_allclose(eight["weights"], one["weights"], rtol=1e-6, atol=1e-9)
+
+
+def test_flights_of_a_batch_are_those_of_one_device(found):
+    one, eight = found
+    assert one["flown"].shape == (8, 51, 3)
+    np.testing.assert_allclose(eight["flown"], one["flown"], atol=1e-7)
+    np.testing.assert_allclose(eight["commands"], one["commands"], atol=1e-6)
+
+
+def test_what_a_fleet_learns_is_that_of_one_device(found):
+    one, eight = found
+    np.testing.assert_array_equal(eight["swaps"], one["swaps"])
+    assert one["swaps"].sum() > 0
+    np.testing.assert_allclose(eight["learnt"], one["learnt"], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("n", "devices", "count"), [(24, 8, 8), (10, 8, 5), (7, 8, 7), (11, 8, 1), (64, 3, 2), (5, 1, 1)]
+)
+def test_as_many_devices_share_work_as_divide_it(n, devices, count):
+    assert shared_by(n, devices) == count
+
+
+def test_with_one_device_nothing_is_moved():
+    tree = {"x": np.ones((4, 2)), "name": "kept"}
+    assert spread(tree) is tree
+    assert jax.device_count() == 1
