@@ -34,7 +34,8 @@ REMARK = "A quick look, smaller than the table: figures to look at, not to quote
 def options_of(make: Callable[..., None]) -> list[Parameter]:
     """Return the options of a table's command: those of the function that makes it, ``on``, ``quick`` and ``out``.
 
-    Its own are the keyword-only parameters. A function that flies no fleets gets no ``on``; one that has no quick look, or one of its own, no ``quick``.
+    Its own are the keyword-only parameters. A function that flies no fleets gets no ``on``; one that has no quick look,
+    or one of its own, no ``quick``.
     """
     options = [each for each in inspect.signature(make).parameters.values() if each.kind is Parameter.KEYWORD_ONLY]
     if make.__name__ not in ALONE:
