@@ -184,7 +184,7 @@ def test_commands_stay_within_what_the_vehicle_takes():
 
     class Deaf(MavlinkLink):
         def __init__(self):
-            self.sent = None
+            self.sent, self.reading, self.heard = None, None, 0.0
 
         def fly_rates(self, thrust, omega):
             self.sent = thrust, omega
