@@ -102,7 +102,8 @@ def watch() -> None:
     environment = {**os.environ, "COVERAGE_FILE": str(PLACE / "reached")}
     command = [sys.executable, "-m", "pytest", "--cov=retrim", "--cov-context=test", "--cov-report=",
                f"--junitxml={PLACE / 'times.xml'}"]  # fmt: skip
-    subprocess.run(command, cwd=ROOT, env=environment, check=True)
+    if subprocess.run(command, cwd=ROOT, env=environment, check=False).returncode > 1:
+        raise SystemExit("the suite could not be run")
 
 
 class Reached:
@@ -114,16 +115,19 @@ class Reached:
         self._seconds: dict[str, float] = {}
         for case in ElementTree.parse(PLACE / "times.xml").iter("testcase"):
             file = case.attrib["classname"].replace(".", "/") + ".py"
+            if len(case):  # it failed, or was skipped, without any fault
+                continue
             self._seconds[f"{file}::{case.attrib['name']}"] = float(case.attrib["time"])
 
     def tests(self, mutant: Mutant) -> tuple[list[str], float]:
-        """Return the tests to run for a fault, or folders of tests, and how long they take without it [s]."""
+        """Return the tests to run for a fault, and how long they take without it [s]."""
         by_line = self._data.contexts_by_lineno(str(mutant.path))
         contexts = [c for line in range(mutant.statement, mutant.line + 1) for c in by_line.get(line, [])]
         found = {context.partition("|")[0] for context in contexts} & self._seconds.keys()
         if not found:
             folders = TESTS[mutant.room]
-            return list(folders), sum(s for test, s in self._seconds.items() if test.startswith(folders))
+            tests = [test for test in self._seconds if test.startswith(folders)]
+            return tests, sum(self._seconds[test] for test in tests)
         near = TESTS[mutant.room][0]
         ordered = sorted(found, key=lambda test: (not test.startswith(near), self._seconds[test]))[:MOST]
         return ordered, sum(self._seconds[test] for test in ordered)

@@ -39,9 +39,12 @@ def station(address, over):
     """A ground station in a thread, until ``over`` is set."""
     with DrillGround(address) as ground:
         for _ in ground.wait():
+            time.sleep(0.02)
             if over.is_set():
                 return
         for _ in ground.learn():
+            if not ground.carried:
+                time.sleep(0.002)
             if over.is_set():
                 return
 

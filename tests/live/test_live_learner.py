@@ -40,6 +40,7 @@ class Beside:
         self.path, self.controller, self.state = start
         room = {f"update.{layer}.{i}": 5_000_000 for layer in ("residual", "policy") for i in (0, 1)}
         room |= {"said.residual": 8192, "said.policy": 8192, "parameters.residual": 2_000_000}
+        room |= {"ready.residual": 8192, "ready.policy": 8192}
         self.bus = InProcessBus(TOPICS | room)
         self.tick, self.now = 0, 100.0
         self.loops = {layer: self.learner(layer) for layer in layers}
@@ -78,12 +79,12 @@ def improving(loop, meanwhile=lambda: None):
 
     def learn(window):
         meanwhile()
-        was = loop._worker._policy
+        was = loop.worker._policy
         nudged = jax.tree.map(lambda leaf: leaf + 0.01, was.policy.params)
         state = PolicyState(was.policy.with_params(nudged), was.optimiser)
         return PolicyUpdate(float(window.t[-1]), 1.0, 2.0, state)
 
-    loop._worker.learn = learn
+    loop.worker.learn = learn
     return loop
 
 
@@ -93,7 +94,7 @@ def weights(tree):
 
 def base_of(loop):
     """The policy that the next update starts from."""
-    return weights(loop._worker._policy.policy)
+    return weights(loop.worker._policy.policy)
 
 
 def test_a_window_becomes_parameters_that_the_controller_takes(start):

@@ -55,6 +55,11 @@ class ResidualWorker:
     def __init__(self, learner: OnlineLearner, state: LearnerState) -> None:
         self.learner, self._residual = learner, state.residual
 
+    @property
+    def state(self) -> Any:
+        """What a fit goes on from."""
+        return self._residual
+
     def learn(self, window: Window) -> ResidualUpdate | Rejection:
         """Fit to ``window``."""
         fitted, report = jax.block_until_ready(self.learner.fit_residual(self._residual, window))
@@ -76,9 +81,20 @@ class PolicyWorker:
         self._policy: PolicyState = state.policy
         self._residual = state.residual
 
+    @property
+    def state(self) -> LearnerState:
+        """What an update goes on from: a policy, in the model of a residual."""
+        return LearnerState(self._policy, self._residual)
+
+    def next_key(self) -> Key[Array, ""]:
+        """Return the key of an update; each call returns another."""
+        self.key, key = random.split(self.key)
+        now: Key[Array, ""] = key
+        return now
+
     def learn(self, window: Window) -> PolicyUpdate | Rejection:
         """Re-train; the window gives starts for the gate."""
-        self.key, key = random.split(self.key)
+        key = self.next_key()
         trained, verdict = jax.block_until_ready(self.learner.update_policy(self._policy, self._residual, window, key))
         return policy_update(float(window.t[-1]), trained, verdict)
 

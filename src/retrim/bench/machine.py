@@ -29,6 +29,17 @@ def on_core(i: int) -> None:
     os.sched_setaffinity(0, {sorted(os.sched_getaffinity(0))[i]})
 
 
+def last_core() -> int:
+    """Return the number of the last core that this process may use.
+
+    Raises:
+        OSError: The system does not let a process choose.
+    """
+    if not hasattr(os, "sched_getaffinity"):
+        raise OSError("this system does not let a process choose its core")
+    return max(os.sched_getaffinity(0))
+
+
 def unit() -> Callable[[], float]:
     """Return a function that takes the time of one unit now [s], the median of three runs."""
     weight = jnp.full((WIDTH, WIDTH), 1.0 / WIDTH)

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from functools import partial
 from typing import Any
 
 from jax import random
@@ -24,6 +25,7 @@ from .flown import learner_in_flight
 from .machine import on_core, rates
 from .timing import Work, compiled, timed
 from .training import encode_and_pretrain, pretrain
+from .vehicles import live_fleet
 
 
 def _update(name: str, *, lora: bool = False) -> dict[str, Any]:
@@ -151,6 +153,13 @@ WORKS: dict[str, Work] = {
     "fleet-map": Work("8 policy updates, lax.map", "-", one_after_another),
     "fleet-vmap": Work("8 policy updates, vmap", "-", side_by_side),
     "fleet-threads": Work("8 policy updates, 2 threads", "-", on_threads),
+    **{
+        f"vehicles-{n}": Work(
+            f"{n} vehicles live at 50 Hz, one process learns for all", "16 within 4 times the delay of one",
+            partial(live_fleet, n), two_cores=True,
+        )
+        for n in (1, 4, 16)
+    },
     "demo": Work("retrim demo", "75 s in all, 2000 MB", _demo),
 }  # fmt: skip
 

@@ -2,8 +2,10 @@
 
 import os
 import tempfile
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from subprocess import Popen
 from typing import Any
@@ -15,11 +17,12 @@ from ..onboard.topics import INTO, MOST, OUT
 from ..transport.bridge import Bridge
 from ..transport.remote import Address
 from ..transport.shared_memory import SharedMemoryBus
+from .fleet_learner import FleetProcess, Seat
 from .learner_process import LearnerPlan
 from .mission import Mission
 from .spec import MAINS
 
-IDLE = 0.002  # [s]
+IDLE, SELDOM = 0.002, 0.05  # [s] between two looks at a bus, while a flight goes on and before it begins
 BEAT_EVERY = 0.25  # [s]
 SILENCE = 5.0  # [s] without a word of the flight, after which it is told
 ATTEMPTS = 5  # to bring a learner back
@@ -28,8 +31,12 @@ ATTEMPTS = 5  # to bring a learner back
 class Ground:
     """The learners of one flight, which is elsewhere. Leaving it as a context ends them."""
 
-    def __init__(self, address: Address) -> None:
+    def __init__(self, address: Address, fleet: FleetProcess | None = None) -> None:
         """Join the bus.
+
+        Args:
+            address: Where the flight is.
+            fleet: The process that learns for all of several flights; None: processes of this one alone.
 
         Raises:
             ConfigError: It cannot be joined.
@@ -37,11 +44,14 @@ class Ground:
         self._network = address.join(dict.fromkeys((*OUT, *INTO), MOST), listen=False)
         self._place = tempfile.TemporaryDirectory(prefix="retrim-ground-")
         self.folder = Path(self._place.name)
-        self.processes: dict[str, Popen[bytes]] = {}
+        self.address, self._fleet = address, fleet
+        self.processes: dict[str, Popen[bytes] | Seat] = {}
         self.restarts: dict[str, int] = {}
         self._mission: Mission | None = None
         self._bus: SharedMemoryBus | None = None
         self._bridge: Bridge | None = None
+        self.carried = False
+        """Whether anything was carried in the last step; if not, there is time to sleep."""
         self._known, self._beaten, self._standing = 0, float("-inf"), "waiting for a flight"
         self._heard = (0, time.monotonic())
 
@@ -61,10 +71,9 @@ class Ground:
         """Yield until there is a flight to learn for."""
         while not self._look():
             yield
-            time.sleep(0.05)
 
     def learn(self) -> Iterator[str]:
-        """Learn until the flight is over; yield how it stands, very often.
+        """Learn until the flight is over; yield how it stands, after each step.
 
         A flight that is not heard of any more may come back, and another one may begin.
         """
@@ -72,8 +81,7 @@ class Ground:
             self._look()
             assert self._bridge is not None
             assert self._bus is not None
-            if not self._bridge.step():
-                time.sleep(IDLE)
+            self.carried = self._bridge.step() > 0
             if time.monotonic() - self._beaten > BEAT_EVERY:
                 self._beaten = time.monotonic()
                 self._standing = self._beat()
@@ -130,7 +138,11 @@ class Ground:
         assert self._bus is not None
         start = self.folder / f"start-{m.number}.safetensors"
         plan = LearnerPlan(self._bus.folder, layer, start, m.reference, m.seed, m.base, os.getpid(), m.floor)
-        self.processes[layer] = launch(MAINS[layer], plan, self.folder / f"{layer}.log")
+        complaints = self.folder / f"{layer}.log"
+        if self._fleet is not None:
+            self.processes[layer] = self._fleet.start(layer, plan, complaints)
+        else:
+            self.processes[layer] = launch(MAINS[layer], plan, complaints)
 
     def _beat(self) -> str:
         """Tell the flight who is alive, bring back who is not, and return how it stands."""
@@ -164,3 +176,53 @@ class Ground:
         if version != self._heard[0] or not version:
             self._heard = version, time.monotonic()
         return time.monotonic() - self._heard[1]
+
+
+def learn_for(
+    addresses: Sequence[Address], stop: threading.Event, told: Callable[[str], None] = lambda text: None
+) -> str:
+    """Learn for flights elsewhere until all of them are over.
+
+    One flight has processes of its own; several have one process for all, which learns for those that are due at once.
+
+    Args:
+        addresses: Where the flights are.
+        stop: Ends it early; the flights go on with their last policies.
+        told: Receives how they stand, very often.
+
+    Returns:
+        How they ended, one line for each.
+
+    Raises:
+        ConfigError: One of the buses cannot be joined.
+    """
+    with ExitStack() as stack:
+        fleet = None
+        if len(addresses) > 1:
+            fleet = FleetProcess(Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="retrim-fleet-"))))
+            stack.callback(fleet.close)
+        grounds = [stack.enter_context(Ground(address, fleet)) for address in addresses]
+        waiting = {ground: ground.wait() for ground in grounds}
+        flights = dict[Ground, Iterator[str]]()
+        stands = dict.fromkeys(grounds, "waiting for a flight")
+        while (waiting or flights) and not stop.is_set():
+            for ground, wait in list(waiting.items()):
+                if next(wait, "there") == "there":
+                    del waiting[ground]
+                    flights[ground] = ground.learn()
+            for ground, flight in list(flights.items()):
+                if (stands_now := next(flight, None)) is None:
+                    del flights[ground]
+                else:
+                    stands[ground] = stands_now
+            told(_summary(stands))
+            if not any(ground.carried for ground in flights):
+                time.sleep(IDLE if flights else SELDOM)
+        return _summary(stands)
+
+
+def _summary(stands: dict[Ground, str]) -> str:
+    """Return how flights stand: one in its own words, several by their addresses."""
+    if len(stands) == 1:
+        return next(iter(stands.values()))
+    return "; ".join(f"{ground.address}: {words}" for ground, words in stands.items())

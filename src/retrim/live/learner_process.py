@@ -17,10 +17,12 @@ from ..adapt.buffer import RollingBuffer
 from ..adapt.learner import LearnerState
 from ..adapt.updates import Layer, PolicyUpdate, ResidualUpdate, Update, pack_update
 from ..adapt.workers import PolicyWorker, ResidualWorker, Worker
+from ..config.presets import Preset
 from ..config.setup import Setup
 from ..errors import MessageError
 from ..experiments.compile_cache import enable_compile_cache
 from ..io.trained import load_learnt
+from ..learn.window import Window
 from ..onboard.messages import COMMAND, MEASURED, FlightRows, Parameters, last_note, pack_note
 from ..onboard.realtime import Lifeline
 from ..physics.state import Command, State
@@ -57,31 +59,50 @@ class LearnerPlan:
 class LearnerLoop:
     """One layer beside the flight. :meth:`step` is the whole of it; a test gives it a clock."""
 
-    def __init__(self, plan: LearnerPlan, bus: Bus, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self,
+        plan: LearnerPlan,
+        bus: Bus,
+        clock: Callable[[], float] = time.monotonic,
+        setup_of: Callable[[Preset, str | None], Setup] = Setup.of,
+    ) -> None:
+        """Build it.
+
+        Args:
+            plan: What to learn.
+            bus: Of the flight.
+            clock: The time [s].
+            setup_of: Returns the set-up of a preset and a reference; loops of several vehicles may share one.
+        """
         state, preset = load_learnt(plan.start)
         self.plan, self.bus, self.state, self._clock = plan, bus, state, clock
-        self.setup = Setup.of(preset, plan.reference)
+        self.setup = setup_of(preset, plan.reference)
         self.every = preset.adapt.fit_every if plan.layer == "residual" else preset.adapt.update_every
         self._buffer = RollingBuffer(preset.adapt.window)
-        self._worker = self._new_worker()
+        self.worker = self.new_worker()
+        """It goes on from what is flown."""
         self._last_tick, self._new_ticks, self._began = -1, 0, float("-inf")
         self._known: dict[str, int] = {}
         self._learnt = 0
         self._pending: tuple[int, PolicyUpdate, float] | None = None
         self._flown: list[tuple[int, Update]] = []
 
-    def _new_worker(self) -> Worker:
+    def new_worker(self) -> Worker:
+        """Return a worker that begins with what was learnt before the flight."""
         if self.plan.layer == "residual":
             return ResidualWorker(self.setup.learner, self.state)
         return PolicyWorker(self.setup.learner, self.state, random.key(self.plan.seed))
 
     def warm_up(self) -> None:
         """Compile what a flight needs; what is learnt from a made-up window is dropped."""
-        x = State.at(self.setup.flown.home())
-        self._buffer.push(0.0, x, Command.hover(x.p.dtype))
-        self._worker.learn(self._buffer.window())
-        self._buffer.clear()
-        self._worker = self._new_worker()
+        self.worker.learn(self.made_up_window())
+        self.worker = self.new_worker()
+
+    def made_up_window(self) -> Window:
+        """Return a window of the shapes of the flight's, with one tick of hover."""
+        x, buffer = State.at(self.setup.flown.home()), RollingBuffer(self.setup.preset.adapt.window)
+        buffer.push(0.0, x, Command.hover(x.p.dtype))
+        return buffer.window()
 
     def catch_up(self) -> None:
         """Go on from what an earlier process of this layer published and control flies."""
@@ -92,28 +113,38 @@ class LearnerLoop:
             and found[0] > self.plan.floor
         ):
             self._flown = [found]
-            self._worker.receive(found[1])
+            self.worker.receive(found[1])
 
     def step(self) -> bool:
         """Take what is new and learn if it is time; return whether something was learnt."""
+        window = self.due()
+        if window is None:
+            return False
+        self.learnt(self.worker.learn(window))
+        return True
+
+    def due(self) -> Window | None:
+        """Take what is new; return the window to learn from if it is time, else None."""
         self._look()
         if self.plan.layer == "policy":
             self._take_residual()
             self._judge()
         waits = self._pending is not None or not self._new_ticks or self._clock() - self._began < self.every
         if waits or not self._wanted():
-            return False
+            return None
         self._began, self._new_ticks = self._clock(), 0
-        update = self._worker.learn(self._buffer.window())
+        return self._buffer.window()
+
+    def learnt(self, update: Update) -> None:
+        """Publish what was learnt from the window of :meth:`due`, if it is still wanted."""
         self._learnt += 1
         took = self._clock() - self._began
         note = pack_note(f"learner.{self.plan.layer}", learnt=self._learnt, took=took, until=update.computed_from)
         self.bus.publish(f"learner.{self.plan.layer}", note)
         if self.plan.layer == "policy" and self._judge():
-            return True  # the policy that it was trained from was taken back meanwhile
+            return  # the policy that it was trained from was taken back meanwhile
         if self._wanted():
             self._publish(update)
-        return True
 
     def _look(self) -> None:
         """Add the ticks that are new to the window."""
@@ -148,7 +179,7 @@ class LearnerLoop:
         if isinstance(update, PolicyUpdate):
             self._pending = version, update, self._clock()
         else:
-            self._worker.receive(update)
+            self.worker.receive(update)
 
     def _learnt_by(self, update: Update) -> LearnerState:
         if isinstance(update, PolicyUpdate):
@@ -164,14 +195,14 @@ class LearnerLoop:
             self._flown.pop()
             back = True
         if back:
-            self._worker.receive(self._flown[-1][1] if self._flown else _start(self.state))
+            self.worker.receive(self._flown[-1][1] if self._flown else _start(self.state))
         if self._pending is None:
             return back
         version, update, published = self._pending
         if version in given_up:
             self._pending = None
         elif status.get("newest", {}).get("policy", 0) >= version:
-            self._worker.receive(update)
+            self.worker.receive(update)
             self._flown, self._pending = [*self._flown[-REMEMBERED:], (version, update)], None
         elif self._clock() - published > VERDICT:
             self._pending = None  # it was damaged on the way, or nobody takes policies any more
@@ -191,7 +222,7 @@ class LearnerLoop:
         found = newest_update(self.bus, self.state, "residual", after=self._known.get("fit", 0))
         if found is not None:
             self._known["fit"] = found[0]
-            self._worker.receive(found[1])
+            self.worker.receive(found[1])
 
     def _fresh(self, topic: str) -> bytes | None:
         message = self.bus.latest(topic, self._known.get(topic, 0))

@@ -175,7 +175,7 @@ def _controllers(plan: Plan, state: LearnerState) -> Any:
 
 def _fitted(learner: OnlineLearner, state: LearnerState, window: Window) -> tuple[Any, list[Update]]:
     """Fit the residual of every flight; return the states, and what each flight is told, with the states of all."""
-    states, reports = _fit(learner, state.residual, window)
+    states, reports = fit_all(learner, state.residual, window)
     reports, t = jax.device_get((reports, window.t[:, -1]))
     return states, [residual_update(float(t[i]), states, _row(reports, i)) for i in range(len(t))]
 
@@ -184,7 +184,8 @@ def _updated(
     learner: OnlineLearner, state: LearnerState, window: Window, keys: Key[Array, " n"]
 ) -> tuple[Key[Array, " n"], Any, list[Update]]:
     """Re-train the policy of every flight; a flight keeps its own where the gate refused the new one."""
-    keys, trained, verdicts = _update(learner, state, window, keys)
+    keys, now = _next_keys(keys)
+    trained, verdicts = update_all(learner, state, window, now)
     verdicts, t = jax.device_get((verdicts, window.t[:, -1]))
     return keys, trained, [policy_update(float(t[i]), trained, _row(verdicts, i)) for i in range(len(t))]
 
@@ -194,19 +195,32 @@ def _row(tree: Any, i: int) -> Any:
 
 
 @eqx.filter_jit
-def _fit(learner: OnlineLearner, residuals: Any, windows: Window) -> tuple[Any, FitReport]:
+def fit_all(learner: OnlineLearner, residuals: Any, windows: Window) -> tuple[Any, FitReport]:
+    """Fit the residual of each flight; every array has a leading axis of flights."""
     fitted: tuple[Any, FitReport] = eqx.filter_vmap(learner.fit_residual)(residuals, windows)
     return fitted
 
 
 @eqx.filter_jit
-def _update(
+def update_all(
     learner: OnlineLearner, state: LearnerState, windows: Window, keys: Key[Array, " n"]
-) -> tuple[Key[Array, " n"], PolicyState, Verdict]:
-    def update(state: LearnerState, window: Window, key: Key[Array, ""]) -> tuple[Key[Array, ""], PolicyState, Verdict]:
-        key, now = random.split(key)
-        trained, verdict = learner.update_policy(state.policy, state.residual, window, now)
-        return key, where(verdict.admitted, trained, state.policy), verdict
+) -> tuple[PolicyState, Verdict]:
+    """Re-train the policy of each flight; every array has a leading axis of flights.
 
-    updated: tuple[Key[Array, " n"], PolicyState, Verdict] = eqx.filter_vmap(update)(state, windows, keys)
+    Returns:
+        The trained policy, or the old one where the gate refused it, and the verdicts.
+    """
+
+    def update(state: LearnerState, window: Window, key: Key[Array, ""]) -> tuple[PolicyState, Verdict]:
+        trained, verdict = learner.update_policy(state.policy, state.residual, window, key)
+        return where(verdict.admitted, trained, state.policy), verdict
+
+    updated: tuple[PolicyState, Verdict] = eqx.filter_vmap(update)(state, windows, keys)
     return updated
+
+
+@jax.jit
+def _next_keys(keys: Key[Array, " n"]) -> tuple[Key[Array, " n"], Key[Array, " n"]]:
+    """Return the keys to go on with, and those of an update."""
+    both = jax.vmap(random.split)(keys)
+    return both[:, 0], both[:, 1]

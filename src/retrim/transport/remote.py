@@ -1,5 +1,6 @@
-"""Buses between machines by name: ``zenoh:192.168.1.5:7447``, ``ros:192.168.1.5:11311``."""
+"""Buses between machines by name: ``zenoh:192.168.1.5:7447``, ``ros:192.168.1.5:11311/quad1``."""
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -8,6 +9,7 @@ from .network import NetworkBus
 
 KINDS = ("zenoh", "ros")
 LOOPBACK = ("127.0.0.1", "localhost")
+ADDRESS = re.compile(r"(?P<kind>\w+):(?P<host>[^/]+):(?P<port>\d{1,5})(/(?P<key>\w+))?")
 
 
 @dataclass(frozen=True)
@@ -17,6 +19,12 @@ class Address:
     kind: str
     host: str
     port: int
+    key: str = ""
+    """Of one vehicle among several that share the place."""
+
+    def __str__(self) -> str:
+        """Return the text that :meth:`of` reads."""
+        return f"{self.kind}:{self.host}:{self.port}{'/' if self.key else ''}{self.key}"
 
     @classmethod
     def of(cls, text: str) -> "Address":
@@ -25,11 +33,13 @@ class Address:
         Raises:
             ConfigError: It is none.
         """
-        kind, _, place = text.partition(":")
-        host, _, port = place.rpartition(":")
-        if kind not in KINDS or not host or not port.isdecimal() or not 1 <= int(port) <= 65535:
-            raise ConfigError(f"{text!r} is no address of a bus; one is zenoh:HOST:PORT or ros:HOST:PORT")
-        return cls(kind, host, int(port))
+        found = ADDRESS.fullmatch(text)
+        if not found or found["kind"] not in KINDS or not 1 <= int(found["port"]) <= 65_535:
+            raise ConfigError(
+                f"{text!r} is no address of a bus; one is zenoh:HOST:PORT or ros:HOST:PORT, with /KEY for one of "
+                "several vehicles there"
+            )
+        return cls(found["kind"], found["host"], int(found["port"]), found["key"] or "")
 
     @property
     def loopback(self) -> bool:
@@ -49,7 +59,7 @@ class Address:
         if self.kind == "zenoh":
             from .zenoh import ZenohBus
 
-            return ZenohBus(capacities, f"tcp/{self.host}:{self.port}", listen=listen)
+            return ZenohBus(capacities, f"tcp/{self.host}:{self.port}", listen=listen, key=self.key)
         from .ros import RosBus
 
-        return RosBus(capacities, f"http://{self.host}:{self.port}")
+        return RosBus(capacities, f"http://{self.host}:{self.port}", key=self.key)

@@ -12,12 +12,13 @@ PREFIX = "/retrim"
 class RosBus(NetworkBus):
     """One end of the bus. Ends in one process share its node, which lives as long as the process."""
 
-    def __init__(self, capacities: Mapping[str, int], master: str) -> None:
+    def __init__(self, capacities: Mapping[str, int], master: str, *, key: str = "") -> None:
         """Join a bus.
 
         Args:
             capacities: Longest message of each topic [bytes].
             master: Where the rosmaster is, as ``http://127.0.0.1:11311``.
+            key: Of one vehicle among several.
 
         Raises:
             ConfigError: rospy is not installed, or there is no master.
@@ -25,9 +26,10 @@ class RosBus(NetworkBus):
         rospy, message = join(master), system_module("std_msgs.msg").UInt8MultiArray
         super().__init__(capacities)
         self._rospy, self._message = rospy, message
+        self._prefix = f"{PREFIX}/{key}" if key else PREFIX
         self._publishers: dict[str, Any] = {}
         self._subscribers = [
-            rospy.Subscriber(_name(topic), message, self._listener(topic), queue_size=1, tcp_nodelay=True,
+            rospy.Subscriber(self._name(topic), message, self._listener(topic), queue_size=1, tcp_nodelay=True,
                              buff_size=64 + 2 * capacity)
             for topic, capacity in capacities.items()
         ]  # fmt: skip
@@ -40,13 +42,12 @@ class RosBus(NetworkBus):
     def _send(self, topic: str, frame: bytes) -> None:
         if topic not in self._publishers:
             self._publishers[topic] = self._rospy.Publisher(
-                _name(topic), self._message, queue_size=1, latch=True, tcp_nodelay=True
+                self._name(topic), self._message, queue_size=1, latch=True, tcp_nodelay=True
             )
         self._publishers[topic].publish(data=frame)
 
     def _listener(self, topic: str) -> Any:
         return lambda message: self._received(topic, bytes(message.data))
 
-
-def _name(topic: str) -> str:
-    return f"{PREFIX}/{topic.replace('.', '/')}"
+    def _name(self, topic: str) -> str:
+        return f"{self._prefix}/{topic.replace('.', '/')}"

@@ -17,13 +17,14 @@ BUFFER = 1  # messages of a topic that its writer keeps for those who join late
 class ZenohBus(NetworkBus):
     """One end of the bus."""
 
-    def __init__(self, capacities: Mapping[str, int], endpoint: str, *, listen: bool) -> None:
+    def __init__(self, capacities: Mapping[str, int], endpoint: str, *, listen: bool, key: str = "") -> None:
         """Join a bus.
 
         Args:
             capacities: Longest message of each topic [bytes].
             endpoint: As ``tcp/192.168.1.5:7447``.
             listen: Wait there for others; if not, look for who does, for as long as it takes.
+            key: Of one vehicle among several.
 
         Raises:
             ConfigError: zenoh is not installed, or nobody can listen there.
@@ -61,11 +62,12 @@ class ZenohBus(NetworkBus):
         self._declare: Any = lambda key: ext.declare_advanced_publisher(
             self._session, key, cache=cache, publisher_detection=True, congestion_control=block
         )
+        self._prefix = f"{PREFIX}/{key}" if key else PREFIX
         self._subscribers = []
         for topic in capacities:
-            key, listener = f"{PREFIX}/{topic}", self._listener(topic)
+            where, listener = f"{self._prefix}/{topic}", self._listener(topic)
             found = ext.declare_advanced_subscriber(
-                self._session, key, listener, history=history, allowed_origin=remote
+                self._session, where, listener, history=history, allowed_origin=remote
             )
             self._subscribers.append(found)
 
@@ -75,7 +77,7 @@ class ZenohBus(NetworkBus):
 
     def _send(self, topic: str, frame: bytes) -> None:
         if topic not in self._publishers:  # only its writer declares one
-            self._publishers[topic] = self._declare(f"{PREFIX}/{topic}")
+            self._publishers[topic] = self._declare(f"{self._prefix}/{topic}")
         self._publishers[topic].put(frame)
 
     def _listener(self, topic: str) -> Any:

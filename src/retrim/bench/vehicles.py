@@ -1,0 +1,190 @@
+"""Many vehicles live on one machine, and one process that learns for all of them."""
+
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ..config.loading import load
+from ..config.scenario import Scenario
+from ..config.setup import Setup
+from ..live.fleet_learner import FleetProcess
+from ..live.learner_process import LearnerPlan
+from ..live.plans import plan_of
+from ..live.session import LAYERS, LiveRequest, live_spec
+from ..live.spec import LiveSpec
+from ..live.topics import topics
+from ..onboard.control import ControlLoop
+from ..onboard.messages import Sample, last_note
+from ..onboard.realtime import sleep_until
+from ..physics.state import Command, State
+from ..plants.sim import SimPlant, SimState, Simulation
+from ..runtime.batched import stacked
+from ..transport.shared_memory import SharedMemoryBus
+from .machine import last_core, on_core
+
+PRESET, SECONDS, SETTLES_S = "hover/retrim", 15.0, 3.0
+PUSH = "small"
+
+
+def live_fleet(n: int) -> dict[str, Any]:
+    """Fly ``n`` vehicles by the clock on one core while one process learns for all on another; return the row.
+
+    Raises:
+        OSError: The vehicles did not fly to the end.
+    """
+    ran = subprocess.run(
+        [sys.executable, "-m", "retrim.bench.vehicles", str(n)], stdout=subprocess.PIPE, text=True, check=False
+    )
+    if ran.returncode != 0 or not ran.stdout:
+        raise OSError(f"the {n} vehicles did not fly to the end")
+    found: dict[str, Any] = json.loads(ran.stdout.splitlines()[-1])
+    remarks = (
+        f"{found['updates_per_s']:.1f} updates a second, {found['policies_per_s']:.1f} of them better and flown, "
+        f"{found['swap_s']:.2f} s from flight to swap (median; worst "
+        f"{found['worst_swap_s']:.2f}), {found['steady_m']:.4f} m off, {found['late']} of {found['ticks']} ticks late"
+    )
+    return {"compile_s": found["warm_s"], "run_s": found["swap_s"], "units": None, "remarks": remarks}
+
+
+class Air:
+    """The vehicles: their simulations as one program, and for each a bus and the loop that flies it."""
+
+    def __init__(self, n: int, place: Path) -> None:
+        setup = Setup.of(load(PRESET))
+        self.dt = setup.preset.dt
+        scenario, starts = Scenario(PUSH, plant="simple"), setup.flight_starts(n)
+        request = LiveRequest(setup, setup.pretrained(), scenario, "full", SECONDS, 0, 5.0, place)
+        self.spec = live_spec(request)
+        self.buses = [SharedMemoryBus.create(topics(self.spec)) for _ in range(n)]
+        self.loops = [self._loop(self.spec, bus) for bus in self.buses]
+        plants = [scenario.make("small", dt=self.dt, seed=i) for i in range(n)]
+        self._simulations = stacked([plant.simulation for plant in plants if isinstance(plant, SimPlant)])
+        self._flown, measured = _launch(self._simulations, stacked(starts))
+        self._measured = np.asarray(measured, dtype=float)
+        self._accepted = np.tile(np.asarray(Command.hover().vector(), dtype=float), (n, 1))
+        self.tick = 0
+
+    def plans(self) -> list[tuple[str, LearnerPlan]]:
+        """Return what is learnt for each vehicle and layer."""
+        return [
+            (layer, plan_of(layer, replace(self.spec, seed=i), self.spec.start, 0, bus.folder, frozenset(), 0))
+            for i, bus in enumerate(self.buses)
+            for layer in LAYERS
+        ]
+
+    def fly(self) -> None:
+        """Fly every vehicle for a tick: measure, decide, simulate."""
+        now, t, commands = time.monotonic(), self.tick * self.dt, []
+        for bus, loop, x, taken in zip(self.buses, self.loops, self._measured, self._accepted, strict=True):
+            bus.publish("sample", Sample(self.tick, t, now, 0.0, x, x, taken).pack())
+            setpoint = loop.tick(time.monotonic())
+            loop.idle()
+            commands.append(loop.plan.limits.low if setpoint is None else setpoint.u)
+        u = jnp.asarray(np.stack(commands), dtype=float)
+        self._flown, measured, taken = _step(self._simulations, self._flown, u, jnp.asarray(self.tick))
+        self._accepted, self._measured = np.asarray(taken, dtype=float), np.asarray(measured, dtype=float)
+        self.tick += 1
+
+    def updates(self) -> int:
+        """Return how many updates of policies there were so far, of all vehicles; the gate refused some."""
+        return sum(int(last_note(bus, "learner.policy").get("learnt", 0)) for bus in self.buses)
+
+    def compile(self) -> None:
+        """Compile what a tick needs; what is simulated is dropped."""
+        u = jnp.asarray(self._accepted, dtype=float)
+        jax.block_until_ready(_step(self._simulations, self._flown, u, jnp.asarray(0)))
+
+    @staticmethod
+    def _loop(spec: LiveSpec, bus: SharedMemoryBus) -> ControlLoop:
+        loop = ControlLoop(plan_of("control", spec, spec.start, 0, bus.folder, frozenset(), 0), bus)
+        loop.warm_up()
+        return loop
+
+
+@eqx.filter_jit
+def _launch(simulations: Simulation, starts: State) -> tuple[SimState, Array]:
+    def launch(simulation: Simulation, x0: State) -> tuple[SimState, Array]:
+        s = simulation.launch(x0)
+        return s, simulation.measured(s).vector()
+
+    launched: tuple[SimState, Array] = eqx.filter_vmap(launch)(simulations, starts)
+    return launched
+
+
+@eqx.filter_jit
+def _step(simulations: Simulation, flown: SimState, u: Array, tick: Array) -> tuple[SimState, Array, Array]:
+    def step(simulation: Simulation, s: SimState, u: Array) -> tuple[SimState, Array, Array]:
+        accepted = simulation.within_limits(Command.of(u))
+        s = simulation.advance(s, accepted, tick)
+        return s, simulation.measured(s).vector(), accepted.vector()
+
+    stepped: tuple[SimState, Array, Array] = eqx.filter_vmap(step)(simulations, flown, u)
+    return stepped
+
+
+def main() -> None:
+    """Fly as many vehicles as the command line says, and print how it went."""
+    n = int(sys.argv[1])
+    with tempfile.TemporaryDirectory() as folder:
+        place = Path(folder)
+        air, fleet = Air(n, place), FleetProcess(place, {last_core()})
+        try:
+            print(json.dumps(_flown(air, fleet, place)))
+        finally:
+            fleet.close()
+            for bus in air.buses:
+                bus.remove()
+
+
+def _flown(air: Air, fleet: FleetProcess, place: Path) -> dict[str, Any]:
+    """Fly for some seconds, and return the figures."""
+    began = time.monotonic()
+    for layer, plan in air.plans():
+        fleet.start(layer, plan, place / "vehicle.log")
+    air.compile()
+    while not all(last_note(bus, f"ready.{layer}", "ready") for bus in air.buses for layer in LAYERS):
+        if fleet.process is None or fleet.process.poll() is not None:
+            raise OSError("the process of the learners died")
+        time.sleep(0.1)
+    warm_s = time.monotonic() - began
+    on_core(0)
+    epoch, late, ages, known = time.monotonic(), 0, list[float](), [0] * len(air.loops)
+    before = 0
+    while air.tick * air.dt < SECONDS:
+        sleep_until(epoch + air.tick * air.dt)
+        air.fly()
+        if air.tick * air.dt <= SETTLES_S:
+            before = air.updates()
+        for i, loop in enumerate(air.loops):
+            version = loop.intake.newest.get("policy", 0)
+            if version != known[i] and air.tick * air.dt > SETTLES_S:
+                ages += [age for _, half, _, age in list(loop.intake.swaps)[-2:] if half == "policy"][-1:]
+            known[i] = version
+        behind = time.monotonic() - (epoch + air.tick * air.dt)
+        late += behind > 0.0
+        epoch += max(0.0, behind - air.dt)  # the world waits rather than jump
+    return {
+        "warm_s": warm_s,
+        "updates_per_s": (air.updates() - before) / (SECONDS - SETTLES_S),
+        "policies_per_s": len(ages) / (SECONDS - SETTLES_S),
+        "swap_s": float(np.median(ages)) if ages else float("nan"),
+        "worst_swap_s": max(ages, default=float("nan")),
+        "steady_m": float(np.mean([loop.error for loop in air.loops])),
+        "late": late,
+        "ticks": air.tick,
+    }
+
+
+if __name__ == "__main__":
+    main()

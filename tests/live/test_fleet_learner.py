@@ -1,0 +1,125 @@
+"""One process that learns for many: each vehicle gets what its own learner would learn, and none is waited for."""
+
+import pickle
+import subprocess
+import time
+
+import jax
+import numpy as np
+import pytest
+
+from live.test_live_learner import Beside, start  # noqa: F401
+from retrim.live import fleet_learner
+from retrim.live.fleet_learner import FleetLearner, FleetProcess
+from retrim.live.learner_process import LearnerPlan
+from retrim.onboard.messages import pack_note
+from retrim.runtime.fleet_learning import room_for
+
+pytestmark = pytest.mark.usefixtures("optax_promotion")
+SEEDS = {"a": 1, "b": 2, "c": 3}
+
+
+def plan_of(start, layer, seed):  # noqa: F811
+    path, controller, _ = start
+    return LearnerPlan(path.parent, layer, path, None, seed, controller.base, 0)
+
+
+@pytest.fixture
+def vehicles(start):  # noqa: F811
+    return {name: Beside(start) for name in SEEDS}
+
+
+def fleet_for(vehicles, start, layer):  # noqa: F811
+    clock = vehicles["a"]
+    fleet = FleetLearner(lambda: clock.now)
+    for name, vehicle in vehicles.items():
+        fleet.add(name, plan_of(start, layer, SEEDS[name]), vehicle.bus)
+    return fleet
+
+
+def found(vehicle, layer):
+    return jax.tree.leaves(vehicle.parameters(layer).arrays)
+
+
+@pytest.mark.parametrize("layer", ["residual", "policy"])
+def test_each_vehicle_gets_what_its_own_learner_learns(start, vehicles, layer):  # noqa: F811
+    """Together, to rounding: of three, whose program is one for four."""
+    for i, vehicle in enumerate(vehicles.values()):
+        vehicle.fly(60 + 10 * i)
+    assert fleet_for(vehicles, start, layer).step() == 3
+    for name, vehicle in vehicles.items():
+        together = found(vehicle, layer) if vehicle.bus.latest(f"parameters.{layer}") else None
+        alone = Beside(start)
+        alone.fly(60 + 10 * list(SEEDS).index(name))
+        loop = type(alone).learner(alone, layer)
+        loop.plan = plan_of(start, layer, SEEDS[name])
+        loop.worker = loop.new_worker()
+        assert loop.step()
+        by_itself = found(alone, layer) if alone.bus.latest(f"parameters.{layer}") else None
+        assert (together is None) == (by_itself is None)
+        for one, other in zip(together or (), by_itself or (), strict=True):
+            np.testing.assert_allclose(one, other, atol=1e-8)
+    assert any(vehicle.bus.latest(f"parameters.{layer}") for vehicle in vehicles.values())
+
+
+def test_a_vehicle_that_is_late_is_not_waited_for(start, vehicles):  # noqa: F811
+    fleet = fleet_for(vehicles, start, "residual")
+    vehicles["a"].fly()
+    vehicles["c"].fly()
+    assert fleet.step() == 2
+    assert vehicles["b"].bus.latest("parameters.residual") is None
+    vehicles["b"].fly()
+    assert fleet.step() == 1
+    assert vehicles["b"].parameters("residual").version == 1
+    assert fleet.step() == 0
+
+
+def test_a_vehicle_may_go_and_the_others_are_learnt_for(start, vehicles):  # noqa: F811
+    fleet = fleet_for(vehicles, start, "residual")
+    fleet.drop("b")
+    fleet.drop("nobody")
+    for vehicle in vehicles.values():
+        vehicle.fly()
+    assert fleet.step() == 2
+    assert vehicles["b"].bus.latest("parameters.residual") is None
+
+
+def test_programs_are_there_for_any_number_that_is_due(start, vehicles, monkeypatch):  # noqa: F811
+    learnt = []
+    monkeypatch.setattr(fleet_learner, "learn_together", lambda workers, windows: learnt.append(len(workers)))
+    fleet = fleet_for(vehicles, start, "residual")
+    fleet.warm_up()
+    assert learnt == [1, 2, 4]
+    fleet.warm_up()
+    assert learnt == [1, 2, 4]
+    assert [room_for(n) for n in (1, 2, 3, 4, 5, 16, 17)] == [1, 2, 4, 4, 8, 16, 32]
+
+
+def test_plans_come_and_go_and_a_flight_that_is_over_is_left(start, vehicles, tmp_path, monkeypatch):  # noqa: F811
+    buses = {f"{i:06d}-residual": vehicle.bus for i, vehicle in enumerate(vehicles.values(), start=1)}
+    monkeypatch.setattr(fleet_learner, "SharedMemoryBus", lambda folder: buses[folder.name])
+    monkeypatch.setattr(fleet_learner, "learn_together", lambda workers, windows: [])
+    process = FleetProcess(tmp_path)
+    monkeypatch.setattr(fleet_learner, "launch", lambda *_: subprocess.Popen(["sleep", "60"]))
+    plan, seats = plan_of(start, "residual", 1), []
+    for name in buses:
+        seats.append(
+            process.start("residual", LearnerPlan(tmp_path / name, *list(vars(plan).values())[1:]), tmp_path / name)
+        )
+    assert {path.stem for path in tmp_path.glob("*.plan")} == set(buses)
+    assert pickle.loads(seats[0].path.read_bytes()).folder == tmp_path / "000001-residual"
+    fleet = FleetLearner()
+    fleet_learner._look(fleet, tmp_path)
+    assert set(fleet.loops) == set(buses)
+    seats[0].kill()
+    buses["000002-residual"].publish("ended", pack_note("ended", reason="landed"))
+    (tmp_path / "noise.plan").write_bytes(b"")
+    fleet_learner._look(fleet, tmp_path)
+    assert set(fleet.loops) == {"000003-residual"}
+    assert [seat.poll() for seat in seats] == [None] * 3
+    process.close()
+    assert [seat.poll() for seat in seats] == [-9] * 3
+
+
+def test_the_clock_of_the_fleet_is_that_of_the_machine():
+    assert FleetLearner()._clock is time.monotonic
