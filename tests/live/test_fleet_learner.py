@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from live.test_live_learner import Beside, start  # noqa: F401
-from retrim.live import fleet_learner
-from retrim.live.fleet_learner import FleetLearner, FleetProcess
+from retrim.live import fleet_learner, fleet_process
+from retrim.live.fleet_learner import FleetLearner
+from retrim.live.fleet_process import FleetProcess
 from retrim.live.learner_process import LearnerPlan
 from retrim.onboard.messages import pack_note
 from retrim.runtime.fleet_learning import room_for
@@ -97,10 +98,10 @@ def test_programs_are_there_for_any_number_that_is_due(start, vehicles, monkeypa
 
 def test_plans_come_and_go_and_a_flight_that_is_over_is_left(start, vehicles, tmp_path, monkeypatch):  # noqa: F811
     buses = {f"{i:06d}-residual": vehicle.bus for i, vehicle in enumerate(vehicles.values(), start=1)}
-    monkeypatch.setattr(fleet_learner, "SharedMemoryBus", lambda folder: buses[folder.name])
+    monkeypatch.setattr(fleet_process, "SharedMemoryBus", lambda folder: buses[folder.name])
     monkeypatch.setattr(fleet_learner, "learn_together", lambda workers, windows: [])
     process = FleetProcess(tmp_path)
-    monkeypatch.setattr(fleet_learner, "launch", lambda *_: subprocess.Popen(["sleep", "60"]))
+    monkeypatch.setattr(fleet_process, "launch", lambda *_: subprocess.Popen(["sleep", "60"]))
     plan, seats = plan_of(start, "residual", 1), []
     for name in buses:
         seats.append(
@@ -109,12 +110,12 @@ def test_plans_come_and_go_and_a_flight_that_is_over_is_left(start, vehicles, tm
     assert {path.stem for path in tmp_path.glob("*.plan")} == set(buses)
     assert pickle.loads(seats[0].path.read_bytes()).folder == tmp_path / "000001-residual"
     fleet = FleetLearner()
-    fleet_learner._look(fleet, tmp_path)
+    fleet_process._look(fleet, tmp_path)
     assert set(fleet.loops) == set(buses)
     seats[0].kill()
     buses["000002-residual"].publish("ended", pack_note("ended", reason="landed"))
     (tmp_path / "noise.plan").write_bytes(b"")
-    fleet_learner._look(fleet, tmp_path)
+    fleet_process._look(fleet, tmp_path)
     assert set(fleet.loops) == {"000003-residual"}
     assert [seat.poll() for seat in seats] == [None] * 3
     process.close()

@@ -235,7 +235,7 @@ def test_one_that_was_started_again_goes_on_from_what_is_flown(start):
     beside.says(newest=1)
     again = beside.learner("policy")
     again.catch_up()
-    np.testing.assert_array_equal(weights(again._worker._residual), weights(beside.update("residual", 1).state))
+    np.testing.assert_array_equal(weights(again.worker._residual), weights(beside.update("residual", 1).state))
     np.testing.assert_array_equal(base_of(again), weights(beside.update("policy", 1).state.policy))
     beside.fly()
     assert improving(again).step()

@@ -10,6 +10,8 @@ import jax
 from jax import random
 from jaxtyping import Array, Key
 
+from ..control.lora import LoraPolicy
+from ..control.policy import Policy
 from ..learn.bptt import PolicyState
 from ..learn.window import Window
 from .gate import Verdict
@@ -85,6 +87,11 @@ class PolicyWorker:
     def state(self) -> LearnerState:
         """What an update goes on from: a policy, in the model of a residual."""
         return LearnerState(self._policy, self._residual)
+
+    @property
+    def policy(self) -> Policy | LoraPolicy:
+        """The policy that an update goes on from."""
+        return self._policy.policy
 
     def next_key(self) -> Key[Array, ""]:
         """Return the key of an update; each call returns another."""

@@ -18,7 +18,7 @@ from jaxtyping import Array
 from ..config.loading import load
 from ..config.scenario import Scenario
 from ..config.setup import Setup
-from ..live.fleet_learner import FleetProcess
+from ..live.fleet_process import FleetProcess
 from ..live.learner_process import LearnerPlan
 from ..live.plans import plan_of
 from ..live.session import LAYERS, LiveRequest, live_spec

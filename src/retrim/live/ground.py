@@ -17,7 +17,7 @@ from ..onboard.topics import INTO, MOST, OUT
 from ..transport.bridge import Bridge
 from ..transport.remote import Address
 from ..transport.shared_memory import SharedMemoryBus
-from .fleet_learner import FleetProcess, Seat
+from .fleet_process import FleetProcess, Seat
 from .learner_process import LearnerPlan
 from .mission import Mission
 from .spec import MAINS

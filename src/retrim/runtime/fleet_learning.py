@@ -1,20 +1,33 @@
-"""Learning for many vehicles at once: whatever is due, as one program."""
+"""Learning for many vehicles at once: whatever is due, as one program; and a base that all of them share."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
+import optax
+from jax import random
+from jaxtyping import Array, Key
 
-from ..adapt.updates import Update
+from ..adapt.learner import LearnerState, OnlineLearner
+from ..adapt.optimisers import CarriedAdam
+from ..adapt.updates import PolicyUpdate, Update
 from ..adapt.workers import PolicyWorker, ResidualWorker, Worker, policy_update, residual_update
+from ..control.lora import LoraPolicy
+from ..control.policy import Policy
+from ..learn.bptt import PolicyState, policy_gradient
 from ..learn.devices import spread
+from ..learn.residuals.model import FittedResidual
 from ..learn.window import Window
 from .batch_learning import fit_all, update_all
 from .batched import one, stacked
 
 
-def learn_together(workers: Sequence[Worker], windows: Sequence[Window]) -> list[Update]:
+def learn_together(
+    workers: Sequence[Worker], windows: Sequence[Window], base: PolicyState | None = None
+) -> list[Update]:
     """Learn from a window for each of several vehicles; the result of each is that of its worker alone, to rounding.
 
     Programs are compiled for powers of two; what is missing to the next one is computed twice and dropped, so that any
@@ -23,6 +36,7 @@ def learn_together(workers: Sequence[Worker], windows: Sequence[Window]) -> list
     Args:
         workers: One for each vehicle, of one layer and one learner, with states of one structure.
         windows: What each learns from.
+        base: The base that low-rank policies put their deltas on from now on; each its own by default.
 
     Returns:
         The update of each.
@@ -36,10 +50,81 @@ def learn_together(workers: Sequence[Worker], windows: Sequence[Window]) -> list
         return [residual_update(float(t[i]), one(states, i), _row(reports, i)) for i in range(n)]
     assert isinstance(first, PolicyWorker)
     keys = [worker.next_key() for worker in workers if isinstance(worker, PolicyWorker)]
-    state = stacked([_state(workers[i]) for i in filled])
+    state = stacked([_on(_state(workers[i]), base) for i in filled])
     trained, verdicts = update_all(first.learner, state, window, spread(jnp.stack([keys[i] for i in filled])))
     verdicts, t = jax.device_get((verdicts, window.t[:, -1]))
     return [policy_update(float(t[i]), one(trained, i), _row(verdicts, i)) for i in range(n)]
+
+
+def shared_base(learner: OnlineLearner, state: LearnerState) -> PolicyState:
+    """Return the base of a low-rank policy as what all vehicles that start from it share, with a fresh optimiser."""
+    policy = state.policy.policy
+    assert isinstance(policy, LoraPolicy)
+    return PolicyState(policy.base, _optimiser(learner).init(policy.base.params))
+
+
+def learn_base(
+    workers: Sequence[PolicyWorker], windows: Sequence[Window], base: PolicyState, key: Key[Array, ""]
+) -> PolicyState:
+    """Take one optimiser step of a shared base, along the mean of the gradients of several vehicles.
+
+    Each vehicle's gradient is that of its own policy, base and delta, in its own corrected model. Since the delta is
+    added to the base, it is the gradient of the base, too.
+
+    Args:
+        workers: One for each vehicle, with low-rank policies.
+        windows: Their flights.
+        base: The base, and its optimiser.
+        key: Consumed.
+
+    Returns:
+        The base after the step; the same one if the gradient is not finite.
+    """
+    n = len(workers)
+    filled = [*range(n), *[0] * (room_for(n) - n)]
+    states = stacked([_on(workers[i].state, base) for i in filled])
+    weight = jnp.asarray([1.0 / n] * n + [0.0] * (len(filled) - n))
+    window = stacked([windows[i] for i in filled])
+    stepped: PolicyState = _base_step(workers[0].learner, base, states, window, weight, key)
+    return stepped
+
+
+def refused_by_all(updates: Sequence[Update]) -> bool:
+    """Return whether no vehicle has found its update better than what it flies: then a shared base is taken back."""
+    return not any(isinstance(update, PolicyUpdate) for update in updates)
+
+
+@eqx.filter_jit
+def _base_step(
+    learner: OnlineLearner, base: PolicyState, states: LearnerState, windows: Window, weight: Array, key: Key[Array, ""]
+) -> PolicyState:
+    def gradient(state: LearnerState, window: Window, key: Key[Array, ""]) -> Any:
+        corrected = learner.view(learner.env, FittedResidual(learner.residual_model, state.residual))
+        x0 = jax.tree.map(lambda leaf: leaf[0], learner.starts(learner.env.task, window, key, 1, learner.num_envs))
+        return policy_gradient(state.policy.policy.merged(), corrected, x0)[1]
+
+    each = eqx.filter_vmap(gradient)(states, windows, random.split(key, weight.shape[0]))
+    mean = jax.tree.map(lambda leaf: jnp.tensordot(weight.astype(leaf.dtype), leaf, axes=1), each)
+    params = base.policy.params
+    change, memory = _optimiser(learner).update(mean, base.optimiser, params)
+    stepped = PolicyState(base.policy.with_params(optax.apply_updates(params, change)), memory)
+    fine = jnp.isfinite(optax.tree.norm(mean))
+    found: PolicyState = jax.tree.map(lambda new, old: jnp.where(fine, new, old), stepped, base)
+    return found
+
+
+def _optimiser(learner: OnlineLearner) -> optax.GradientTransformation:
+    """Return one Adam for the whole flight, with the rate of all weights."""
+    return CarriedAdam(learner.optimiser.rate, learner.optimiser.max_grad_norm).transformation(1)
+
+
+def _on(state: Any, base: PolicyState | None) -> Any:
+    """Put the delta of a low-rank policy on another base."""
+    if base is None or not isinstance(state, LearnerState) or not isinstance(state.policy.policy, LoraPolicy):
+        return state
+    assert isinstance(base.policy, Policy)
+    policy = dataclasses.replace(state.policy.policy, base=base.policy)
+    return LearnerState(PolicyState(policy, state.policy.optimiser), state.residual)
 
 
 def room_for(n: int) -> int:

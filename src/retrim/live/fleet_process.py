@@ -1,0 +1,116 @@
+"""The process that learns for many vehicles, which come and go while it runs."""
+
+import contextlib
+import os
+import pickle
+import subprocess
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+
+from ..errors import RetrimError
+from ..experiments.compile_cache import enable_compile_cache
+from ..io.files import write_whole
+from ..onboard.launch import launch
+from ..onboard.messages import pack_note
+from ..onboard.realtime import Lifeline
+from ..transport.shared_memory import SharedMemoryBus
+from .fleet_learner import FleetLearner
+from .learner_process import CHECK_EVERY, NICE, LearnerPlan
+
+LOOK_EVERY = 0.1  # [s] for vehicles that have come or gone
+
+
+@dataclass(frozen=True)
+class FleetPlan:
+    """Everything that the process is started with."""
+
+    folder: Path
+    """A plan for each vehicle and layer, ``NAME.plan``; they come and go."""
+    parent: int
+
+
+def learn_for_all(plan: FleetPlan) -> None:
+    """Learn until the parent is gone: the main function of the process."""
+    with contextlib.suppress(OSError, AttributeError):
+        os.nice(NICE)
+    enable_compile_cache()
+    fleet, parent, looked = FleetLearner(), Lifeline(plan.parent), 0.0
+    while not parent.gone():
+        if time.monotonic() - looked > LOOK_EVERY:
+            looked = time.monotonic()
+            _look(fleet, plan.folder)
+        if not fleet.step():
+            time.sleep(CHECK_EVERY)
+
+
+def _look(fleet: FleetLearner, folder: Path) -> None:
+    """Take vehicles that have come, and let those go that are gone or whose flight is over."""
+    there = {path.stem: path for path in folder.glob("*.plan")}
+    over = {name for name, loop in fleet.loops.items() if loop.bus.latest("ended") is not None}
+    for name in (fleet.loops.keys() - there.keys()) | over:
+        fleet.drop(name)
+    new = [name for name in sorted(there.keys() - fleet.loops.keys()) if name not in over]
+    for name in new:
+        with contextlib.suppress(OSError, EOFError, RetrimError):  # gone again
+            found: LearnerPlan = pickle.loads(there[name].read_bytes())  # written by the parent of this process
+            bus = SharedMemoryBus(found.folder)
+            if bus.latest("ended") is None:
+                fleet.add(name, found, bus)
+    if not new:
+        return
+    fleet.warm_up()
+    device = jax.devices()[0].platform
+    for name in fleet.loops.keys() & set(new):
+        loop = fleet.loops[name]
+        loop.bus.publish(f"ready.{loop.plan.layer}", pack_note("ready", base=loop.plan.base, device=device))
+
+
+@dataclass
+class FleetProcess:
+    """The process of a :class:`FleetLearner`, started when the first vehicle needs it, and again if it died."""
+
+    folder: Path
+    cores: set[int] | None = None
+    """Where it may run; None for anywhere."""
+    process: "subprocess.Popen[bytes] | None" = None
+    count: int = 0
+
+    def start(self, layer: str, plan: LearnerPlan, complaints: Path) -> "Seat":
+        """Have it learn for a vehicle and layer."""
+        if self.process is None or self.process.poll() is not None:
+            main, fleet = "retrim.live.fleet_process:learn_for_all", FleetPlan(self.folder, os.getpid())
+            self.process = launch(main, fleet, self.folder / "learners.log", self.cores)
+        self.count += 1
+        path = self.folder / f"{self.count:06d}-{layer}.plan"
+        write_whole(path, pickle.dumps(plan))
+        complaints.unlink(missing_ok=True)
+        complaints.symlink_to(self.folder / "learners.log")
+        return Seat(self.process, path)
+
+    def close(self) -> None:
+        """End it."""
+        if self.process is not None:
+            self.process.kill()
+            self.process.wait()
+
+
+@dataclass(frozen=True)
+class Seat:
+    """One vehicle and layer in the process of all; to a ground station it looks like a process of its own."""
+
+    process: "subprocess.Popen[bytes]"
+    path: Path
+
+    def poll(self) -> int | None:
+        """Return the exit code of the process; None while it runs."""
+        return self.process.poll()
+
+    def kill(self) -> None:
+        """Have it learn for this vehicle no more."""
+        self.path.unlink(missing_ok=True)
+
+    def wait(self) -> None:
+        """Return at once: the process goes on for the others."""

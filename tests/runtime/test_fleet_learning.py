@@ -1,0 +1,92 @@
+"""A base that many vehicles share: it takes the mean of their steps, and serves a vehicle that has learnt nothing."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import random
+
+from helpers import random_field_flight, tiny_preset
+from retrim.adapt.updates import PolicyUpdate, Rejection, Skip
+from retrim.adapt.workers import PolicyWorker, ResidualWorker
+from retrim.config.setup import Setup
+from retrim.learn.bptt import PolicyState, policy_loss
+from retrim.learn.residuals.model import FittedResidual
+from retrim.runtime.fleet_learning import learn_base, learn_together, refused_by_all, shared_base
+
+pytestmark = pytest.mark.usefixtures("optax_promotion")
+PUSH = jnp.array([1.5, -1.0, 0.5])
+
+
+def pushed(x, u):
+    return PUSH
+
+
+@pytest.fixture(scope="module")
+def fleet():
+    """A learner, and what two vehicles with low-rank policies have learnt of the same push; their windows."""
+    with jax.numpy_dtype_promotion("standard"):
+        setup = Setup.of(tiny_preset(adapt={"fit_steps": 100}))
+        learner, low_rank = setup.learner, setup.low_rank(setup.pretrained(), random.key(0))
+        windows = [random_field_flight(pushed, random.key(i), n=setup.preset.adapt.window) for i in (1, 2)]
+        workers = []
+        for i, window in enumerate(windows):
+            state = learner.init(low_rank, random.key(i))
+            fitted, _ = learner.fit_residual(state.residual, window)
+            workers.append(PolicyWorker(learner, type(state)(state.policy, fitted), random.key(i)))
+        return learner, workers, windows
+
+
+def weights(base):
+    return np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(base.policy.params)])
+
+
+def test_a_base_serves_a_vehicle_that_has_learnt_nothing(fleet):
+    """What two have felt lowers the loss of the bare base in the model of the first."""
+    learner, workers, windows = fleet
+    first = base = shared_base(learner, workers[0].state)
+    for i in range(40):
+        base = learn_base(workers, windows, base, random.key(i))
+    corrected = learner.view(learner.env, FittedResidual(learner.residual_model, workers[0].state.residual))
+    starts = jax.vmap(learner.env.task.reset)(random.split(random.key(9), 32))
+    before, after = (float(policy_loss(each.policy, corrected, starts)) for each in (first, base))
+    assert after < before - 0.01 * abs(before)
+
+
+def test_a_step_that_is_not_finite_changes_nothing(fleet):
+    learner, workers, windows = fleet
+    base = shared_base(learner, workers[0].state)
+    state = workers[0].state
+    sick = jax.tree.map(lambda leaf: jnp.full_like(leaf, jnp.nan), state.policy.policy.params)
+    policy = PolicyState(state.policy.policy.with_params(sick), state.policy.optimiser)
+    broken = PolicyWorker(learner, type(state)(policy, state.residual), random.key(0))
+    after = learn_base([broken, workers[1]], windows, base, random.key(0))
+    np.testing.assert_array_equal(weights(after), weights(base))
+
+
+def test_deltas_go_on_from_the_shared_base(fleet):
+    learner, workers, windows = fleet
+    base = learn_base(workers, windows, shared_base(learner, workers[0].state), random.key(0))
+    updates = learn_together(workers, windows, base)
+    taken = [update.state.policy.base for update in updates if isinstance(update, PolicyUpdate)]
+    for each in taken:
+        np.testing.assert_array_equal(each.layers[0].weight, base.policy.layers[0].weight)
+    assert len(updates) == 2
+
+
+def test_a_fit_of_many_is_each_ones_own(fleet):
+    learner, workers, windows = fleet
+    alone = [
+        ResidualWorker(learner, worker.state).learn(window) for worker, window in zip(workers, windows, strict=True)
+    ]
+    together = learn_together([ResidualWorker(learner, worker.state) for worker in workers], windows)
+    for one, other in zip(alone, together, strict=True):
+        assert one.computed_from == other.computed_from
+        for a, b in zip(jax.tree.leaves(one.state), jax.tree.leaves(other.state), strict=True):
+            np.testing.assert_allclose(a, b, atol=1e-9)
+
+
+def test_a_base_that_nobody_admits_is_known(fleet):
+    better = PolicyUpdate(0.0, 1.0, 2.0, fleet[1][0].state.policy)
+    assert refused_by_all([Rejection(0.0, "policy", "worse"), Skip(0.0, "policy")])
+    assert not refused_by_all([Rejection(0.0, "policy", "worse"), better])
