@@ -17,6 +17,7 @@ import pytest
 from commands import retrim
 from helpers import tiny_preset
 from retrim import ConfigError, Fleet, Scenario, Setup
+from retrim.config import named_presets
 from retrim.experiments import cluster, jobs
 from retrim.experiments.cluster import Cluster
 from retrim.experiments.flights import FlightSpec
@@ -139,6 +140,21 @@ def test_a_table_says_what_failed_elsewhere(here, tmp_path, monkeypatch):
     retrim("sweep", "study.toml", "--on", here, "--out", "there", cwd=tmp_path)
     assert [row["n"] for row in rows(tmp_path / "there")] == [2] * 6
     assert not any("failures" in row for row in rows(tmp_path / "there"))
+
+
+def test_a_table_grows_by_its_command(tmp_path, monkeypatch):
+    small = tiny_preset(adapt={"window": 20, "fit_every": 0.4, "update_every": 0.6, "fit_latency": 0.1})
+    monkeypatch.setitem(named_presets.PRESETS, "hover/fast", small)
+    words = "--preset", "hover/fast", "--flights", "4", "8", "--seconds", "1.2"
+    said = retrim("reproduce", "scaling", *words, "--out", "s", cwd=tmp_path)
+    found = json.loads((tmp_path / "s" / "scaling.json").read_text())["rows"]
+    assert [row["flights"] for row in found] == [4, 8]
+    assert all(row["run_s"] > 0 and row["peak_mb"] > 50 for row in found)
+    assert "flights a second" in said
+    assert (tmp_path / "s" / "scaling.png").stat().st_size > 5000
+    assert "--flights 6 must be a positive multiple of 4" in retrim(
+        "reproduce", "scaling", "--flights", "6", cwd=tmp_path, code=1
+    )
 
 
 def rows(folder):

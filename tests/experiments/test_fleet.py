@@ -107,6 +107,16 @@ def test_lots_fly_the_same_to_rounding_and_land_once(fleet, flights, monkeypatch
         assert (flight.learnt is None) == (other.learnt is None)
 
 
+def test_flights_that_are_forgotten_have_landed(fleet, flights, monkeypatch):
+    monkeypatch.setattr(lots, "LOT", 2)
+    monkeypatch.setattr(lots, "lanes", lambda: 1)
+    landed = []
+    gone = fleet.run(landed=landed.extend, forget=True)
+    assert gone.flown == []
+    assert not gone.interrupted
+    assert {flight.spec for flight in landed} == set(fleet.specs)
+
+
 def test_a_lot_ends_each_flight_where_it_is_terminated(fleet):
     """A vehicle that is pushed to the ground is cut off at the same tick as when it flies alone."""
     scenario = Scenario("push=-8", plant="simple")

@@ -126,6 +126,7 @@ class Fleet:
         stop: threading.Event | None = None,
         only: Sequence[FlightSpec] | None = None,
         by_lot: bool = False,
+        forget: bool = False,
     ) -> Flights:
         """Fly.
 
@@ -139,6 +140,7 @@ class Fleet:
             only: Fly these specifications, a part of ``specs``.
             by_lot: Hand an executor of other processes the lots of the default, whose flights then are the same bit for
                 bit, instead of one flight at a time.
+            forget: Return no flights: thousands of logs fill a memory, and ``landed`` has seen them.
 
         Returns:
             The flights that were flown to their end, in the order of the specifications. A job that failed in another
@@ -151,15 +153,21 @@ class Fleet:
         specs = self.specs if only is None else list(only)
         if isinstance(executor, ThreadPoolExecutor):
             lots = [Lot([spec], None) for spec in specs]
-            return gathered(specs, lots, self._here(executor, stop), progress=progress, landed=landed, stop=stop)
+            return gathered(
+                specs, lots, self._here(executor, stop), progress=progress, landed=landed, stop=stop, forget=forget
+            )
         if executor is not None:
             lots = self.lots(specs) if by_lot else [Lot([spec], None) for spec in specs]
             submit = self._away(executor)
-            return gathered(specs, lots, submit, progress=progress, landed=landed, stop=stop, outlive=True)
+            return gathered(
+                specs, lots, submit, progress=progress, landed=landed, stop=stop, outlive=True, forget=forget
+            )
         lots = self.lots(specs)
         self.warm_up([lot.specs[0] for lot in lots if lot.compiled is None])
         with ThreadPoolExecutor(1 if self._latency == "measured" else lanes()) as pool:
-            return gathered(specs, lots, self._here(pool, stop), progress=progress, landed=landed, stop=stop)
+            return gathered(
+                specs, lots, self._here(pool, stop), progress=progress, landed=landed, stop=stop, forget=forget
+            )
 
     def _here(self, pool: Executor, stop: threading.Event) -> Submit:
         """Lots are flown in this process."""

@@ -13,6 +13,9 @@ from .interrupts import interrupts_only_set
 from .lots import Lot
 from .metrics import Rows, rows
 
+GONE: "Future[list[Flight]]" = Future()
+"""In the place of a future whose flights are forgotten; nobody waits for it."""
+GONE.cancel()
 OFTEN = 1.0  # [s]: progress is told so often while flights are in the air
 Progress = Callable[[float, int], None]
 """Called with the number of flights that are over, one in the air by the share that was flown, and of all flights."""
@@ -49,6 +52,7 @@ def gathered(
     landed: Callable[[Sequence[Flight]], None] | None,
     stop: threading.Event,
     outlive: bool = False,
+    forget: bool = False,
 ) -> Flights:
     """Start every lot, and wait until all flights are over or given up.
 
@@ -59,13 +63,14 @@ def gathered(
         progress: Called in this thread when flights are over, and now and then before.
         landed: Receives flights that were flown to their end, in this thread.
         stop: Gives up what is flying. Ctrl-C does the same, and sets it.
+        forget: Keep no flight once ``landed`` has seen it: thousands of logs fill a memory.
         outlive: Go on where a lot failed, and tell in the end; what does not fit together still ends everything.
 
     Raises:
         PlantError: A plant refused.
     """
     futures: list[Future[list[Flight]]] = []
-    aloft, flown = dict[int, float](), dict[FlightSpec, Flight]()
+    aloft, flown = dict[int, float](), dict[FlightSpec, Flight | None]()
     failed = dict[FlightSpec, str]()
     try:
         for i, lot in enumerate(lots):
@@ -87,10 +92,12 @@ def gathered(
                     failed |= dict.fromkeys(lots[waiting[future]].specs, _told(error))
                 else:
                     flights = future.result()
-                    flown |= {flight.spec: flight for flight in flights}
+                    flown |= {flight.spec: None if forget else flight for flight in flights}
                     if landed is not None:
                         with interrupts_only_set(stop):
                             landed(flights)
+                    if forget:
+                        futures[waiting[future]] = GONE
                 del waiting[future]
                 told()
             if not over and aloft:
@@ -107,10 +114,11 @@ def gathered(
             late = [future for future in futures if stop.is_set() and not future.cancelled()]
             kept = [flight for each in late if each.exception() is None for flight in each.result()]
             new = [flight for flight in kept if flight.spec not in flown]
-            flown |= {flight.spec: flight for flight in new}
+            flown |= {flight.spec: None if forget else flight for flight in new}
             if landed is not None and new:
                 landed(new)
-    return Flights([flown[spec] for spec in specs if spec in flown], len(flown) < len(specs), failed)
+    kept_flights = [flight for spec in specs if (flight := flown.get(spec)) is not None]
+    return Flights(kept_flights, len(flown) < len(specs), failed)
 
 
 def _told(error: BaseException) -> str:

@@ -127,7 +127,7 @@ def _fly(fleet: Fleet, kept: "_Kept", run: Run, reporter: Reporter) -> None:
     with reporter.progress(f"flying {fleet.preset.name}") as advance:
         advance(0.0, "compiling the programs of a flight")
         flights = fleet.run(
-            run.executor, stop=run.stop, only=missing, landed=keep, progress=told_by(advance), by_lot=True
+            run.executor, stop=run.stop, only=missing, landed=keep, progress=told_by(advance), by_lot=True, forget=True
         )
     for spec, why in flights.failed.items():
         vehicle = spec.scenario.vehicle_name(fleet.preset.vehicle)

@@ -35,6 +35,8 @@ class Panel:
     curves: Sequence[Curve]
     columns: int = 1
     """Of the legend."""
+    log: bool = False
+    """Both axes."""
 
 
 def panel_figure(title: str, panels: Sequence[Panel], *, across: int = 3) -> Figure:
@@ -56,6 +58,8 @@ def panel_figure(title: str, panels: Sequence[Panel], *, across: int = 3) -> Fig
                     curve.x, curve.y, linestyle=style, marker=marker, markersize=4, color=color, label=curve.label
                 )
             axes.set(xlabel=panel.x, ylabel=panel.y)
+            if panel.log:
+                axes.set(xscale="log", yscale="log")
             axes.set_title(panel.title, fontsize=11, color=INK)
             axes.grid(alpha=0.25)
             axes.legend(fontsize=8, frameon=False, ncols=panel.columns)

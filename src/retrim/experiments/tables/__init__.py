@@ -13,6 +13,7 @@ from .phase import phase as phase
 from .plants import plants as plants
 from .raptor import raptor as raptor
 from .reversing import reversing as reversing
+from .scaling import scaling as scaling
 from .track import track as track
 from .transfer import transfer as transfer
 from .tuning import tuning as tuning
@@ -20,6 +21,6 @@ from .vision import vision as vision
 
 MADE = (
     hover, reversing, track, phase, vision, plants, model, fast, ablation, design, efficiency, transfer, raptor,
-    buses, tuning,
+    buses, tuning, scaling,
 )  # fmt: skip
 """Those of ``retrim reproduce``; the gauntlet is a command of its own."""

@@ -23,6 +23,7 @@ QUICK: dict[str, Options] = {
     "phase": {**FEW, "seconds": 24.0, "references": ("figure8",)},
     "plants": {**SHORT, "plant": ("bem", "simple")},
     "ablation": {**FEW, "seconds": 14.0},
+    "scaling": {"flights": (12, 40), "seconds": 6.0},
     "tuning": {"candidates": 12, "starts": 1, "methods": ("geometric", "geometric-i", "indi")},
 }
 """By table: options that are smaller."""

@@ -1,0 +1,138 @@
+"""How time and memory grow with the number of flights."""
+
+import resource
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ...config.scenario import Scenario
+from ...errors import ConfigError
+from ...viz.panels import Curve, Panel, panel_figure
+from ...viz.plots import save
+from ..fleet import Fleet
+from ..flights import Flight
+from ..gathering import told_by
+from ..limits import check_flights
+from ..reporter import Reporter
+from ..run import Run
+from ..stopwatch import Stopwatch
+from .document import Document, TableSection
+from .study import refuse_misfits, table_presets, train_all
+
+CONDITIONS = ("gusts", "pickup")
+METHODS = ("base", "full")
+EACH = len(CONDITIONS) * len(METHODS)
+COLUMNS = (
+    "flights",
+    "compiling [s]",
+    "flying [s]",
+    "flights a second",
+    "seconds of flight a second",
+    "peak memory [MB]",
+)
+
+
+def scaling(
+    run: Run,
+    reporter: Reporter,
+    *,
+    preset: str = "hover/retrim",
+    flights: tuple[int, ...] = (12, 40, 120, 400, 1000),
+    seconds: float = 12.0,
+) -> None:
+    """Flights by the dozen to the ten thousand: time, flights a second, memory, and how they grow.
+
+    Args:
+        run: Folder of scaling.md, scaling.json and the picture.
+        reporter: Receives progress and the table.
+        preset: A preset for hover, to train with.
+        flights: How many, one number after another, each a multiple of four: half of them adapt, and they fly in
+            gusts, or with a load that is picked up and dropped.
+        seconds: Length of a flight [s].
+    """
+    (loaded,) = table_presets([preset], "hover", seeds=(0,), starts=1, seconds=seconds)
+    for n in flights or (0,):
+        if n < EACH or n % EACH:
+            raise ConfigError(f"--flights {n} must be a positive multiple of {EACH}")
+        check_flights(n // EACH, seconds)
+    scenarios = [Scenario(name) for name in CONDITIONS]
+    refuse_misfits(loaded, scenarios, methods=METHODS, starts=1, seconds=seconds)
+    intro = (
+        f"Made by `retrim reproduce scaling`: flights of {seconds:g} s on plant `bem` in two conditions of the "
+        "gauntlet, half of them adapting twice a second, in lots of at most 64 on each core; flights are scored and "
+        "forgotten as they land. Compiling: what was not in the machine's compile cache. Memory: the most that the "
+        "process had until then."
+    )
+    document = Document(run, "scaling", "Flights by the thousand", intro, [0], reporter)
+    study = train_all(loaded, (0,), run, reporter)
+    rows = list[dict[str, Any]]()
+    for n in flights if study.policies else ():
+        if run.interrupted:
+            break
+        fleet = Fleet(loaded, study.policies, scenarios, methods=METHODS, starts=n // EACH, seconds=seconds)
+        watch, errors = Stopwatch(), list[float]()
+
+        def note(landed: Sequence[Flight], errors: list[float] = errors) -> None:
+            errors += [flight.steady for flight in landed]
+
+        with run.interruptible(), reporter.progress(f"{n} flights") as advance:
+            fleet.run(
+                run.executor,
+                stop=run.stop,
+                progress=told_by(advance),
+                landed=note,
+                by_lot=True,
+                forget=True,
+            )
+        if not run.interrupted:
+            rows.append(_row(n, seconds, watch, errors))
+            run.write_results(rows, seeds=[0], name="scaling")
+    if rows:
+        document.add(_section(rows, run), rows)
+    document.write()
+
+
+def _row(n: int, seconds: float, watch: Stopwatch, errors: Sequence[float]) -> dict[str, Any]:
+    unit = 1024.0 if sys.platform != "darwin" else 1024.0**2
+    compile_s = watch.compile_s
+    return {
+        "flights": n,
+        "seconds": seconds,
+        "compile_s": compile_s,
+        "run_s": watch.total_s - compile_s,
+        "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit,
+        "crashes": int(np.isnan(errors).sum()),
+        "mean": float(np.nanmean(errors)),
+    }
+
+
+def _section(rows: Sequence[dict[str, Any]], run: Run) -> TableSection:
+    n, took, memory = (np.array([row[key] for row in rows]) for key in ("flights", "run_s", "peak_mb"))
+    lines = tuple(
+        (
+            f"{row['flights']}",
+            f"{row['compile_s']:.0f}",
+            f"{row['run_s']:.1f}",
+            f"{row['flights'] / row['run_s']:.1f}",
+            f"{row['flights'] * row['seconds'] / row['run_s']:.0f}",
+            f"{row['peak_mb']:.0f}",
+        )
+        for row in rows
+    )
+    linear = took[-1] * n / n[-1]
+    panels = [
+        Panel(
+            "flying",
+            "flights",
+            "s",
+            [Curve(n, took, "measured"), Curve(n, linear, "in proportion", dashed=True)],
+            log=True,
+        ),
+        Panel("peak memory", "flights", "MB", [Curve(n, memory, "measured")], log=True),
+    ]
+    drawn = save(panel_figure("Flights by the thousand", panels, across=2), run.folder, "scaling")
+    crashed = sum(row["crashes"] for row in rows)
+    about = f"{crashed} of {int(n.sum())} flights crashed."
+    return TableSection(COLUMNS, lines, about=about, picture=drawn[0])
