@@ -21,7 +21,7 @@ from ..stopwatch import Stopwatch
 from .document import Document, TableSection
 from .study import refuse_misfits, table_presets, train_all
 
-CONDITIONS = ("gusts", "pickup")
+CONDITIONS = ("gusts", "payload")
 METHODS = ("base", "full")
 EACH = len(CONDITIONS) * len(METHODS)
 COLUMNS = (
@@ -49,7 +49,7 @@ def scaling(
         reporter: Receives progress and the table.
         preset: A preset for hover, to train with.
         flights: How many, one number after another, each a multiple of four: half of them adapt, and they fly in
-            gusts, or with a load that is picked up and dropped.
+            gusts, or with a load.
         seconds: Length of a flight [s].
     """
     (loaded,) = table_presets([preset], "hover", seeds=(0,), starts=1, seconds=seconds)
@@ -60,8 +60,8 @@ def scaling(
     scenarios = [Scenario(name) for name in CONDITIONS]
     refuse_misfits(loaded, scenarios, methods=METHODS, starts=1, seconds=seconds)
     intro = (
-        f"Made by `retrim reproduce scaling`: flights of {seconds:g} s on plant `bem` in two conditions of the "
-        "gauntlet, half of them adapting twice a second, in lots of at most 64 on each core; flights are scored and "
+        f"Made by `retrim reproduce scaling`: flights of {seconds:g} s on plant `bem` in gusts or "
+        "with a load, half of them adapting twice a second, in lots of at most 64 on each core; flights are scored and "
         "forgotten as they land. Compiling: what was not in the machine's compile cache. Memory: the most that the "
         "process had until then."
     )
