@@ -158,7 +158,7 @@ class Fleet:
             )
         if executor is not None:
             lots = self.lots(specs) if by_lot else [Lot([spec], None) for spec in specs]
-            submit = self._away(executor)
+            submit = self._away(executor, learnt=not forget)
             return gathered(
                 specs, lots, submit, progress=progress, landed=landed, stop=stop, outlive=True, forget=forget
             )
@@ -173,9 +173,9 @@ class Fleet:
         """Lots are flown in this process."""
         return lambda lot, aloft: pool.submit(self._fly, lot, aloft, stop)
 
-    def _away(self, executor: Executor) -> Submit:
+    def _away(self, executor: Executor, *, learnt: bool) -> Submit:
         """Lots are flown by whoever gets the job."""
-        return lambda lot, aloft: executor.submit(fly_job, self._job(lot.specs))
+        return lambda lot, aloft: executor.submit(fly_job, self._job(lot.specs, learnt))
 
     def _fly(self, lot: Lot, aloft: Callable[[float], None], stop: threading.Event) -> list[Flight]:
         """Fly a lot in this process; ``aloft`` is told the share that was flown."""
@@ -201,9 +201,8 @@ class Fleet:
         finally:
             lot.compiled.set()
 
-    def _job(self, specs: Sequence[FlightSpec]) -> Job:
+    def _job(self, specs: Sequence[FlightSpec], learnt: bool) -> Job:
         policies = tuple(self.policies[spec.seed] for spec in specs)
         starts = tuple(self._starts[spec.scenario.reference, spec.seed][spec.start] for spec in specs)
-        return Job(
-            self._id, dump(self.preset), policies, tuple(specs), starts, self.seconds, self._latency, self._state
-        )
+        about = self.seconds, self._latency, self._state, learnt
+        return Job(self._id, dump(self.preset), policies, tuple(specs), starts, *about)

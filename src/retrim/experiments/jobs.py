@@ -1,7 +1,7 @@
 """A lot of flights as a job for another process: all it needs as a value, and the set-up, built once per process."""
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from ..adapt.learner import LearnerState
@@ -27,6 +27,8 @@ class Job:
     seconds: float
     latency: Latency
     state: LearnerState | None
+    learnt: bool = True
+    """Send back what each flight has learnt, too, which is as large as its log."""
 
 
 def fly_job(job: Job) -> list[Flight]:
@@ -34,9 +36,11 @@ def fly_job(job: Job) -> list[Flight]:
     setup: Setup = setup_for(job.preset, job.specs[0].scenario.reference, job.fleet)
     if len(job.specs) > 1:
         release_programs()
-        return fly_lot(setup, job.policies, job.specs, job.starts, job.seconds, state=job.state, cold=True)
-    (policy,), (spec,), (x0,) = job.policies, job.specs, job.starts
-    return [fly_one(setup, policy, spec, x0, job.seconds, latency=job.latency, state=job.state)]
+        flights = fly_lot(setup, job.policies, job.specs, job.starts, job.seconds, state=job.state, cold=True)
+    else:
+        (policy,), (spec,), (x0,) = job.policies, job.specs, job.starts
+        flights = [fly_one(setup, policy, spec, x0, job.seconds, latency=job.latency, state=job.state)]
+    return flights if job.learnt else [replace(flight, learnt=None) for flight in flights]
 
 
 @functools.lru_cache(maxsize=16)

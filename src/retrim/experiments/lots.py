@@ -9,7 +9,7 @@ import jax
 from .flights import FlightSpec
 from .provenance import cores
 
-LOT = 64  # flights of one program on one device
+LOT, LARGE = 64, 2048  # flights of one program: on one CPU, on one accelerator
 
 
 class Lot(NamedTuple):
@@ -34,7 +34,7 @@ def in_lots(groups: Iterable[list[FlightSpec]], program: Callable[[list[FlightSp
     first, others = dict[Hashable, Lot](), list[Lot]()
     for group in groups:
         of_group = program(group)
-        size = 1 if of_group is None else min(LOT * jax.device_count(), -(-len(group) // lanes()))
+        size = 1 if of_group is None else min(largest(), -(-len(group) // lanes()))
         for i in range(0, len(group), size):
             part = group[i : i + size]
             if len(part) == 1:
@@ -44,6 +44,11 @@ def in_lots(groups: Iterable[list[FlightSpec]], program: Callable[[list[FlightSp
             else:
                 first[of_group, len(part)] = Lot(part, threading.Event(), compiles=True)
     return [*first.values(), *others]
+
+
+def largest() -> int:
+    """Return how many flights one program has at most, on all devices together."""
+    return (LOT if jax.default_backend() == "cpu" else LARGE) * jax.device_count()
 
 
 def lanes() -> int:

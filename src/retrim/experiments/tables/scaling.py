@@ -1,8 +1,10 @@
 """How time and memory grow with the number of flights."""
 
+import pickle
 import resource
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +17,7 @@ from ..fleet import Fleet
 from ..flights import Flight
 from ..gathering import told_by
 from ..limits import check_flights
+from ..lots import LOT
 from ..reporter import Reporter
 from ..run import Run
 from ..stopwatch import Stopwatch
@@ -24,6 +27,8 @@ from .study import refuse_misfits, table_presets, train_all
 CONDITIONS = ("gusts", "payload")
 METHODS = ("base", "full")
 EACH = len(CONDITIONS) * len(METHODS)
+MANY, MACHINES = 1_000_000, (1, 3, 10, 30, 100, 300, 1000)
+LINK, JOB_S = 117e6, 1e-3  # [bytes/s], [s]: assumed
 COLUMNS = (
     "flights",
     "compiling [s]",
@@ -67,7 +72,7 @@ def scaling(
     )
     document = Document(run, "scaling", "Flights by the thousand", intro, [0], reporter)
     study = train_all(loaded, (0,), run, reporter)
-    rows = list[dict[str, Any]]()
+    rows, sizes = list[dict[str, Any]](), list[int]()
     for n in flights if study.policies else ():
         if run.interrupted:
             break
@@ -76,6 +81,7 @@ def scaling(
 
         def note(landed: Sequence[Flight], errors: list[float] = errors) -> None:
             errors += [flight.steady for flight in landed]
+            sizes.append(len(pickle.dumps(replace(landed[0], learnt=None))))
 
         with run.interruptible(), reporter.progress(f"{n} flights") as advance:
             fleet.run(
@@ -87,11 +93,44 @@ def scaling(
                 forget=True,
             )
         if not run.interrupted:
-            rows.append(_row(n, seconds, watch, errors))
+            rows.append(_row(n, seconds, watch, errors) | {"flight_bytes": max(sizes)})
             run.write_results(rows, seeds=[0], name="scaling")
     if rows:
         document.add(_section(rows, run), rows)
+        document.add(_on_machines(rows))
     document.write()
+
+
+def _on_machines(rows: Sequence[dict[str, Any]]) -> TableSection:
+    """Extrapolate to many machines by a model of four numbers, two of which are measured."""
+    last = rows[-1]
+    per_flight, size, compiling = last["run_s"] / last["flights"], last["flight_bytes"], rows[0]["compile_s"]
+    lines = []
+    for m in MACHINES:
+        bounds = {
+            "flying": MANY * per_flight / m,
+            "the client's network": MANY * size / LINK,
+            "the scheduler": MANY / LOT * JOB_S,
+        }
+        most = max(bounds, key=lambda name: bounds[name])
+        lines.append((f"{m}", _time(compiling + bounds[most]), most))
+    about = (
+        f"Not measured, but computed: {MANY:,} such flights on so many machines of this kind, by a Dask scheduler. "
+        f"Time = compiling ({compiling:.0f} s, on all machines at once, as measured above) + the largest of: flying "
+        f"({1e3 * per_flight:.0f} ms a flight, measured above, divided by the machines); the network of the client, "
+        f"who receives {size / 1e3:.0f} kB a flight (measured) at {LINK / 1e6:.0f} MB/s (assumed, a gigabit); the "
+        f"scheduler, at {1e3 * JOB_S:.0f} ms a job of {LOT} flights (assumed). Training, stragglers and lost machines "
+        "are left out. Beyond the network's limit more machines do not help: several clients do, each with a part of "
+        "the seeds."
+    )
+    return TableSection(("machines", "time", "what takes longest"), tuple(lines), "On more machines", about)
+
+
+def _time(seconds: float) -> str:
+    for unit, size in (("days", 86_400.0), ("hours", 3600.0), ("minutes", 60.0)):
+        if seconds >= 2.0 * size:
+            return f"{seconds / size:.1f} {unit}"
+    return f"{seconds:.0f} s"
 
 
 def _row(n: int, seconds: float, watch: Stopwatch, errors: Sequence[float]) -> dict[str, Any]:
