@@ -7,7 +7,7 @@ from contextlib import ExitStack
 
 import pytest
 
-from retrim.experiments.latency import rosmaster, two_machines
+from retrim.experiments.latency import free_port, rosmaster, two_machines
 
 pytestmark = pytest.mark.slow
 RETRIM = [sys.executable, "-m", "retrim.cli"]
@@ -48,3 +48,27 @@ def test_a_flight_learns_on_another_machine(policy, tmp_path, network):
     assert found["steady"] < 0.01
     assert found["fallback_ticks"] == 0
     assert found["refused_messages"] == 0
+
+
+def test_one_process_on_the_ground_learns_for_two_vehicles_between_namespaces(policy, tmp_path):
+    """Over zenoh on this machine; one of the vehicles comes later, and the first flies on."""
+    pytest.importorskip("zenoh")
+    where = [f"zenoh:127.0.0.1:{free_port()}" for _ in range(2)]
+    words = [*RETRIM, "live", "--policy", str(policy), "--plant", "simple", "--disturbance", "large", "--seconds", "25"]
+    more = [
+        ["--learners", address, "--adapt", "lora", "--out", str(tmp_path / f"{i}")] for i, address in enumerate(where)
+    ]
+    ground = subprocess.Popen([*RETRIM, "learn", *where], stdout=subprocess.PIPE, text=True)
+    flights = [subprocess.Popen([*words, *each], stdout=subprocess.PIPE, text=True) for each in more]
+    said = [flight.communicate(timeout=300)[0] for flight in flights]
+    heard = ground.communicate(timeout=60)[0]
+    assert [flight.returncode for flight in flights] == [0, 0], said
+    assert ground.returncode == 0, heard
+    assert heard.count("flight over: landed") == 2
+    for i in range(2):
+        rows = json.loads((tmp_path / f"{i}" / "results.json").read_text())["rows"]
+        found = {row["metric"]: row["value"] for row in rows}
+        assert found["policies"] > 3
+        assert found["flight_to_swap_s"] < 1.5
+        assert found["steady"] < 0.01
+        assert found["refused_messages"] == 0

@@ -28,6 +28,7 @@ def _doctor() -> int:
         ("commit", commit()),
         *versions().items(),
         ("machine", describe_hardware()),
+        ("devices of JAX", f"{jax.device_count()}, {jax.default_backend()}"),
         ("compile cache", str(jax.config.values["jax_compilation_cache_dir"])),
         ("batched products (jax-ml/jax#39103)", verdict),
     ):

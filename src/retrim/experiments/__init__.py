@@ -1,5 +1,6 @@
 """Experiments as a library: training, fleets of flights, sweeps, tables, pictures. Nothing here prints."""
 
+from .cluster import Cluster as Cluster
 from .compile_cache import enable_compile_cache as enable_compile_cache
 from .fleet import Fleet as Fleet
 from .flights import Flight as Flight
