@@ -17,6 +17,10 @@ class PlantError(RetrimError, RuntimeError):
     """A plant refused what it was asked for, or it is gone."""
 
 
+class JobError(RetrimError, RuntimeError):
+    """Work that was handed to another process has failed there, or nobody can be reached who would do it."""
+
+
 class MessageError(RetrimError, ValueError):
     """Bytes that must not be used: truncated, damaged, of another kind, or with values that are not finite."""
 

@@ -18,7 +18,8 @@ from commands import retrim
 from helpers import tiny_preset
 from retrim import ConfigError, Fleet, Scenario, Setup
 from retrim.config import named_presets
-from retrim.experiments import cluster, jobs
+from retrim.errors import JobError
+from retrim.experiments import cluster, jobs, sweep, training  # noqa: F401  (before a test replaces what it imports)
 from retrim.experiments.cluster import Cluster
 from retrim.experiments.flights import FlightSpec
 from retrim.experiments.metrics import cell, failed_record, summary
@@ -97,8 +98,73 @@ def test_a_failed_flight_is_a_row_with_its_error():
     lost = failed_record(FlightSpec(Scenario(), "full", 1), "small", "m", "OSError: gone")
     row = summary([flown, lost])
     assert (row["n"], row["crashes"], row["failures"]) == (2, 0, ["OSError: gone"])
+    assert (row["mean"], row["max"], row["median"]) == (0.01, 0.01, 0.01)
     assert cell(row) == "0.010, 1 of 2 failed"
     assert cell(summary([lost])) == "1 of 1 failed"
+
+
+def test_a_table_with_holes_is_not_made(here, tmp_path, monkeypatch):
+    def failing(*_, **__):
+        raise OSError("the disk is full")
+
+    monkeypatch.setattr(jobs, "fly_lot", failing)
+    monkeypatch.setitem(named_presets.PRESETS, "hover/fast", tiny_preset(pretrain={"num_updates": 10, "num_envs": 2}))
+    words = "--presets", "hover/fast", "--methods", "base", "--seeds", "0", "--starts", "4", "--seconds", "1"
+    said = retrim("reproduce", "hover", *words, "--on", here, "--out", "h", cwd=tmp_path, code=1)
+    assert "flights failed elsewhere, the first by OSError: the disk is full" in said
+
+
+def test_a_training_that_fails_costs_no_other(here, tmp_path, monkeypatch):
+    train = training.train
+
+    def failing(setup, seed):
+        if seed == 1:
+            raise MemoryError("too large")
+        return train(setup, seed)
+
+    monkeypatch.setattr(training, "train", failing)
+    (tmp_path / "study.toml").write_text(SWEEP.format(starts=1))
+    said = retrim("sweep", "study.toml", "--on", here, "--out", "s", cwd=tmp_path, code=1)
+    assert "1 of 2 trainings of hover/retrim failed: seed 1: too large" in said
+    assert [path.stem[-5:] for path in (tmp_path / "s/policies").iterdir()] == ["seed0"]
+
+
+def test_a_flight_that_fails_leaves_the_others_and_an_exit_code(here, tmp_path, monkeypatch):
+    fly = jobs.fly_lot
+
+    def failing(setup, policies, specs, *rest, **more):
+        if specs[0].method == "full":
+            raise OSError("gone")
+        return fly(setup, policies, specs, *rest, **more)
+
+    monkeypatch.setattr(jobs, "fly_lot", failing)
+    monkeypatch.setattr("retrim.experiments.lots.lanes", lambda: 1)
+    (tmp_path / "study.toml").write_text(SWEEP.format(starts=1).replace('"none", "small", "gusts"', '"none"'))
+    said = retrim("sweep", "study.toml", "--on", here, "--out", "s", cwd=tmp_path, code=1)
+    assert "2 flights failed elsewhere, the first by OSError: gone; the same command flies them" in said
+    base, full = rows(tmp_path / "s")
+    assert "failures" not in base
+    assert (full["n"], full["failures"], full["mean"]) == (2, ["OSError: gone"] * 2, None)
+    monkeypatch.undo()
+    retrim("sweep", "study.toml", "--on", here, "--out", "s", cwd=tmp_path)
+    assert [row.get("failures") for row in rows(tmp_path / "s")] == [None, None]
+
+
+def test_a_scheduler_that_is_gone_ends_it(here):
+    there = Cluster(here)
+    there.shutdown()
+    with pytest.raises(JobError, match=r"no job can be given to the scheduler at tcp://"):
+        there.submit(int).result()
+
+
+def test_what_cannot_come_back_is_told_and_what_is_given_up_stays_so(here):
+    with Cluster(here) as there:
+        with pytest.raises(ZeroDivisionError):
+            there.submit(divmod, 1, 0).result(30)
+        assert there.submit(divmod, 7, 2).result(30) == (3, 1)
+        slow = there.submit(time.sleep, 0.5)
+        assert slow.cancel()
+        assert slow.cancelled()
 
 
 @pytest.mark.parametrize(
@@ -127,8 +193,8 @@ def test_other_versions_are_refused_before_the_first_job(here, monkeypatch):
         Cluster(here)
 
 
-def test_a_table_says_what_failed_elsewhere(here, tmp_path, monkeypatch):
-    """The policies are trained by the workers, too, and the row of a job that failed is flown again."""
+def test_a_sweep_elsewhere_is_the_same_table_and_flies_again_what_had_failed(here, tmp_path, monkeypatch):
+    """The policies are trained by the workers, too."""
     (tmp_path / "study.toml").write_text(SWEEP.format(starts=1))
     said = retrim("sweep", "study.toml", "--on", here, "--out", "there", cwd=tmp_path)
     assert f"2 workers at {here}" in said
@@ -235,7 +301,8 @@ def test_a_killed_worker_and_a_cut_connection_change_nothing(tmp_path):
         wire = Wire(port)
 
         def disturb():
-            while not flights.exists():
+            until = time.monotonic() + 300.0
+            while not flights.exists() and time.monotonic() < until:
                 time.sleep(0.1)
             workers[0].kill()
             wire.cut(5.0)

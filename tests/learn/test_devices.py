@@ -21,13 +21,16 @@ import numpy as np
 sys.path.insert(0, "{tests}")
 from helpers import tiny_preset
 from retrim import Fleet, Scenario, Setup
+from retrim.adapt.buffer import RollingBuffer
+from retrim.adapt.workers import PolicyWorker
+from retrim.physics import Command, State
+from retrim.runtime.fleet_learning import learn_base, learn_together, shared_base
 
 jax.config.update("jax_enable_x64", True)
 assert jax.device_count() == {devices}
 soon = {{"window": 20, "fit_every": 0.2, "update_every": 0.3, "fit_latency": 0.1, "update_latency": 0.1}}
-preset = tiny_preset(
-    pretrain={{"hidden_sizes": (8,), "num_updates": 4, "num_envs": 8, "horizon": 10}}, adapt={{"fit_steps": 3, **soon}}
-)
+small = {{"hidden_sizes": (16, 16), "num_updates": 4, "num_envs": 8, "horizon": 10}}
+preset = tiny_preset(pretrain=small, adapt={{"fit_steps": 3, **soon}})
 setup, losses = Setup.of(preset), []
 for policy, some in setup.pretraining(0):
     losses += [float(loss) for loss in some]
@@ -35,6 +38,14 @@ gusts = Scenario("gusts", plant="simple", sensors="mocap")
 fleet = Fleet(preset, policy, [gusts], methods=("full",), starts=8, seconds=1.0)
 fleet.lots(fleet.specs)
 flights = fleet.run().flown
+low_rank = setup.low_rank(policy, jax.random.key(0))
+state = setup.learner.init(low_rank, jax.random.key(1))
+window, base = RollingBuffer(preset.adapt.window), shared_base(setup.learner, state)
+window.push(0.0, State.at(setup.flown.home()), Command.hover(float))
+for n in (2, 4, 3):  # other numbers of vehicles, other devices
+    workers = [PolicyWorker(setup.learner, state, jax.random.key(i)) for i in range(n)]
+    base = learn_base(workers, [window.window()] * n, base, jax.random.key(n))
+    learn_together(workers, [window.window()] * n, base)
 learnt = [jax.tree.leaves(flight.learnt)[0] for flight in flights]
 np.savez(
     "{out}",
@@ -42,6 +53,7 @@ np.savez(
     weights=policy.layers[0].weight,
     flown=np.stack([flight.log.p for flight in flights]),
     commands=np.stack([flight.log.u for flight in flights]),
+    base=base.policy.layers[0].weight,
     learnt=np.stack([np.asarray(leaf) for leaf in learnt]),
     swaps=[len(flight.swaps) for flight in flights],
 )
@@ -84,6 +96,11 @@ def test_what_a_fleet_learns_is_that_of_one_device(found):
     np.testing.assert_array_equal(eight["swaps"], one["swaps"])
     assert one["swaps"].sum() > 0
     np.testing.assert_allclose(eight["learnt"], one["learnt"], atol=1e-6)
+
+
+def test_a_shared_base_is_that_of_one_device(found):
+    one, eight = found
+    np.testing.assert_allclose(eight["base"], one["base"], atol=1e-7)
 
 
 @pytest.mark.parametrize(

@@ -3,12 +3,16 @@
 import pickle
 import subprocess
 import time
+from dataclasses import replace
 
 import jax
 import numpy as np
 import pytest
+from jax import random
 
 from live.test_live_learner import Beside, start  # noqa: F401
+from retrim.config.setup import Setup
+from retrim.io.trained import load_learnt, save_learnt
 from retrim.live import fleet_learner, fleet_process
 from retrim.live.fleet_learner import FleetLearner
 from retrim.live.fleet_process import FleetProcess
@@ -85,6 +89,39 @@ def test_a_vehicle_may_go_and_the_others_are_learnt_for(start, vehicles):  # noq
     assert vehicles["b"].bus.latest("parameters.residual") is None
 
 
+def test_nothing_is_published_for_a_vehicle_that_went_meanwhile(start, vehicles):  # noqa: F811
+    fleet = FleetLearner(lambda: vehicles["a"].now)
+    fleet.add("a", plan_of(start, "residual", 1), vehicles["a"].bus, lambda: False)
+    vehicles["a"].fly()
+    assert fleet.step() == 1
+    assert vehicles["a"].bus.latest("parameters.residual") is None
+
+
+def test_low_rank_vehicles_share_a_base_and_lose_it_with_a_policy_that_is_taken_back(start, tmp_path):  # noqa: F811
+    path, controller, _ = start
+    _, preset = load_learnt(path)
+    setup = Setup.of(preset)
+    state = setup.learner.init(setup.low_rank(setup.new_policy(random.key(0)), random.key(1)), random.key(2))
+    save_learnt(tmp_path / "start.safetensors", state, preset)
+    vehicles = {name: Beside((tmp_path / "start.safetensors", controller, state)) for name in "ab"}
+    fleet = fleet_for(vehicles, (tmp_path / "start.safetensors", controller, state), "policy")
+    for vehicle in vehicles.values():
+        vehicle.fly()
+    assert fleet.step() == 2
+    (base,) = fleet._bases.values()
+    admitted = [vehicle for vehicle in vehicles.values() if vehicle.bus.latest("parameters.policy") is not None]
+    moved = np.abs(np.asarray(base.policy.layers[0].weight - state.policy.policy.base.layers[0].weight)).max() > 0
+    assert moved == bool(admitted)  # a step that nobody admits is taken back
+    fleet.loops["a"].taken_back += 1
+    was = id(base)
+    for vehicle in vehicles.values():
+        vehicle.fly()
+        fleet.loops["a"]._pending = fleet.loops["b"]._pending = None
+    vehicles["a"].now += 100.0
+    fleet.step()
+    assert id(next(iter(fleet._bases.values()))) != was
+
+
 def test_programs_are_there_for_any_number_that_is_due(start, vehicles, monkeypatch):  # noqa: F811
     learnt = []
     monkeypatch.setattr(fleet_learner, "learn_together", lambda workers, windows: learnt.append(len(workers)))
@@ -109,15 +146,21 @@ def test_plans_come_and_go_and_a_flight_that_is_over_is_left(start, vehicles, tm
         )
     assert {path.stem for path in tmp_path.glob("*.plan")} == set(buses)
     assert pickle.loads(seats[0].path.read_bytes()).folder == tmp_path / "000001-residual"
-    fleet = FleetLearner()
-    fleet_process._look(fleet, tmp_path)
+    fleet, done = FleetLearner(), set()
+    fleet_process._look(fleet, tmp_path, done)
     assert set(fleet.loops) == set(buses)
     seats[0].kill()
     buses["000002-residual"].publish("ended", pack_note("ended", reason="landed"))
     (tmp_path / "noise.plan").write_bytes(b"")
-    fleet_process._look(fleet, tmp_path)
+    fleet_process._look(fleet, tmp_path, done)
     assert set(fleet.loops) == {"000003-residual"}
+    assert done == {"000002-residual"}
     assert [seat.poll() for seat in seats] == [None] * 3
+    bad = process.start("residual", replace(plan, start=tmp_path / "nothing"), tmp_path / "bad")
+    monkeypatch.setattr(fleet_process, "SharedMemoryBus", lambda folder: buses["000003-residual"])
+    fleet_process._look(fleet, tmp_path, done)
+    assert bad.poll() == 1  # a ground station sees a process that died
+    assert set(fleet.loops) == {"000003-residual"}
     process.close()
     assert [seat.poll() for seat in seats] == [-9] * 3
 

@@ -10,10 +10,10 @@ import pytest
 
 from live.test_faults import Drill, controller, spec_in, whole_log  # noqa: F401
 from live_processes import HOME, DrillPlan, level
-from retrim.errors import MessageError
+from retrim.errors import ConfigError, MessageError
 from retrim.experiments.latency import free_port as unused_port
 from retrim.live.events import LiveEvents
-from retrim.live.ground import Ground
+from retrim.live.ground import Ground, learn_for
 from retrim.live.mission import Mission
 from retrim.live.page import free_port
 from retrim.live.spec import PageSpec
@@ -93,6 +93,18 @@ def test_a_flight_with_learners_elsewhere(tmp_path, controller, lost):  # noqa: 
         assert swaps[-1] > 2.0
     if lost.startswith("bridge"):
         assert status.restarts == {"bridge": 1}
+
+
+@pytest.mark.parametrize(
+    ("addresses", "why"),
+    [
+        (["zenoh:h:1", "zenoh:h:1"], "address zenoh:h:1 is there twice"),
+        (["ros:h:1/a", "ros:g:1/b"], "vehicles at several rosmasters"),
+    ],
+)
+def test_addresses_that_cannot_be_learnt_for_together_are_named(addresses, why):
+    with pytest.raises(ConfigError, match=why):
+        learn_for([Address.of(each) for each in addresses], threading.Event())
 
 
 def mission_in(folder, base, number=1):

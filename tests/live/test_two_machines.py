@@ -50,8 +50,8 @@ def test_a_flight_learns_on_another_machine(policy, tmp_path, network):
     assert found["refused_messages"] == 0
 
 
-def test_one_process_on_the_ground_learns_for_two_vehicles_between_namespaces(policy, tmp_path):
-    """Over zenoh on this machine; one of the vehicles comes later, and the first flies on."""
+def test_one_process_on_the_ground_learns_for_two_vehicles_as_between_namespaces(policy, tmp_path):
+    """Over zenoh on this machine: two flights with low-rank policies, which share a base."""
     pytest.importorskip("zenoh")
     where = [f"zenoh:127.0.0.1:{free_port()}" for _ in range(2)]
     words = [*RETRIM, "live", "--policy", str(policy), "--plant", "simple", "--disturbance", "large", "--seconds", "25"]

@@ -5,11 +5,13 @@ import os
 import signal
 import socket
 import time
+from contextlib import ExitStack
 
 import pytest
 
 from bus_ends import LOCAL, NETWORK, arrived, network, two_ends
 from retrim.errors import ConfigError, MessageError
+from retrim.experiments.latency import free_port
 from retrim.transport.network import NetworkBus
 from retrim.transport.remote import Address
 from retrim.transport.shared_memory import SharedMemoryBus
@@ -115,10 +117,37 @@ def test_of_a_network_only_what_is_newer_and_fits_is_taken():
 
 
 @pytest.mark.parametrize("text", ["", "zenoh", "zenoh:", "zenoh::7447", "zenoh:host:0", "zenoh:host:99999",
-                                  "tcp:host:1", "ros:host:port"])  # fmt: skip
+                                  "tcp:host:1", "ros:host:port", "zenoh:host:1/", "ros:host:1/a b"])  # fmt: skip
 def test_an_address_that_is_none_is_named(text):
     with pytest.raises(ConfigError, match="is no address of a bus; one is zenoh:HOST:PORT or ros:HOST:PORT"):
         Address.of(text)
+
+
+@pytest.mark.parametrize("text", ["zenoh:10.0.0.5:7447", "ros:robot:11311/quad1"])
+def test_an_address_is_what_it_says(text):
+    assert str(Address.of(text)) == text
+
+
+def test_vehicles_at_one_place_do_not_hear_each_other():
+    """Each has a key; who listens for another one, or for none, gets nothing of it."""
+    pytest.importorskip("zenoh")
+    port = free_port()
+    with ExitStack() as stack:
+
+        def end(key, *, listen=False):
+            bus = Address("zenoh", "127.0.0.1", port, key).join(TOPICS, listen=listen)
+            stack.callback(bus.close)
+            return bus
+
+        one, same, other, none = end("quad1", listen=True), end("quad1"), end("quad2"), end("")
+        one.publish("a", b"one")
+        until = time.monotonic() + 10.0
+        while same.latest("a") is None and time.monotonic() < until:
+            time.sleep(0.02)
+        assert same.latest("a").data == b"one"
+        time.sleep(0.2)
+        assert other.latest("a") is None
+        assert none.latest("a") is None
 
 
 def test_a_master_that_there_is_not_is_named():

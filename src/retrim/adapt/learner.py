@@ -96,7 +96,12 @@ class OnlineLearner(eqx.Module):
 
     @eqx.filter_jit
     def update_policy(
-        self, state: PolicyState, residual: Any, window: Window, key: Key[Array, ""]
+        self,
+        state: PolicyState,
+        residual: Any,
+        window: Window,
+        key: Key[Array, ""],
+        flown: Policy | LoraPolicy | None = None,
     ) -> tuple[PolicyState, Verdict]:
         """Re-train the policy by back-propagation in the corrected model, and judge the result.
 
@@ -108,6 +113,7 @@ class OnlineLearner(eqx.Module):
             residual: State of the residual model.
             window: Ticks of flight.
             key: Consumed.
+            flown: Policy that flies, and that the trained one has to be better than; that of ``state`` by default.
 
         Returns:
             The trained policy, and the gate's verdict on it.
@@ -124,7 +130,8 @@ class OnlineLearner(eqx.Module):
             jax.vmap(self.env.task.reset)(random.split(k_gate, HELD_OUT // 2)),
             drawn(window, k_window, (HELD_OUT // 2,)),
         )
-        return trained, judge(trained.policy.merged(), state.policy.merged(), corrected, held_out)
+        incumbent = state.policy if flown is None else flown
+        return trained, judge(trained.policy.merged(), incumbent.merged(), corrected, held_out)
 
 
 @eqx.filter_jit

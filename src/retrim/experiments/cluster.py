@@ -3,20 +3,19 @@
 import re
 import socket
 from collections.abc import Callable, Iterator
-from concurrent.futures import CancelledError, Executor, Future
-from contextlib import contextmanager
-from types import TracebackType
+from concurrent.futures import Executor, Future, InvalidStateError
+from contextlib import contextmanager, suppress
 from typing import Any
 
-from ..errors import ConfigError
+from ..errors import ConfigError, JobError
 from ..plants.extras import import_extra
-from .provenance import versions
+from .provenance import EXTRAS, commit, versions
 from .reporter import Reporter
 
 ANSWERS_S = 10.0  # for somebody to be there
 BACK_S = 60.0  # for the scheduler to answer, also after its connection was cut
 WORKERS_S = 30.0  # for the first worker to be there
-ATTEMPTS = 5  # to have a job done whose worker, or whose scheduler's memory of it, was lost
+ATTEMPTS = 5  # to have a job done that the scheduler forgot, or whose result was lost on the way
 ADDRESS = re.compile(r"(tcp|tls)://\[?(?P<host>[^\]]+)\]?:(?P<port>\d{1,5})")
 ALIKE = ("retrim", "jax", "jaxlib", "equinox", "optax", "numpy", "python")
 """What must be the same everywhere, so that a flight is the same wherever it is flown."""
@@ -25,8 +24,9 @@ ALIKE = ("retrim", "jax", "jaxlib", "equinox", "optax", "numpy", "python")
 class Cluster(Executor):
     """An executor whose jobs are done by the workers of a Dask scheduler.
 
-    A job whose worker dies is done again elsewhere; so is one that the scheduler forgot while the connection to it was
-    cut. Each job's result comes once. Nothing here listens: the scheduler is called.
+    A job whose worker dies is done again elsewhere, until Dask takes the job for the cause (its ``allowed-failures``,
+    three by default). So is one that the scheduler forgot while the connection to it was cut. Each job's result comes
+    once. Nothing here listens: the scheduler is called.
     """
 
     def __init__(self, address: str) -> None:
@@ -75,37 +75,34 @@ class Cluster(Executor):
         """Leave the scheduler, which drops what was not waited for."""
         self._client.close()
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Leave the scheduler."""
-        self.shutdown()
-
     def _start(self, outer: "Future[Any]", submit: Callable[[], Any], attempts: int) -> None:
         """Start a job, and again where it was lost, until its result is there."""
         try:
             inner = submit()
         except Exception as error:
-            outer.set_exception(ConnectionError(f"the scheduler at {self.address} is gone ({_line(error)})"))
+            outer.set_exception(JobError(f"no job can be given to the scheduler at {self.address} ({_line(error)})"))
             return
 
         def over(done: Any) -> None:
-            if outer.done():
-                return
-            try:
-                if done.status == "error" and not _worker_died(done):
+            with suppress(InvalidStateError):  # it was cancelled meanwhile
+                if done.status == "error":
                     outer.set_exception(done.exception())
                     return
-                if done.status == "finished":
-                    outer.set_result(done.result())
-                    return
                 lost: object = done.status
-            except (OSError, CancelledError) as error:  # on the way from the worker
-                lost = _line(error)
-            if attempts > 1:
-                self._start(outer, submit, attempts - 1)
-            else:
-                outer.set_exception(ConnectionError(f"the job was lost {ATTEMPTS} times ({lost})"))
+                if done.status == "finished":
+                    try:
+                        outer.set_result(done.result())
+                        return
+                    except InvalidStateError:
+                        raise
+                    except Exception as error:  # on the way from the worker, or it cannot be read here
+                        lost = _line(error)
+                    finally:
+                        done.release()  # or the worker would keep the result as well
+                if attempts > 1 and not outer.done():
+                    self._start(outer, submit, attempts - 1)
+                else:
+                    outer.set_exception(JobError(f"a job was lost {ATTEMPTS} times ({lost})"))
 
         outer.add_done_callback(lambda future: inner.cancel() if future.cancelled() else None)
         inner.add_done_callback(over)
@@ -116,7 +113,9 @@ class Cluster(Executor):
             self._client.wait_for_workers(1, timeout=WORKERS_S)
         except TimeoutError as error:
             raise ConfigError(f"--on {self.address}: no worker came in {WORKERS_S:g} s") from error
-        for worker, theirs in self._client.run(ours).items():
+        for worker, theirs in self._client.run(ours, on_error="return").items():
+            if isinstance(theirs, BaseException):
+                raise ConfigError(f"worker {worker} does not have this retrim ({_line(theirs)})")
             check_alike(theirs, f"worker {worker}")
 
 
@@ -132,9 +131,9 @@ def joined(address: str | None, reporter: Reporter) -> Iterator[Cluster | None]:
 
 
 def ours() -> dict[str, str]:
-    """Return the versions that must be the same everywhere."""
+    """Return what must be the same everywhere: versions, and the commit of a checkout."""
     found = versions()
-    return {name: found[name] for name in ALIKE}
+    return {name: found.get(name, "missing") for name in (*ALIKE, *EXTRAS)} | {"commit": commit()}
 
 
 def check_alike(theirs: dict[str, str], who: str) -> None:
@@ -148,7 +147,7 @@ def check_alike(theirs: dict[str, str], who: str) -> None:
         ConfigError: They differ, with each difference.
     """
     here = ours()
-    if other := [f"{name} {theirs.get(name)}, here {here[name]}" for name in ALIKE if theirs.get(name) != here[name]]:
+    if other := [f"{name} {theirs.get(name)}, here {here[name]}" for name in here if theirs.get(name) != here[name]]:
         raise ConfigError(f"{who} has other versions: {'; '.join(other)}")
 
 
@@ -161,10 +160,5 @@ def call(theirs: dict[str, str], fn: Callable[..., Any], args: tuple[Any, ...], 
     return fn(*args, **kwargs)
 
 
-def _worker_died(done: Any) -> bool:
-    """Return whether Dask gave a job up since workers died of it, or beside it."""
-    return done.status == "error" and type(done.exception()).__name__ == "KilledWorker"
-
-
 def _line(error: BaseException) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
+    return (" ".join(str(error).split()) or type(error).__name__)[:200]

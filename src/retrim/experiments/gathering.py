@@ -6,7 +6,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass, field
 from functools import partial
 
-from ..errors import ConfigError
+from ..errors import ConfigError, JobError
 from ..runtime.flight import FlightStopped
 from .flights import Flight, FlightSpec
 from .interrupts import interrupts_only_set
@@ -68,6 +68,7 @@ def gathered(
 
     Raises:
         PlantError: A plant refused.
+        JobError: Nobody can be reached any more who would fly.
     """
     futures: list[Future[list[Flight]]] = []
     aloft, flown = dict[int, float](), dict[FlightSpec, Flight | None]()
@@ -86,7 +87,7 @@ def gathered(
             over = wait(waiting, OFTEN, FIRST_COMPLETED).done
             for future in over:
                 error = future.exception()
-                if error is not None and (not outlive or isinstance(error, ConfigError | FlightStopped)):
+                if error is not None and (not outlive or isinstance(error, ConfigError | JobError | FlightStopped)):
                     raise error
                 if error is not None:
                     failed |= dict.fromkeys(lots[waiting[future]].specs, _told(error))

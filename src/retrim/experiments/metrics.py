@@ -96,13 +96,19 @@ def summary(records: Sequence[Mapping[str, Any]], keys: Sequence[str] = CONDITIO
     """Return one row for flights of the same conditions.
 
     The mean is over the flights that were not terminated; the median and the maximum count a terminated flight as
-    infinite, which is None, so that it cannot hide one.
+    infinite, which is None, so that it cannot hide one. A flight whose job failed says nothing of the method: it counts
+    in ``n`` and is told in ``failures``.
 
     Args:
         records: Of :func:`record`.
         keys: Conditions that the row repeats.
     """
-    first = records[0]
+    why = [each["failed"] for each in records if each.get("failed")]
+    first, records = records[0], [each for each in records if not each.get("failed")]
+    if not records:
+        none = dict.fromkeys(("mean", "std", "median", "max", "peak_after_5s", "settle_s", *EFFORT, "interval"))
+        about = {key: first[key] for key in keys if key != "reference" or first[key]}
+        return about | {"metric": first["metric"], **none, "n": len(why), "crashes": 0, "failures": why, "errors": []}
     everything = _column(records, "error")
     whole = everything[np.isfinite(everything)]
     cross = [each["cross_track_m"] for each in records if each["cross_track_m"] is not None]
@@ -119,9 +125,9 @@ def summary(records: Sequence[Mapping[str, Any]], keys: Sequence[str] = CONDITIO
         **{name: _mean(records, name) for name in EFFORT},
         **({name: _mean(records, name) for name in BEHIND} if cross else {}),
         "interval": interval(records),
-        "n": len(records),
+        "n": len(records) + len(why),
         "crashes": sum(each["crashed"] for each in records),
-        **({"failures": why} if (why := [each["failed"] for each in records if each.get("failed")]) else {}),
+        **({"failures": why} if why else {}),
         "errors": [each["error"] for each in records],
     }
 

@@ -50,7 +50,7 @@ class Run:
         self.folder = out or Path("runs") / f"{command}-{datetime.now():%Y%m%d-%H%M%S}"
         self.remark = remark
         self.trained = trained or self.folder
-        self.executor = executor
+        self.executor, self.failed = executor, False
         self.watch = Stopwatch()
         self.replaces = out is not None and any(self.folder.glob("*.json"))
         self.stop = stop or threading.Event()
@@ -64,8 +64,8 @@ class Run:
 
     @property
     def exit_code(self) -> int:
-        """0, or 130 for a run that was interrupted."""
-        return INTERRUPTED if self.interrupted else 0
+        """0; 130 for a run that was interrupted, 1 for one of which a part failed."""
+        return INTERRUPTED if self.interrupted else int(self.failed)
 
     @contextlib.contextmanager
     def interruptible(self) -> Iterator[None]:

@@ -133,6 +133,10 @@ def _fly(fleet: Fleet, kept: "_Kept", run: Run, reporter: Reporter) -> None:
         vehicle = spec.scenario.vehicle_name(fleet.preset.vehicle)
         row = failed_record(spec, vehicle, fleet.setups[spec.scenario.reference].flown.metric, why)
         kept.add({keys[spec]: {"preset": fleet.preset.name, **row}})
+    if flights.failed:
+        run.failed = True
+        why = next(iter(flights.failed.values()))
+        reporter.say(f"{len(flights.failed)} flights failed elsewhere, the first by {why}; the same command flies them")
 
 
 def _trained(preset: Preset, sweep: Sweep, run: Run, reporter: Reporter) -> dict[int, Policy]:
@@ -147,10 +151,12 @@ def _trained(preset: Preset, sweep: Sweep, run: Run, reporter: Reporter) -> dict
     found = {seed: load_policy(path)[0] for seed, path in paths.items() if path.is_file()}
     missing = [seed for seed in sweep.seeds if seed not in found]
     if missing and run.executor is not None:
-        elsewhere = trained_elsewhere(preset, missing, run.executor, reporter=reporter, stop=run.stop)
-        for seed, (policy, _) in elsewhere.items():
+
+        def keep(seed: int, policy: Policy) -> None:
             save_policy(paths[seed], policy, preset)
             found[seed] = policy
+
+        trained_elsewhere(preset, missing, run.executor, reporter=reporter, stop=run.stop, landed=keep)
         if run.interrupted:
             raise KeyboardInterrupt
         missing = []
@@ -172,7 +178,7 @@ class _Kept:
         for line in path.read_text().splitlines() if path.is_file() else ():
             try:
                 row = json.loads(line)
-                if row["failed"] is None:
+                if row.get("failed") is None:
                     self.rows[row["key"]] = row
             except (json.JSONDecodeError, KeyError, TypeError):
                 continue
@@ -201,7 +207,8 @@ def _report(sweep: Sweep, kept: Sequence[dict[str, Any]], run: Run, reporter: Re
     for flights in groups.values():
         row = summary(flights, GROUP)
         found.append(row)
-        figures = ("crashed" if row[name] is None else f"{row[name]:.3f}" for name in ("median", "max"))
+        none = "crashed" if row["crashes"] else "-"
+        figures = (none if row[name] is None else f"{row[name]:.3f}" for name in ("median", "max"))
         cells.append((*(str(flights[0][name]) for name in varied), cell(row), *figures))
     intro = "Made by `retrim sweep`. Error [m] over the last seconds of each flight, over seeds and starts."
     document = Document(run, "sweep", "Sweep", intro, sweep.seeds, reporter, {"sweep": dataclasses.asdict(sweep)})
@@ -220,6 +227,6 @@ def _bar_groups(groups: Mapping[tuple[Any, ...], list[dict[str, Any]]]) -> dict[
     for group, flights in groups.items():
         label = ", ".join(str(group[i]) for i in varied)
         shown.setdefault(label, {})[str(group[-1])] = [
-            float("inf") if row["error"] is None else row["error"] for row in flights
+            float("inf") if row["error"] is None else row["error"] for row in flights if not row.get("failed")
         ]
     return shown

@@ -1,7 +1,7 @@
 """Pretraining with progress, and the error of a policy in its own model."""
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, wait
 from typing import NamedTuple
 
@@ -15,7 +15,7 @@ from ..config.loading import changed, dump, parse
 from ..config.presets import Preset
 from ..config.setup import Setup
 from ..control.policy import Policy
-from ..errors import RetrimError
+from ..errors import JobError
 from ..learn.env import Env
 from ..learn.residuals.model import FittedResidual
 from ..learn.rollout import rollout
@@ -62,7 +62,13 @@ def train(
 
 
 def trained_elsewhere(
-    preset: Preset, seeds: Sequence[int], executor: Executor, *, reporter: Reporter, stop: threading.Event
+    preset: Preset,
+    seeds: Sequence[int],
+    executor: Executor,
+    *,
+    reporter: Reporter,
+    stop: threading.Event,
+    landed: Callable[[int, Policy], None] = lambda seed, policy: None,
 ) -> dict[int, tuple[Policy, float]]:
     """Pretrain a policy for each seed, all at once, in other processes.
 
@@ -71,16 +77,17 @@ def trained_elsewhere(
         seeds: Seeds of weights and starts.
         executor: Hands a seed to whoever is free.
         reporter: Receives the progress.
-        stop: Gives up what is not trained yet.
+        stop: Gives up what is not trained yet; Ctrl-C does the same, and sets it.
+        landed: Receives each policy as it comes.
 
     Returns:
         By seed: the policy, and its error in its own model [m]. Complete, but after ``stop``.
 
     Raises:
-        RetrimError: A training failed.
+        JobError: A training failed; told once the others have come.
     """
     jobs = {executor.submit(train_job, dump(preset), seed): seed for seed in seeds}
-    found, waiting = dict[int, tuple[Policy, float]](), set(jobs)
+    found, failed, waiting = dict[int, tuple[Policy, float]](), list[str](), set(jobs)
     try:
         with reporter.progress(f"pretraining {preset.name} elsewhere") as advance:
             while waiting and not stop.is_set():
@@ -88,12 +95,18 @@ def trained_elsewhere(
                 for job in wait(waiting, 1.0, FIRST_COMPLETED).done:
                     waiting.remove(job)
                     if (error := job.exception()) is not None:
-                        raise RetrimError(f"training {preset.name}, seed {jobs[job]}, failed: {error}") from error
+                        failed.append(f"seed {jobs[job]}: {' '.join(str(error).split())}")
+                        continue
                     found[jobs[job]] = job.result()
+                    landed(jobs[job], found[jobs[job]][0])
             advance(len(found) / len(jobs), f"{len(found)} of {len(jobs)} seeds")
+    except KeyboardInterrupt:
+        stop.set()
     finally:
         for job in waiting:
             job.cancel()
+    if failed:
+        raise JobError(f"{len(failed)} of {len(jobs)} trainings of {preset.name} failed: {failed[0]}")
     return {seed: found[seed] for seed in seeds if seed in found}
 
 

@@ -9,6 +9,8 @@ import numpy as np
 from jax import lax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from ..errors import ConfigError
+
 T = TypeVar("T")
 
 MANY = "many"
@@ -29,6 +31,9 @@ def spread(tree: T, *, axis: int = 0) -> T:
     Args:
         tree: Arrays whose axis ``axis`` has the same length; other leaves stay.
         axis: The axis of environments, flights or vehicles.
+
+    Raises:
+        ConfigError: There are several hosts, and their devices do not divide it.
     """
     leaves = jax.tree.leaves(eqx.filter(tree, eqx.is_array))
     return _laid(tree, leaves[0].shape[axis], PartitionSpec(*[None] * axis, MANY)) if leaves else tree
@@ -52,6 +57,9 @@ def gathered(tree: T) -> T:
 
 def _laid(tree: T, n: int, how: PartitionSpec) -> T:
     count = shared_by(n, jax.device_count())
+    if jax.process_count() > 1 and count < jax.device_count():
+        hosts = jax.process_count()
+        raise ConfigError(f"{n} cannot be divided among the {jax.device_count()} devices of {hosts} hosts")
     if count == 1:
         return tree
     arrays, rest = eqx.partition(tree, eqx.is_array)

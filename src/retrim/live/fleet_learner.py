@@ -35,30 +35,40 @@ class FleetLearner:
         """By the name of a vehicle and layer."""
         self._clock, self._setups = clock, dict[tuple[str, str | None], Setup]()
         self._kind = dict[int, Any]()
-        self._compiled = set[tuple[Any, int]]()
+        self._wanted = dict[int, Callable[[], bool]]()
+        self._taken_back = dict[Any, int]()
+        self._compiled = set[tuple[Any, int, bool]]()
         self._bases = dict[Any, PolicyState]()
         self._key = random.key(0)
         self._most = AT_ONCE if jax.default_backend() == "cpu" else MANY
 
-    def add(self, name: str, plan: LearnerPlan, bus: Bus) -> None:
-        """Learn for one more vehicle and layer, from now on."""
+    def add(self, name: str, plan: LearnerPlan, bus: Bus, wanted: Callable[[], bool] = lambda: True) -> None:
+        """Learn for one more vehicle and layer, from now on.
+
+        Args:
+            name: Its name.
+            plan: What to learn.
+            bus: Of the flight.
+            wanted: Asked before something is published, since who wanted it may be gone meanwhile.
+        """
         loop = LearnerLoop(plan, bus, self._clock, self._setup_of)
         loop.catch_up()
         policy = loop.state.policy.policy
         base = fingerprint(policy.base) if isinstance(policy, LoraPolicy) else ""
         self.loops[name] = loop
+        self._wanted[id(loop)] = wanted
         self._kind[id(loop)] = plan.layer, id(loop.setup), base
 
     def drop(self, name: str) -> None:
         """Learn no more for it."""
         if (loop := self.loops.pop(name, None)) is not None:
-            del self._kind[id(loop)]
+            del self._kind[id(loop)], self._wanted[id(loop)]
 
     def warm_up(self) -> None:
         """Compile what the present vehicles need, however many of them are due at once."""
         for kind, loops in self._kinds(list(self.loops.values())).items():
             for n in (1 << k for k in range(room_for(min(len(loops), self._most)).bit_length())):
-                if (kind, n) in self._compiled:
+                if (kind, n, len(loops) > 1) in self._compiled:
                     continue
                 some = [loops[i % len(loops)] for i in range(n)]
                 workers, windows = [loop.new_worker() for loop in some], [loop.made_up_window() for loop in some]
@@ -66,7 +76,7 @@ class FleetLearner:
                 if (low_rank := _low_rank(workers)) and len(loops) > 1:
                     base = shared_base(low_rank[0].learner, low_rank[0].state)
                     learn_base(low_rank, windows, base, random.key(0))
-                self._compiled.add((kind, n))
+                self._compiled.add((kind, n, len(loops) > 1))
 
     def step(self) -> int:
         """Learn for vehicles that are due, those first that have waited longest; return for how many.
@@ -83,7 +93,8 @@ class FleetLearner:
             if not windows:
                 continue
             for (loop, _), update in zip(windows, self._learnt(kind, windows), strict=True):
-                loop.learnt(update)
+                if self._wanted[id(loop)]():
+                    loop.learnt(update)
             served = {id(loop) for loop, _ in windows}
             self.loops = dict(sorted(self.loops.items(), key=lambda each: id(each[1]) in served))  # to the end
             done += len(windows)
@@ -95,6 +106,10 @@ class FleetLearner:
         low_rank = _low_rank(workers)
         if not low_rank or list(self._kind.values()).count(kind) < 2:
             return learn_together(workers, seen)
+        backs = sum(loop.taken_back for loop in self.loops.values() if self._kind[id(loop)] == kind)
+        if backs != self._taken_back.get(kind, backs):
+            self._bases.pop(kind, None)  # control has taken a policy back: go on from what flies
+        self._taken_back[kind] = backs
         before = self._bases.get(kind) or shared_base(low_rank[0].learner, low_rank[0].state)
         self._key, key = random.split(self._key)
         base = learn_base(low_rank, seen, before, key)

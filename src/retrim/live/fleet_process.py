@@ -4,6 +4,7 @@ import contextlib
 import os
 import pickle
 import subprocess
+import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,7 @@ from ..transport.shared_memory import SharedMemoryBus
 from .fleet_learner import FleetLearner
 from .learner_process import CHECK_EVERY, NICE, LearnerPlan
 
+FAILED = ".failed"
 LOOK_EVERY = 0.1  # [s] for vehicles that have come or gone
 
 
@@ -37,28 +39,42 @@ def learn_for_all(plan: FleetPlan) -> None:
     with contextlib.suppress(OSError, AttributeError):
         os.nice(NICE)
     enable_compile_cache()
-    fleet, parent, looked = FleetLearner(), Lifeline(plan.parent), 0.0
+    fleet, parent, looked, done = FleetLearner(), Lifeline(plan.parent), 0.0, set[str]()
     while not parent.gone():
         if time.monotonic() - looked > LOOK_EVERY:
             looked = time.monotonic()
-            _look(fleet, plan.folder)
+            _look(fleet, plan.folder, done)
         if not fleet.step():
             time.sleep(CHECK_EVERY)
 
 
-def _look(fleet: FleetLearner, folder: Path) -> None:
-    """Take vehicles that have come, and let those go that are gone or whose flight is over."""
+def _look(fleet: FleetLearner, folder: Path, done: set[str]) -> None:
+    """Take vehicles that have come, and let those go that are gone or whose flight is over.
+
+    Args:
+        fleet: The learners.
+        folder: With the plans.
+        done: Names of plans that are over or cannot be followed; it grows.
+    """
     there = {path.stem: path for path in folder.glob("*.plan")}
-    over = {name for name, loop in fleet.loops.items() if loop.bus.latest("ended") is not None}
-    for name in (fleet.loops.keys() - there.keys()) | over:
+    done |= {name for name, loop in fleet.loops.items() if loop.bus.latest("ended") is not None}
+    for name in (fleet.loops.keys() - there.keys()) | (fleet.loops.keys() & done):
         fleet.drop(name)
-    new = [name for name in sorted(there.keys() - fleet.loops.keys()) if name not in over]
+    new = sorted(there.keys() - fleet.loops.keys() - done)
     for name in new:
-        with contextlib.suppress(OSError, EOFError, RetrimError):  # gone again
+        try:
             found: LearnerPlan = pickle.loads(there[name].read_bytes())  # written by the parent of this process
             bus = SharedMemoryBus(found.folder)
-            if bus.latest("ended") is None:
-                fleet.add(name, found, bus)
+            if bus.latest("ended") is not None:
+                done.add(name)
+                continue
+            fleet.add(name, found, bus, there[name].exists)
+        except RetrimError as error:
+            done.add(name)
+            print(error, file=sys.stderr, flush=True)
+            there[name].with_suffix(FAILED).touch()
+        except (OSError, EOFError):  # gone again
+            continue
     if not new:
         return
     fleet.warm_up()
@@ -105,8 +121,8 @@ class Seat:
     path: Path
 
     def poll(self) -> int | None:
-        """Return the exit code of the process; None while it runs."""
-        return self.process.poll()
+        """Return the exit code of the process, or 1 if it cannot follow the plan; None while it learns."""
+        return 1 if self.path.with_suffix(FAILED).exists() else self.process.poll()
 
     def kill(self) -> None:
         """Have it learn for this vehicle no more."""

@@ -10,7 +10,7 @@ from pathlib import Path
 from subprocess import Popen
 from typing import Any
 
-from ..errors import MessageError
+from ..errors import ConfigError, MessageError
 from ..onboard.launch import last_words, launch
 from ..onboard.messages import last_note, pack_note
 from ..onboard.topics import INTO, MOST, OUT
@@ -138,6 +138,8 @@ class Ground:
         assert self._bus is not None
         start = self.folder / f"start-{m.number}.safetensors"
         plan = LearnerPlan(self._bus.folder, layer, start, m.reference, m.seed, m.base, os.getpid(), m.floor)
+        if (old := self.processes.get(layer)) is not None:
+            old.kill()  # a seat in the process of a fleet outlives that process
         complaints = self.folder / f"{layer}.log"
         if self._fleet is not None:
             self.processes[layer] = self._fleet.start(layer, plan, complaints)
@@ -191,11 +193,15 @@ def learn_for(
         told: Receives how they stand, very often.
 
     Returns:
-        How they ended, one line for each.
+        How they ended.
 
     Raises:
-        ConfigError: One of the buses cannot be joined.
+        ConfigError: One of the buses cannot be joined, an address is there twice, or there are two rosmasters.
     """
+    if twice := [str(each) for i, each in enumerate(addresses) if each in addresses[:i]]:
+        raise ConfigError(f"address {twice[0]} is there twice; each vehicle has its own, or a key of its own")
+    if len({(each.host, each.port) for each in addresses if each.kind == "ros"}) > 1:
+        raise ConfigError("vehicles at several rosmasters: a process of ROS 1 knows one; give them keys at one master")
     with ExitStack() as stack:
         fleet = None
         if len(addresses) > 1:

@@ -84,6 +84,8 @@ class LearnerLoop:
         self._last_tick, self._new_ticks, self._began = -1, 0, float("-inf")
         self._known: dict[str, int] = {}
         self._learnt = 0
+        self.taken_back = 0
+        """How often control took a policy back."""
         self._pending: tuple[int, PolicyUpdate, float] | None = None
         self._flown: list[tuple[int, Update]] = []
 
@@ -195,6 +197,7 @@ class LearnerLoop:
             self._flown.pop()
             back = True
         if back:
+            self.taken_back += 1
             self.worker.receive(self._flown[-1][1] if self._flown else _start(self.state))
         if self._pending is None:
             return back

@@ -204,23 +204,30 @@ def fit_all(learner: OnlineLearner, residuals: Any, windows: Window) -> tuple[An
 
 @eqx.filter_jit
 def update_all(
-    learner: OnlineLearner, state: LearnerState, windows: Window, keys: Key[Array, " n"]
+    learner: OnlineLearner, state: LearnerState, windows: Window, keys: Key[Array, " n"], flown: Any = None
 ) -> tuple[PolicyState, Verdict]:
     """Re-train the policy of each flight; every array has a leading axis of flights.
+
+    Args:
+        learner: How.
+        state: What each goes on from.
+        windows: Of each flight.
+        keys: Consumed.
+        flown: Policies that fly, where these are others than those of ``state``.
 
     Returns:
         The trained policy, or the old one where the gate refused it, and the verdicts.
     """
 
-    def update(state: LearnerState, window: Window, key: Key[Array, ""]) -> tuple[PolicyState, Verdict]:
-        trained, verdict = learner.update_policy(state.policy, state.residual, window, key)
+    def update(state: LearnerState, window: Window, key: Key[Array, ""], flown: Any) -> tuple[PolicyState, Verdict]:
+        trained, verdict = learner.update_policy(state.policy, state.residual, window, key, flown)
         return where(verdict.admitted, trained, state.policy), verdict
 
     if jax.default_backend() != "cpu" or jax.device_count() > 1:
-        updated: tuple[PolicyState, Verdict] = eqx.filter_vmap(update)(state, windows, keys)
+        updated: tuple[PolicyState, Verdict] = eqx.filter_vmap(update)(state, windows, keys, flown)
         return updated
     # A core is fastest with a few at once, whose activations stay in its cache.
-    arrays, rest = eqx.partition((state, windows, keys), eqx.is_array)
+    arrays, rest = eqx.partition((state, windows, keys, flown), eqx.is_array)
 
     def of_arrays(one: Any) -> tuple[PolicyState, Verdict]:
         trained, verdict = update(*eqx.combine(one, rest))

@@ -18,7 +18,7 @@ from ..adapt.workers import PolicyWorker, ResidualWorker, Worker, policy_update,
 from ..control.lora import LoraPolicy
 from ..control.policy import Policy
 from ..learn.bptt import PolicyState, policy_gradient
-from ..learn.devices import spread
+from ..learn.devices import gathered, spread
 from ..learn.residuals.model import FittedResidual
 from ..learn.window import Window
 from .batch_learning import fit_all, update_all
@@ -36,7 +36,8 @@ def learn_together(
     Args:
         workers: One for each vehicle, of one layer and one learner, with states of one structure.
         windows: What each learns from.
-        base: The base that low-rank policies put their deltas on from now on; each its own by default.
+        base: The base that low-rank policies put their deltas on from now on; each its own by default. The gate
+            compares what comes of it with what flies.
 
     Returns:
         The update of each.
@@ -51,7 +52,8 @@ def learn_together(
     assert isinstance(first, PolicyWorker)
     keys = [worker.next_key() for worker in workers if isinstance(worker, PolicyWorker)]
     state = stacked([_on(_state(workers[i]), base) for i in filled])
-    trained, verdicts = update_all(first.learner, state, window, spread(jnp.stack([keys[i] for i in filled])))
+    flown = None if base is None else stacked([_policy(workers[i]) for i in filled])
+    trained, verdicts = update_all(first.learner, state, window, spread(jnp.stack([keys[i] for i in filled])), flown)
     verdicts, t = jax.device_get((verdicts, window.t[:, -1]))
     return [policy_update(float(t[i]), one(trained, i), _row(verdicts, i)) for i in range(n)]
 
@@ -86,7 +88,7 @@ def learn_base(
     weight = jnp.asarray([1.0 / n] * n + [0.0] * (len(filled) - n))
     window = stacked([windows[i] for i in filled])
     stepped: PolicyState = _base_step(workers[0].learner, base, states, window, weight, key)
-    return stepped
+    return gathered(stepped)  # the next step may be shared by other devices
 
 
 def refused_by_all(updates: Sequence[Update]) -> bool:
@@ -135,6 +137,11 @@ def room_for(n: int) -> int:
 def _state(worker: Worker) -> Any:
     assert isinstance(worker, ResidualWorker | PolicyWorker)
     return worker.state
+
+
+def _policy(worker: Worker) -> Any:
+    assert isinstance(worker, PolicyWorker)
+    return worker.policy
 
 
 def _row(tree: Any, i: int) -> Any:

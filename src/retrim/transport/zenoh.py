@@ -37,7 +37,7 @@ class ZenohBus(NetworkBus):
         ext: Any = _ext
         super().__init__(capacities)
         config = zenoh.Config()
-        for key, value in {
+        for name, value in {
             "mode": "peer",
             "scouting/multicast/enabled": False,
             "timestamping/enabled": True,  # the history that late joiners ask for needs it
@@ -48,7 +48,7 @@ class ZenohBus(NetworkBus):
             # A peer that is back is found again at once.
             "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
         }.items():
-            config.insert_json5(key, json.dumps(value))
+            config.insert_json5(name, json.dumps(value))
         try:
             self._session: Any = zenoh.open(config)
         except zenoh.ZError as error:

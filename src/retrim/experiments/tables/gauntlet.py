@@ -9,7 +9,7 @@ from ...config.conditions import conditions
 from ...config.loading import load
 from ...config.methods import find_method
 from ...config.setup import Setup
-from ...errors import ConfigError, PlantError
+from ...errors import ConfigError, JobError, PlantError
 from ...viz import plots
 from ...viz.panels import Curve, Panel, heat_map, panel_figure
 from ..flights import Flight
@@ -79,7 +79,7 @@ def gauntlet(
             flights = fly_all(
                 study, [known[name]], run, reporter, methods=methods, starts=starts, seconds=seconds
             ).flown
-        except PlantError as error:
+        except (PlantError, JobError) as error:
             left_out.append(f"{name}: {error}")
             continue
         if flights:

@@ -27,7 +27,7 @@ QUICK: dict[str, Options] = {
     "tuning": {"candidates": 12, "starts": 1, "methods": ("geometric", "geometric-i", "indi")},
 }
 """By table: options that are smaller."""
-ALONE = ("model", "efficiency", "buses", "tuning", "design")
+ALONE = ("model", "efficiency", "buses", "tuning", "design", "scaling")
 """Tables that this process makes alone."""
 REMARK = "A quick look, smaller than the table: figures to look at, not to quote."
 

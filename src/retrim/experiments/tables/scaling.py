@@ -85,14 +85,12 @@ def scaling(
 
         with run.interruptible(), reporter.progress(f"{n} flights") as advance:
             fleet.run(
-                run.executor,
                 stop=run.stop,
                 progress=told_by(advance),
                 landed=note,
-                by_lot=True,
                 forget=True,
             )
-        if not run.interrupted:
+        if not run.interrupted and errors:
             rows.append(_row(n, seconds, watch, errors) | {"flight_bytes": max(sizes)})
             run.write_results(rows, seeds=[0], name="scaling")
     if rows:
@@ -143,7 +141,7 @@ def _row(n: int, seconds: float, watch: Stopwatch, errors: Sequence[float]) -> d
         "run_s": watch.total_s - compile_s,
         "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit,
         "crashes": int(np.isnan(errors).sum()),
-        "mean": float(np.nanmean(errors)),
+        "mean": float(np.nanmean(errors)) if np.isfinite(errors).any() else None,
     }
 
 

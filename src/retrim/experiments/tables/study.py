@@ -11,6 +11,7 @@ from ...config.presets import Preset
 from ...config.scenario import Scenario
 from ...config.setup import Setup
 from ...control.policy import Policy
+from ...errors import JobError
 from ..fleet import Fleet
 from ..gathering import Flights, told_by
 from ..limits import check_flights, check_seeds
@@ -98,16 +99,16 @@ def fly_all(
 
     Raises:
         PlantError: The package of a plant is not installed.
+        JobError: Flights failed in another process; a table with holes is not made.
     """
     if not study.policies or run.interrupted:
         return Flights([], interrupted=True)
     fleet = Fleet(study.preset, study.policies, scenarios, methods=methods, starts=starts, seconds=seconds)
+    flights = Flights([], interrupted=True)
     with run.interruptible(), reporter.progress("flying") as advance:
         advance(0.0, "compiling the programs of a flight (kept in a cache for the next time)")
         flights = fleet.run(run.executor, stop=run.stop, progress=told_by(advance), by_lot=True)
-        for spec, why in flights.failed.items():
-            reporter.say(
-                f"failed: {spec.scenario.disturbance}, {spec.method}, seed {spec.seed}, start {spec.start}: {why}"
-            )
-        return flights
-    return Flights([], interrupted=True)
+    if flights.failed:
+        why = next(iter(flights.failed.values()))
+        raise JobError(f"{len(flights.failed)} of {len(fleet.specs)} flights failed elsewhere, the first by {why}")
+    return flights

@@ -141,7 +141,7 @@ class CrazyfliePlant(LinkedPlant[CrazyflieLink]):
                 self._sink(link)
             link.stop_logs()
         finally:
-            self._flies = False
+            self._flies, self.thrust.hover = False, None
             link.close()
 
     def _sink(self, link: CrazyflieLink) -> None:
