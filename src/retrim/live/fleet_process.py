@@ -5,8 +5,9 @@ import os
 import pickle
 import subprocess
 import sys
+import threading
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import jax
@@ -93,9 +94,14 @@ class FleetProcess:
     """Where it may run; None for anywhere."""
     process: "subprocess.Popen[bytes] | None" = None
     count: int = 0
+    lock: threading.Lock = field(default_factory=threading.Lock)
 
     def start(self, layer: str, plan: LearnerPlan, complaints: Path) -> "Seat":
-        """Have it learn for a vehicle and layer."""
+        """Have it learn for a vehicle and layer; may be called from any thread."""
+        with self.lock:
+            return self._start(layer, plan, complaints)
+
+    def _start(self, layer: str, plan: LearnerPlan, complaints: Path) -> "Seat":
         if self.process is None or self.process.poll() is not None:
             main, fleet = "retrim.live.fleet_process:learn_for_all", FleetPlan(self.folder, os.getpid())
             self.process = launch(main, fleet, self.folder / "learners.log", self.cores)

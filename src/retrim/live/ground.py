@@ -5,6 +5,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import ExitStack
 from pathlib import Path
 from subprocess import Popen
@@ -23,7 +24,7 @@ from .mission import Mission
 from .spec import MAINS
 
 IDLE, SELDOM = 0.002, 0.05  # [s] between two looks at a bus, while a flight goes on and before it begins
-BEAT_EVERY = 0.25  # [s]
+BEAT_EVERY = TOLD_EVERY = 0.25  # [s]
 SILENCE = 5.0  # [s] without a word of the flight, after which it is told
 ATTEMPTS = 5  # to bring a learner back
 
@@ -208,23 +209,32 @@ def learn_for(
             fleet = FleetProcess(Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="retrim-fleet-"))))
             stack.callback(fleet.close)
         grounds = [stack.enter_context(Ground(address, fleet)) for address in addresses]
-        waiting = {ground: ground.wait() for ground in grounds}
-        flights = dict[Ground, Iterator[str]]()
         stands = dict.fromkeys(grounds, "waiting for a flight")
-        while (waiting or flights) and not stop.is_set():
-            for ground, wait in list(waiting.items()):
-                if next(wait, "there") == "there":
-                    del waiting[ground]
-                    flights[ground] = ground.learn()
-            for ground, flight in list(flights.items()):
-                if (stands_now := next(flight, None)) is None:
-                    del flights[ground]
-                else:
-                    stands[ground] = stands_now
-            told(_summary(stands))
-            if not any(ground.carried for ground in flights):
-                time.sleep(IDLE if flights else SELDOM)
+        # A thread for each: a network that is slow to one vehicle keeps no other waiting.
+        pool = stack.enter_context(ThreadPoolExecutor(len(grounds)))
+        flights = [pool.submit(_serve, ground, stands, stop) for ground in grounds]
+        try:
+            while wait(flights, TOLD_EVERY).not_done:
+                told(_summary(stands))
+        except BaseException:
+            stop.set()  # the threads end, too
+            raise
+        for flight in flights:
+            flight.result()
         return _summary(stands)
+
+
+def _serve(ground: Ground, stands: dict[Ground, str], stop: threading.Event) -> None:
+    """Learn for one flight until it is over, and note how it stands."""
+    for _ in ground.wait():
+        if stop.wait(SELDOM):
+            return
+    for words in ground.learn():
+        stands[ground] = words
+        if stop.is_set():
+            return
+        if not ground.carried:
+            time.sleep(IDLE)
 
 
 def _summary(stands: dict[Ground, str]) -> str:
