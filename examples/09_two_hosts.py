@@ -35,11 +35,11 @@ def main(quick: bool = False) -> None:
         address = f"127.0.0.1:{free.getsockname()[1]}"
     words = [sys.executable, __file__, address, "2"]
     more = ["quick"] if quick else []
-    first, second = (subprocess.Popen([*words, str(i), *more], stdout=subprocess.PIPE, text=True) for i in (0, 1))
-    said = first.communicate()[0]
-    if first.returncode or second.wait():
+    hosts = [subprocess.Popen([*words, str(i), *more], stdout=subprocess.PIPE, text=True) for i in (0, 1)]
+    said = [host.communicate()[0] for host in hosts]
+    if any(host.returncode for host in hosts):
         raise SystemExit("a host has failed")
-    print(said, end="")
+    print(said[0], end="")
 
 
 if __name__ == "__main__":
