@@ -125,7 +125,7 @@ class CrazyfliePlant(LinkedPlant[CrazyflieLink]):
         """Send thrust and body rates."""
         thrust = round(self.thrust.command(float(u[0])))
         self.link.send(crtp.rates_setpoint(thrust, u[1:]))
-        return np.concatenate([[self.thrust.per_mass(thrust)], u[1:]])
+        return np.concatenate([[self.thrust.per_mass(float(thrust))], u[1:]])
 
     def wait(self, until: float) -> None:
         """Keep the link alive."""
