@@ -3,7 +3,7 @@
 import hashlib
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -31,16 +31,18 @@ class FleetLearner:
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         """Build one without vehicles; ``clock`` tells the time [s]."""
-        self.loops: dict[str, LearnerLoop] = {}
-        """By the name of a vehicle and layer."""
+        self._members: dict[str, _Member] = {}
         self._clock, self._setups = clock, dict[tuple[str, str | None], Setup]()
-        self._kind = dict[int, Any]()
-        self._wanted = dict[int, Callable[[], bool]]()
         self._taken_back = dict[Any, int]()
         self._compiled = set[tuple[Any, int, bool]]()
         self._bases = dict[Any, PolicyState]()
         self._key = random.key(0)
         self._most = AT_ONCE if jax.default_backend() == "cpu" else MANY
+
+    @property
+    def loops(self) -> dict[str, LearnerLoop]:
+        """The loops by the name of a vehicle and layer, those first that have waited longest."""
+        return {name: member.loop for name, member in self._members.items()}
 
     def add(self, name: str, plan: LearnerPlan, bus: Bus, wanted: Callable[[], bool] = lambda: True) -> None:
         """Learn for one more vehicle and layer, from now on.
@@ -55,18 +57,16 @@ class FleetLearner:
         loop.catch_up()
         policy = loop.state.policy.policy
         base = fingerprint(policy.base) if isinstance(policy, LoraPolicy) else ""
-        self.loops[name] = loop
-        self._wanted[id(loop)] = wanted
-        self._kind[id(loop)] = plan.layer, id(loop.setup), base
+        self._members[name] = _Member(loop, (plan.layer, id(loop.setup), base), wanted)
 
     def drop(self, name: str) -> None:
         """Learn no more for it."""
-        if (loop := self.loops.pop(name, None)) is not None:
-            del self._kind[id(loop)], self._wanted[id(loop)]
+        self._members.pop(name, None)
 
     def warm_up(self) -> None:
         """Compile what the present vehicles need, however many of them are due at once."""
-        for kind, loops in self._kinds(list(self.loops.values())).items():
+        for kind, members in self._kinds().items():
+            loops = [member.loop for member in members.values()]
             for n in (1 << k for k in range(room_for(min(len(loops), self._most)).bit_length())):
                 if (kind, n, len(loops) > 1) in self._compiled:
                     continue
@@ -85,35 +85,35 @@ class FleetLearner:
         left are due in the next step, and learn from a window that is as new as that.
         """
         done = 0
-        for kind, loops in self._kinds(list(self.loops.values())).items():
-            windows = list[tuple[LearnerLoop, Window]]()
-            for loop in loops:
-                if len(windows) < self._most and (window := loop.due()) is not None:
-                    windows.append((loop, window))
+        for kind, members in self._kinds().items():
+            windows = dict[str, Window]()
+            for name, member in members.items():
+                if len(windows) < self._most and (window := member.loop.due()) is not None:
+                    windows[name] = window
             if not windows:
                 continue
-            for (loop, _), update in zip(windows, self._learnt(kind, windows), strict=True):
-                if self._wanted[id(loop)]():
-                    loop.learnt(update)
-            served = {id(loop) for loop, _ in windows}
-            self.loops = dict(sorted(self.loops.items(), key=lambda each: id(each[1]) in served))  # to the end
+            updates = self._learnt(kind, [members[name].loop for name in windows], list(windows.values()))
+            for name, update in zip(windows, updates, strict=True):
+                if members[name].wanted():
+                    members[name].loop.learnt(update)
+                self._members[name] = self._members.pop(name)  # to the end
             done += len(windows)
         return done
 
-    def _learnt(self, kind: Any, windows: list[tuple[LearnerLoop, Window]]) -> list[Update]:
+    def _learnt(self, kind: Any, loops: list[LearnerLoop], windows: list[Window]) -> list[Update]:
         """Learn for some vehicles of a kind; low-rank policies put their deltas on a base that learns from all."""
-        workers, seen = [loop.worker for loop, _ in windows], [window for _, window in windows]
+        workers, members = [loop.worker for loop in loops], self._kinds()[kind].values()
         low_rank = _low_rank(workers)
-        if not low_rank or list(self._kind.values()).count(kind) < 2:
-            return learn_together(workers, seen)
-        backs = sum(loop.taken_back for loop in self.loops.values() if self._kind[id(loop)] == kind)
+        if not low_rank or len(members) < 2:
+            return learn_together(workers, windows)
+        backs = sum(member.loop.taken_back for member in members)
         if backs != self._taken_back.get(kind, backs):
             self._bases.pop(kind, None)  # control has taken a policy back: go on from what flies
         self._taken_back[kind] = backs
         before = self._bases.get(kind) or shared_base(low_rank[0].learner, low_rank[0].state)
         self._key, key = random.split(self._key)
-        base = learn_base(low_rank, seen, before, key)
-        updates = learn_together(workers, seen, base)
+        base = learn_base(low_rank, windows, before, key)
+        updates = learn_together(workers, windows, base)
         self._bases[kind] = before if refused_by_all(updates) else base
         return updates
 
@@ -124,12 +124,21 @@ class FleetLearner:
             self._setups[key] = Setup.of(preset, reference)
         return self._setups[key]
 
-    def _kinds(self, loops: list[LearnerLoop]) -> dict[Any, list[LearnerLoop]]:
-        """Return loops by what is one program: the layer, the learner, and the base of what is learnt as a delta."""
-        found: dict[Any, list[LearnerLoop]] = {}
-        for loop in loops:
-            found.setdefault(self._kind[id(loop)], []).append(loop)
+    def _kinds(self) -> dict[Any, dict[str, "_Member"]]:
+        """Return the members of each kind, by name."""
+        found: dict[Any, dict[str, _Member]] = {}
+        for name, member in self._members.items():
+            found.setdefault(member.kind, {})[name] = member
         return found
+
+
+class _Member(NamedTuple):
+    """One vehicle and layer."""
+
+    loop: LearnerLoop
+    kind: tuple[str, int, str]
+    """What is one program: the layer, the learner, and the base of what is learnt as a delta."""
+    wanted: Callable[[], bool]
 
 
 def _low_rank(workers: Sequence[Worker]) -> list[PolicyWorker]:

@@ -178,7 +178,7 @@ def _fitted(learner: OnlineLearner, state: LearnerState, window: Window) -> tupl
     """Fit the residual of every flight; return the states, and what each flight is told, with the states of all."""
     states, reports = fit_all(learner, state.residual, window)
     reports, t = jax.device_get((reports, window.t[:, -1]))
-    return states, [residual_update(float(t[i]), states, _row(reports, i)) for i in range(len(t))]
+    return states, [residual_update(float(t[i]), states, row(reports, i)) for i in range(len(t))]
 
 
 def _updated(
@@ -188,10 +188,11 @@ def _updated(
     keys, now = _next_keys(keys)
     trained, verdicts = update_all(learner, state, window, now)
     verdicts, t = jax.device_get((verdicts, window.t[:, -1]))
-    return keys, trained, [policy_update(float(t[i]), trained, _row(verdicts, i)) for i in range(len(t))]
+    return keys, trained, [policy_update(float(t[i]), trained, row(verdicts, i)) for i in range(len(t))]
 
 
-def _row(tree: Any, i: int) -> Any:
+def row(tree: Any, i: int) -> Any:
+    """Return what arrays of NumPy with a leading axis of flights say of one flight."""
     return jax.tree.map(lambda leaf: leaf[i], tree)
 
 

@@ -21,7 +21,7 @@ from ..learn.bptt import PolicyState, policy_gradient
 from ..learn.devices import gathered, spread
 from ..learn.residuals.model import FittedResidual
 from ..learn.window import Window
-from .batch_learning import fit_all, update_all
+from .batch_learning import fit_all, row, update_all
 from .batched import one, stacked
 
 
@@ -48,14 +48,14 @@ def learn_together(
     if isinstance(first, ResidualWorker):
         states, reports = fit_all(first.learner, stacked([_state(workers[i]) for i in filled]), window)
         reports, t = jax.device_get((reports, window.t[:, -1]))
-        return [residual_update(float(t[i]), one(states, i), _row(reports, i)) for i in range(n)]
+        return [residual_update(float(t[i]), one(states, i), row(reports, i)) for i in range(n)]
     assert isinstance(first, PolicyWorker)
     keys = [worker.next_key() for worker in workers if isinstance(worker, PolicyWorker)]
     state = stacked([_on(_state(workers[i]), base) for i in filled])
     flown = None if base is None else stacked([_policy(workers[i]) for i in filled])
     trained, verdicts = update_all(first.learner, state, window, spread(jnp.stack([keys[i] for i in filled])), flown)
     verdicts, t = jax.device_get((verdicts, window.t[:, -1]))
-    return [policy_update(float(t[i]), one(trained, i), _row(verdicts, i)) for i in range(n)]
+    return [policy_update(float(t[i]), one(trained, i), row(verdicts, i)) for i in range(n)]
 
 
 def shared_base(learner: OnlineLearner, state: LearnerState) -> PolicyState:
@@ -142,7 +142,3 @@ def _state(worker: Worker) -> Any:
 def _policy(worker: Worker) -> Any:
     assert isinstance(worker, PolicyWorker)
     return worker.policy
-
-
-def _row(tree: Any, i: int) -> Any:
-    return jax.tree.map(lambda leaf: leaf[i], tree)

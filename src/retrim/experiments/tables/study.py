@@ -51,12 +51,8 @@ def table_presets(
 def train_all(preset: Preset, seeds: Sequence[int], run: Run, reporter: Reporter) -> Study:
     """Train a policy for each seed; an interruption leaves those that are complete."""
     if run.executor is not None:
-        with run.interruptible():
-            found = trained_elsewhere(preset, seeds, run.executor, reporter=reporter, stop=run.stop)
-            return Study(
-                preset, {seed: policy for seed, (policy, _) in found.items()}, tuple(e for _, e in found.values())
-            )
-        return Study(preset, {}, ())
+        found = trained_elsewhere(preset, seeds, run.executor, reporter=reporter, stop=run.stop)
+        return Study(preset, {s: policy for s, (policy, _) in found.items()}, tuple(e for _, e in found.values()))
     setup, policies, errors = Setup.of(preset), dict[int, Policy](), list[float]()
     for seed in seeds:
         if run.interrupted:
