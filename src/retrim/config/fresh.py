@@ -1,4 +1,4 @@
-"""What a set-up draws from a seed beside training: starts of flights, and deltas of low rank."""
+"""What a set-up draws from a seed beside training: fresh policies, starts of flights, and deltas of low rank."""
 
 from functools import partial
 
@@ -11,11 +11,25 @@ from jaxtyping import Array, Float, Key
 from ..control.lora import LoraPolicy
 from ..control.policy import Policy
 from ..physics.state import State
+from ..physics.vehicle import Vehicle
 from ..tasks.hover import TILT, Hover
 from ..tasks.observation import StateObs
 
 START_TAG = 2**30 + 1  # folded into a seed for the starts of flights: they share no key with training
 LOW_RANK_TAG = 2**30 + 4  # folded into a learner's key for the delta that it starts from
+
+
+@partial(jax.jit, static_argnames=("size", "hidden"))
+def untrained(size: int, vehicle: Vehicle, key: Key[Array, ""], hidden: tuple[int, ...]) -> Policy:
+    """Return a policy of observations of a size, by a program that every set-up of these sizes shares.
+
+    Args:
+        size: Of the observation.
+        vehicle: It gives the limits of the commands.
+        key: Consumed.
+        hidden: Widths of the hidden layers.
+    """
+    return Policy.of(size, vehicle, key=key, hidden=hidden)
 
 
 def flight_starts(home: Float[Array, "3"], n: int, seed: int) -> list[State]:

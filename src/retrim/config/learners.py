@@ -1,5 +1,6 @@
 """What a policy of a preset is trained in and by, the learner beside its flight, and the frame that it is flown in."""
 
+import functools
 import math
 from typing import Any
 
@@ -39,8 +40,9 @@ def nominal_model(preset: Preset, vehicle: Vehicle) -> AbstractDynamics[Any]:
     return model if lag is None else Lagged(model, lag)
 
 
+@functools.lru_cache(maxsize=32)
 def pretraining_optimiser(table: Pretrain) -> optax.GradientTransformation:
-    """Return Adam under a cosine, behind a clip; each call makes another object, for which programs compile anew."""
+    """Return Adam under a cosine, behind a clip; the same object for the same table, so that programs are shared."""
     rate = optax.cosine_decay_schedule(table.learning_rate, table.num_updates)
     return optax.chain(optax.clip_by_global_norm(table.max_grad_norm or math.inf), optax.adam(rate, b2=table.adam_b2))
 

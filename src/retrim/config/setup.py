@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
-import jax
 import jax.numpy as jnp
 import optax
 from jax import random
@@ -32,7 +31,7 @@ from ..tasks.keypoints import Keypoints
 from ..tasks.motions import MOTIONS
 from ..tasks.reference import Reference
 from ..tasks.task import AbstractTask
-from .fresh import flight_starts, low_rank
+from .fresh import flight_starts, low_rank, untrained
 from .learners import felt_frame, make_learner, nominal_model, pretraining_optimiser
 from .presets import Preset
 from .presets import Track as TrackTable
@@ -107,7 +106,8 @@ class Setup:
     def new_policy(self, key: Key[Array, ""]) -> Policy:
         """Return an untrained policy; the key is consumed."""
         size, hidden = self.env.task.observation.size, self.preset.pretrain.hidden_sizes
-        return jax.jit(lambda key: Policy.of(size, self.vehicle, key=key, hidden=hidden))(key)  # type: ignore[no-any-return]
+        fresh: Policy = untrained(size, self.vehicle, key, tuple(hidden))
+        return fresh
 
     def pretraining(self, seed: int = 0) -> Iterator[tuple[Policy, Float[Array, " updates"]]]:
         """Train a policy from scratch.

@@ -6,6 +6,7 @@ vehicle did, goes on in the estimate by the value of where it was cut. Values ar
 so that they are of the size of a reward whatever the discount.
 """
 
+import functools
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -100,14 +101,20 @@ def ppo(
         After each update the network, and figures: mean reward of a step, loss, and the share of clipped samples.
     """
     updates = settings.updates(steps)
-    rate = optax.cosine_decay_schedule(settings.learning_rate, updates * settings.epochs * settings.minibatches)
-    optimiser = optax.chain(optax.clip_by_global_norm(settings.max_grad_norm), optax.adam(rate, eps=1e-5))
+    optimiser = _optimiser(settings, updates)
     k_reset, k_learn = random.split(key)
     envs = jax.jit(jax.vmap(problem.reset))(random.split(k_reset, settings.envs))
     state = PpoState(net, optimiser.init(eqx.filter(net, eqx.is_inexact_array)), envs, k_learn)
     for _ in range(updates):
         state, figures = update(problem, state, optimiser, settings)
         yield state.net, {name: float(value) for name, value in figures.items()}
+
+
+@functools.lru_cache(maxsize=32)
+def _optimiser(settings: PpoSettings, updates: int) -> optax.GradientTransformation:
+    """Adam under a cosine, behind a clip; the same object for the same numbers, so that programs are shared."""
+    rate = optax.cosine_decay_schedule(settings.learning_rate, updates * settings.epochs * settings.minibatches)
+    return optax.chain(optax.clip_by_global_norm(settings.max_grad_norm), optax.adam(rate, eps=1e-5))
 
 
 @eqx.filter_jit

@@ -155,8 +155,8 @@ def solved(
     from it: the implicit function theorem); none flows through ``start``.
     """
     disk = 2.0 * AIR_DENSITY * prop.area
-    v = start
-    for _ in range(steps):
+
+    def step(v: Float[Array, ""]) -> Float[Array, ""]:
         v = lax.stop_gradient(v)
         thrust, lift_slope = jax.jvp(
             lambda v: blade_forces(prop, omega, v_hor, v_ver, v).thrust, (v,), (jnp.ones_like(v),)
@@ -164,8 +164,13 @@ def solved(
         speed = jnp.sqrt(v_hor**2 + (v_ver - v) ** 2)
         momentum_slope = disk * (speed + v * (v - v_ver) / speed)
         slope = jnp.minimum(lift_slope, 0.0) - jnp.maximum(momentum_slope, 0.1 * disk)  # never flat, never rising
-        v = v - (thrust - disk * v * speed) / lax.stop_gradient(slope)
-        v = jnp.clip(v, -20.0, 60.0)
+        return jnp.clip(v - (thrust - disk * v * speed) / lax.stop_gradient(slope), -20.0, 60.0)
+
+    v = start
+    if steps > 2:  # many steps are a loop, which compiles in the time of one of them
+        v = lax.fori_loop(0, steps - 2, lambda _, v: step(v), v)
+    for _ in range(min(steps, 2)):
+        v = step(v)
     return v
 
 

@@ -183,7 +183,7 @@ class SimPlant(Plant):
     def reset(self, x0: State | None) -> Measurement:
         """Hover at ``x0``; without one, 1 m above the ground."""
         start = State.at(jnp.array([0.0, 0.0, 1.0])) if x0 is None else x0
-        self._state = _launch(self.simulation, start)
+        self._state = _launch(self.simulation.undisturbed(), start)  # one program, whatever disturbs it later
         self._ticks = 0
         return self._measurement()
 

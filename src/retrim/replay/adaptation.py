@@ -2,7 +2,6 @@
 
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,6 +19,7 @@ from ..learn.residuals.model import FittedResidual
 from ..learn.residuals.targets import Targets
 from ..learn.window import Window
 from ..physics.state import Command
+from .predictors import refitted
 
 SETTLED = 5  # refused updates in a row after which nothing more is to be gained
 ENOUGH = 0.5  # share of a window that must be valid
@@ -81,13 +81,12 @@ def adapt_to(
 def _fitted(rows: Targets, setup: Setup, state: Any) -> Any:
     """Return the state of the residual model after the last whole window."""
     a, dt = setup.preset.adapt, setup.preset.dt
-    fit = eqx.filter_jit(lambda state, rows: setup.learner.residual_model.fit(state, rows))
     fitted = 0
     for last in range(a.window, rows.valid.shape[0] + 1, max(1, round(a.fit_every / dt))):
         part: Targets = jax.tree.map(lambda leaf, last=last: leaf[last - a.window : last], rows)
         if float(np.mean(part.valid)) < ENOUGH:
             continue
-        new, _ = fit(state, part)
+        new = refitted(setup.learner.residual_model, state, part)
         if bool(all_finite(new)):
             state, fitted = new, fitted + 1
     if not fitted:

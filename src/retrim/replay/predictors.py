@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import numpy as np
 from jax import random
+from jaxtyping import Float
 
 from ..adapt.gate import all_finite
 from ..config.loading import changed
@@ -58,19 +59,27 @@ class Learnt:
     """A residual model, refitted from where the last fit ended, as in flight."""
 
     def __init__(self, model: ResidualModel, seed: int) -> None:
-        self._state: Any = model.init(random.key(seed))
-        self._fit = eqx.filter_jit(lambda state, rows: model.fit(state, rows))
-        self._predict = eqx.filter_jit(
-            lambda state, rows: jax.vmap(lambda x, u: model.predict(state, x, u))(rows.x, rows.u)
-        )
+        self._model, self._state = model, model.init(random.key(seed))
 
     def __call__(self, rows: Targets) -> Predict:
         """Fit to a window."""
-        state, _ = self._fit(self._state, rows)
+        state = refitted(self._model, self._state, rows)
         if bool(all_finite(eqx.filter(state, eqx.is_inexact_array))):  # a fit that is not is refused in flight
             self._state = state
         kept = self._state
-        return lambda more: np.asarray(self._predict(kept, more))
+        return lambda more: np.asarray(_predicted(self._model, kept, more))
+
+
+@eqx.filter_jit
+def refitted(model: ResidualModel, state: Any, rows: Targets) -> Any:
+    """Return the state of a residual model after a fit, by a program that models of one kind share."""
+    return model.fit(state, rows)[0]
+
+
+@eqx.filter_jit
+def _predicted(model: ResidualModel, state: Any, rows: Targets) -> Float[jax.Array, "n 3"]:
+    predicted: Float[jax.Array, "n 3"] = jax.vmap(lambda x, u: model.predict(state, x, u))(rows.x, rows.u)
+    return predicted
 
 
 def yardsticks(dt: float) -> dict[str, Callable[[], Predictor]]:
