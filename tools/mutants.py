@@ -2,9 +2,10 @@
 
 ``make mutants`` draws faults at random (seeded) from config, adapt, runtime and experiments: a comparison turned round,
 a number changed, two arguments exchanged, a keyword left out, a condition negated. The suite runs once to learn which
-tests reach which line. Then each fault is planted in a copy of the tree, and the tests that reach it run until one
-fails: those of its own room first, the quick ones before the slow ones. A line that runs at import belongs to no test;
-the tests of its room run instead. A survivor wants a test, or is equivalent to the original.
+tests reach which line. Then each fault is planted in a copy of the tree, and tests run until one fails: those that
+reach it, first those of its own room, the quick ones before the slow ones; then the others of its room, since a line of
+a compiled program is seen only by the test that compiled it, and a line that runs at import by none. A survivor wants a
+test, or is equivalent to the original.
 """
 
 import argparse
@@ -16,9 +17,12 @@ import random
 import shutil
 import subprocess
 import sys
+import tempfile
 import time
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -70,6 +74,7 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=60, help="faults to plant")
     parser.add_argument("--seed", type=int, default=0, help="seed of their choice")
     parser.add_argument("--rooms", nargs="*", default=list(TESTS), choices=list(TESTS), help="where to plant them")
+    parser.add_argument("--jobs", type=int, default=2, help="faults that are tried at once")
     parser.add_argument("--again", action="store_true", help="believe what the last run found of who reaches what")
     parser.add_argument("--out", type=Path, default=PLACE / "results.json", help="file for the results")
     chosen = parser.parse_args()
@@ -81,15 +86,13 @@ def main() -> None:
     reached = Reached()
     print(f"{len(sample)} of {len(everything)} possible faults, seed {chosen.seed}", flush=True)
     rows = []
-    for i, mutant in enumerate(sample, start=1):
-        began = time.monotonic()
-        tests, seconds = reached.tests(mutant)
-        seen = noticed(mutant, tests, 120.0 + 5.0 * seconds)
-        rows.append({"file": mutant.name, "line": mutant.line, "fault": mutant.what, "noticed": seen})
-        shown = "noticed " if seen else "SURVIVED"
-        print(f"{i:3d} {shown} {mutant.name}:{mutant.line} {mutant.what} ({len(tests)} tests, "
-              f"{time.monotonic() - began:.0f} s)", flush=True)  # fmt: skip
-        chosen.out.write_text(json.dumps({"seed": chosen.seed, "rows": rows}, indent=2) + "\n")
+    with ThreadPoolExecutor(chosen.jobs) as pool:
+        for row in pool.map(partial(tried, reached), sample):
+            rows.append(row)
+            shown = "noticed " if row["noticed"] else "SURVIVED"
+            print(f"{len(rows):3d} {shown} {row['file']}:{row['line']} {row['fault']} "
+                  f"({row['tests']} tests, {row['seconds']} s)", flush=True)  # fmt: skip
+            chosen.out.write_text(json.dumps({"seed": chosen.seed, "rows": rows}, indent=2) + "\n")
     share = sum(row["noticed"] for row in rows) / max(1, len(rows))
     print(f"noticed: {100 * share:.0f} % of {len(rows)}")
     sys.exit(share < 0.9)
@@ -124,19 +127,29 @@ class Reached:
         by_line = self._data.contexts_by_lineno(str(mutant.path))
         contexts = [c for line in range(mutant.statement, mutant.line + 1) for c in by_line.get(line, [])]
         found = {context.partition("|")[0] for context in contexts} & self._seconds.keys()
-        if not found:
-            folders = TESTS[mutant.room]
-            tests = [test for test in self._seconds if test.startswith(folders)]
-            return tests, sum(self._seconds[test] for test in tests)
-        near = TESTS[mutant.room][0]
-        ordered = sorted(found, key=lambda test: (not test.startswith(near), self._seconds[test]))[:MOST]
-        return ordered, sum(self._seconds[test] for test in ordered)
+        room = TESTS[mutant.room] if not found else TESTS[mutant.room][:1]
+        beside = [test for test in self._seconds if test.startswith(room) and test not in found]
+        near = sorted(found, key=lambda test: (not test.startswith(TESTS[mutant.room][0]), self._seconds[test]))
+        tests = (near + sorted(beside, key=self._seconds.__getitem__))[:MOST]
+        return tests, sum(self._seconds[test] for test in tests)
+
+
+def tried(reached: Reached, mutant: Mutant) -> dict[str, object]:
+    """Run the tests that reach a fault; return the row of the results."""
+    began = time.monotonic()
+    tests, seconds = reached.tests(mutant)
+    seen = noticed(mutant, tests, 120.0 + 5.0 * seconds)
+    return {"file": mutant.name, "line": mutant.line, "fault": mutant.what, "noticed": seen, "tests": len(tests),
+            "seconds": round(time.monotonic() - began)}  # fmt: skip
 
 
 def noticed(mutant: Mutant, tests: list[str], timeout: float) -> bool:
     """Plant a fault in a copy of the tree; return whether tests notice it, which take far less than ``timeout`` [s]."""
-    tree = PLACE / "tree"
-    shutil.rmtree(tree, ignore_errors=True)
+    with tempfile.TemporaryDirectory(dir=PLACE) as tree:
+        return _fails(Path(tree), mutant, tests, timeout)
+
+
+def _fails(tree: Path, mutant: Mutant, tests: list[str], timeout: float) -> bool:
     for name in ("src", "tests", "examples", "docs"):
         shutil.copytree(ROOT / name, tree / name, ignore=shutil.ignore_patterns("__pycache__"))
     for name in ("pyproject.toml", "README.md", "CONTRIBUTING.md"):
