@@ -26,6 +26,23 @@ update_every = 1.5
 fit_latency = 0.1
 update_latency = 0.3
 """
+# Of a sweep whose policies need not fly: one size, so that sweeps share their programs.
+OVERLAY = """
+[overlay.pretrain]
+hidden_sizes = [16, 16]
+num_updates = 10
+num_envs = 4
+horizon = 40
+[overlay.adapt]
+window = 20
+num_updates = 2
+num_envs = 2
+fit_steps = 5
+fit_every = 0.4
+update_every = 0.6
+fit_latency = 0.1
+update_latency = 0.2
+"""
 ENVIRONMENT = {**os.environ, "COLUMNS": "160", "NO_COLOR": "1"}
 
 

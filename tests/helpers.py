@@ -18,6 +18,12 @@ from retrim.tasks import Hover, StateObs
 
 GOAL = (0.0, 0.0, 1.0)
 
+BRIEF = {
+    "pretrain": {"hidden_sizes": [16, 16], "num_updates": 10, "num_envs": 2, "horizon": 20},
+    "adapt": {"window": 20, "fit_every": 0.4, "update_every": 0.6, "fit_latency": 0.1, "update_latency": 0.2,
+              "fit_steps": 5, "num_updates": 2, "num_envs": 2},
+}  # fmt: skip
+
 residual_targets = eqx.filter_jit(learn.residual_targets)  # one program instead of one for each operation
 
 
@@ -91,6 +97,12 @@ def tiny_preset(**changes):
         pretrain={"hidden_sizes": (32, 32), "num_updates": 60, "num_envs": 8, "horizon": 60},
         adapt={"fit_steps": 20, "num_updates": 3, "num_envs": 4},
     )
+    return changed(preset, **changes) if changes else preset
+
+
+def brief_preset(name="hover/fast", **changes):
+    """A preset for flights of a second or two: it learns at once, and hardly; one size, so that programs are shared."""
+    preset = changed(load(name), pretrain=BRIEF["pretrain"], adapt=BRIEF["adapt"])
     return changed(preset, **changes) if changes else preset
 
 

@@ -6,7 +6,7 @@ import json
 import pytest
 
 from commands import retrim
-from helpers import tiny_preset
+from helpers import brief_preset
 from retrim.config import Setup, changed, levers
 from retrim.config import named_presets as presets
 from retrim.config.levers import CONTROL, OFF, ON
@@ -27,11 +27,8 @@ def test_every_lever_is_one_change_of_its_preset(task, kind):
 
 
 def test_the_ablation_by_its_command(tmp_path, as_a_user, monkeypatch):
-    soon = {"window": 20, "fit_every": 0.4, "update_every": 0.6, "fit_latency": 0.1, "update_latency": 0.2}
-    tiny = {"hidden_sizes": [16, 16], "num_updates": 10, "num_envs": 2, "horizon": 20}
-    small = changed(tiny_preset(), pretrain=tiny, adapt={**soon, "fit_steps": 2, "num_updates": 2, "num_envs": 2})
     for name in ("hover/retrim", "hover/paper"):
-        monkeypatch.setitem(presets.PRESETS, name, small)
+        monkeypatch.setitem(presets.PRESETS, name, brief_preset())
     monkeypatch.setitem(levers.OFF, "hover", (OFF["hover"][0], levers.Lever("slow", {"adapt": {"update_every": 2.0}})))
     monkeypatch.setitem(levers.ON, "hover", (ON["hover"][0],))
     table = importlib.import_module("retrim.experiments.tables.ablation")  # the package has a function of that name

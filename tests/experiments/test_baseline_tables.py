@@ -12,7 +12,7 @@ import pytest
 from jax import random
 
 from commands import retrim
-from helpers import random_command, random_state, tiny_preset
+from helpers import brief_preset, random_command, random_state, tiny_preset
 from retrim import ConfigError, PlantError, Setup, changed
 from retrim.cli.reproduce import COMMANDS
 from retrim.config import load, named_presets
@@ -210,7 +210,7 @@ def test_a_quick_look_takes_less_of_what_nobody_asked_for(tmp_path):
 
 
 def test_what_each_method_costs_by_its_command(tmp_path, monkeypatch):
-    small = changed(tiny_preset(), pretrain={"hidden_sizes": (16, 16), "num_updates": 10, "horizon": 20})
+    small = brief_preset()
     monkeypatch.setitem(named_presets.PRESETS, "hover/fast", small)
     monkeypatch.setattr(effort, "DECISIONS", 3)
     monkeypatch.setattr(effort, "RUNS", 2)

@@ -14,8 +14,8 @@ from concurrent.futures import ThreadPoolExecutor
 import jax
 import pytest
 
-from commands import retrim
-from helpers import tiny_preset
+from commands import OVERLAY, retrim
+from helpers import brief_preset
 from retrim import ConfigError, Fleet, Scenario, Setup
 from retrim.config import named_presets
 from retrim.errors import JobError
@@ -29,25 +29,17 @@ pytestmark = [
     pytest.mark.usefixtures("as_a_user"),
     pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning", "ignore:Port .* in use"),
 ]
-SWEEP = """
+SWEEP = (
+    """
 presets = ["hover/retrim"]
 seeds = [0, 1]
 methods = ["base", "full"]
 disturbances = ["none", "small", "gusts"]
 starts = {starts}
 seconds = 2
-[overlay.pretrain]
-hidden_sizes = [8]
-num_updates = 10
-num_envs = 2
-horizon = 20
-[overlay.adapt]
-window = 20
-fit_every = 0.4
-update_every = 0.6
-fit_latency = 0.1
-update_latency = 0.2
 """
+    + OVERLAY
+)
 
 
 @pytest.fixture(scope="module")
@@ -61,8 +53,7 @@ def here(as_a_user):
 
 @pytest.fixture(scope="module")
 def fleet(as_a_user):
-    soon = {"window": 20, "fit_every": 0.4, "update_every": 0.6, "fit_latency": 0.1, "update_latency": 0.2}
-    preset = tiny_preset(adapt=soon)
+    preset = brief_preset()
     policy = Setup.of(preset).new_policy(jax.random.key(0))
     return Fleet(preset, policy, [Scenario("small", plant="simple")], starts=2, seconds=1.2)
 
@@ -108,7 +99,7 @@ def test_a_table_with_holes_is_not_made(here, tmp_path, monkeypatch):
         raise OSError("the disk is full")
 
     monkeypatch.setattr(jobs, "fly_lot", failing)
-    monkeypatch.setitem(named_presets.PRESETS, "hover/fast", tiny_preset(pretrain={"num_updates": 10, "num_envs": 2}))
+    monkeypatch.setitem(named_presets.PRESETS, "hover/fast", brief_preset())
     words = "--presets", "hover/fast", "--methods", "base", "--seeds", "0", "--starts", "4", "--seconds", "1"
     said = retrim("reproduce", "hover", *words, "--on", here, "--out", "h", cwd=tmp_path, code=1)
     assert "flights failed elsewhere, the first by OSError: the disk is full" in said
@@ -209,8 +200,7 @@ def test_a_sweep_elsewhere_is_the_same_table_and_flies_again_what_had_failed(her
 
 
 def test_a_table_grows_by_its_command(tmp_path, monkeypatch):
-    small = tiny_preset(adapt={"window": 20, "fit_every": 0.4, "update_every": 0.6, "fit_latency": 0.1})
-    monkeypatch.setitem(named_presets.PRESETS, "hover/fast", small)
+    monkeypatch.setitem(named_presets.PRESETS, "hover/fast", brief_preset())
     words = "--preset", "hover/fast", "--flights", "4", "8", "--seconds", "1.2"
     said = retrim("reproduce", "scaling", *words, "--out", "s", cwd=tmp_path)
     found = json.loads((tmp_path / "s" / "scaling.json").read_text())["rows"]

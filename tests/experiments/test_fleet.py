@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helpers import tiny_preset
+from helpers import brief_preset, tiny_preset
 from retrim import ConfigError, Fleet, Scenario, Setup, enable_compile_cache, load
 from retrim.config.loading import dump
 from retrim.experiments import flying, gathering, lots
@@ -27,8 +27,7 @@ SCENARIOS = [Scenario("small", plant="simple"), Scenario("gusts", plant="simple"
 @pytest.fixture(scope="module")
 def fleet(as_a_user):
     """Eight flights, too short to crash, of two policies that were never trained."""
-    soon = {"window": 20, "fit_every": 0.4, "update_every": 0.6, "fit_latency": 0.1, "update_latency": 0.2}
-    preset = tiny_preset(adapt=soon)
+    preset = brief_preset()
     setup = Setup.of(preset)
     policies = {seed: setup.new_policy(jax.random.key(seed)) for seed in (0, 5)}
     return Fleet(preset, policies, SCENARIOS, starts=1, seconds=1.2)

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from commands import retrim
-from helpers import tiny_preset
-from retrim.config import changed
+from helpers import brief_preset
 from retrim.config import named_presets as presets
 from retrim.config.conditions import conditions
 from retrim.experiments.recovery import change_times, recoveries
@@ -56,10 +55,7 @@ def test_who_stays_outside_or_crashes_has_not_recovered():
 
 
 def test_the_gauntlet_by_its_command(tmp_path, as_a_user, monkeypatch):
-    soon = {"window": 20, "fit_every": 0.4, "update_every": 0.6, "fit_latency": 0.1, "update_latency": 0.2}
-    tiny = {"hidden_sizes": [16, 16], "num_updates": 10, "num_envs": 2, "horizon": 20}
-    small = changed(tiny_preset(), pretrain=tiny, adapt={**soon, "fit_steps": 2, "num_updates": 2, "num_envs": 2})
-    monkeypatch.setitem(presets.PRESETS, "hover/retrim", small)
+    monkeypatch.setitem(presets.PRESETS, "hover/retrim", brief_preset())
     words = "--only", "wind/simple", "wind/mujoco", "--methods", "base", "full", "--starts", "1", "--seconds", "6"
     out = retrim("gauntlet", *words, "--out", "g", cwd=tmp_path)
     assert "wind/simple" in out

@@ -6,32 +6,21 @@ import time
 
 import pytest
 
-from commands import results, retrim, started
+from commands import OVERLAY, results, retrim, started
 from retrim import Scenario
 from retrim.experiments.sweep import Sweep
 
 pytestmark = pytest.mark.usefixtures("as_a_user")
 
-SWEEP = """
+SWEEP = (
+    """
 seeds = [0, 1]
 disturbances = ["none", "wind=3"]
 plants = ["simple"]
 seconds = 1.2
-[overlay.pretrain]
-hidden_sizes = [16, 16]
-num_updates = 10
-num_envs = 4
-horizon = 40
-[overlay.adapt]
-window = 20
-num_updates = 2
-num_envs = 2
-fit_steps = 5
-fit_every = 0.4
-update_every = 0.6
-fit_latency = 0.1
-update_latency = 0.2
 """
+    + OVERLAY
+)
 COMBINATIONS = [(name, method) for name in ("none", "wind=3") for method in ("base", "full")]
 
 

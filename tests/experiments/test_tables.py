@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from commands import results, retrim
-from helpers import tiny_preset
+from helpers import brief_preset, tiny_preset
 from made_up import DT, flight, log
 from retrim import ConfigError, Scenario, Setup, changed, load
 from retrim.config import named_presets as presets
@@ -30,14 +30,11 @@ fast, levels = (importlib.import_module(f"{TABLES}.{name}") for name in ("fast",
 
 pytestmark = pytest.mark.usefixtures("as_a_user")
 
-SOON = {"window": 20, "fit_every": 0.4, "update_every": 0.6, "fit_latency": 0.1, "update_latency": 0.2, "fit_steps": 5}
-TINY = {"hidden_sizes": [16, 16], "num_updates": 10, "num_envs": 2, "horizon": 20}
 LEVELS = ("none", "small", "large")
 
 
 def test_a_table_of_hover_by_its_command(tmp_path, monkeypatch):
-    small = changed(tiny_preset(), pretrain=TINY, adapt={**SOON, "num_updates": 2, "num_envs": 2})
-    monkeypatch.setitem(presets.PRESETS, "hover/fast", small)
+    monkeypatch.setitem(presets.PRESETS, "hover/fast", brief_preset())
     words = "--presets", "fast", "--seeds", "0", "3", "--seconds", "1", "--starts", "1", "--plant", "simple"
     words += "--methods", "base", "indi", "full", "lora"
     out = retrim("reproduce", "hover", *words, "--out", "t", cwd=tmp_path)
@@ -60,12 +57,7 @@ def test_a_table_of_hover_by_its_command(tmp_path, monkeypatch):
 
 
 def test_a_section_of_tracking_has_cross_track_and_the_papers_rows(tmp_path):
-    preset = changed(
-        load("track/preview"),
-        track={"reference": "circle"},
-        pretrain=TINY,
-        adapt={**SOON, "num_updates": 2, "num_envs": 2},
-    )
+    preset = brief_preset("track/preview", track={"reference": "circle"})
     scenario = Scenario(plant="simple", reference="circle")
     circle = Levels(
         "circle", preset, scenario, "x", ("base", "lora"), {"base": ("1", "2", "3"), "datt": ("4", "5", "6")}
@@ -91,7 +83,7 @@ def test_a_section_of_tracking_has_cross_track_and_the_papers_rows(tmp_path):
 
 def test_a_run_goes_on_where_it_was_killed(tmp_path, monkeypatch):
     """What is finished is not flown again, and the table is the same; another size, or other code, is flown."""
-    preset = changed(tiny_preset(), pretrain=TINY)
+    preset = brief_preset()
     sections = [Levels(f"{n}", preset, Scenario(plant="simple"), f"x{n}", ("base", "indi")) for n in (1, 2)]
     monkeypatch.setattr(provenance, "commit", lambda: "abc")
     flown = []
@@ -168,7 +160,7 @@ def test_baselines_fly_without_a_trained_policy(tmp_path, monkeypatch):
 def test_a_table_of_fast_flight_flies_a_file_too(tmp_path):
     """The race line that comes with the examples uses what the kingfisher can do, and no more."""
     line = Path(__file__).parents[2] / "examples" / "race.csv"
-    preset = changed(load("track/fast"), track={"reference": "circle=8", "felt_copies": 0}, pretrain=TINY)
+    preset = brief_preset("track/fast", track={"reference": "circle=8", "felt_copies": 0})
     setup = Setup.of(preset, str(line))
     assert setup.limits_exceeded() is None
     flown = setup.flown.reference

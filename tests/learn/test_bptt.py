@@ -53,8 +53,9 @@ def models(key):
     }
 
 
-@pytest.mark.parametrize("which", ["simple", "hybrid", "through residual", "straight through"])
-@pytest.mark.parametrize("delay", [0, 2])
+@pytest.mark.parametrize(
+    ("which", "delay"), [("simple", 0), ("hybrid", 2), ("through residual", 0), ("straight through", 2)]
+)
 def test_perturbations_equal_plain_gradient(which, delay, key):
     env = hover_env(models(key)[which], horizon=6, history=2, delay_ticks=delay)
     policy = awake(key, env.task.observation.size)

@@ -42,7 +42,7 @@ low_rank = setup.low_rank(policy, jax.random.key(0))
 state = setup.learner.init(low_rank, jax.random.key(1))
 window, base = RollingBuffer(preset.adapt.window), shared_base(setup.learner, state)
 window.push(0.0, State.at(setup.flown.home()), Command.hover(float))
-for n in (2, 4, 3):  # other numbers of vehicles, other devices
+for n in (4, 3):  # other numbers of vehicles, other devices
     workers = [PolicyWorker(setup.learner, state, jax.random.key(i)) for i in range(n)]
     base = learn_base(workers, [window.window()] * n, base, jax.random.key(n))
     learn_together(workers, [window.window()] * n, base)
