@@ -65,6 +65,12 @@ OPERATIONS = {
         x.at[:, jnp.array([2])].set(7.0), lax.dynamic_slice(x, (0, jnp.int64(p + 5.0), 1), (2, 2, 2)), x[jnp.int32(-1)],
         lax.dynamic_update_slice(x, jnp.ones((1, 2, 2)), (jnp.int64(p), 2, 1)), 7 // jnp.int32(2 + p), x.astype(int),
     ],
+    "loops": lambda p, x: [
+        lax.scan(lambda c, row: (c * p + row.sum(), c), x[0, 0, 0], x),
+        lax.scan(lambda c, row: (c + row, (c, row[0])), x[0], (x + p), reverse=True),
+        lax.fori_loop(0, 5, lambda i, c: c + i * p, x), lax.map(jnp.cumsum, x[0]),
+        lax.scan(lambda c, _: (c + p, jnp.arange(2.0)), x, None, length=3),
+    ],
 }  # fmt: skip
 
 
@@ -105,6 +111,8 @@ def test_what_has_no_numpy_form_is_named_before_take_off():
         numpy_program(lambda p, x: jnp.sort(x), jnp.array(0.0), X)
     with pytest.raises(ConfigError, match="rounding away from zero in this controller has no NumPy form"):
         numpy_program(lambda p, x: lax.round(x), jnp.array(0.0), X)
+    with pytest.raises(ConfigError, match="a loop of 101 steps, more than 100, in this controller has no NumPy form"):
+        numpy_program(lambda p, x: lax.fori_loop(0, 101, lambda i, c: c + p, x), jnp.array(0.0), X)
 
 
 @pytest.mark.parametrize(

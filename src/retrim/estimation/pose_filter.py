@@ -7,6 +7,7 @@ visible it predicts; one visible point already corrects it. What Eq. (1) misses,
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Float, Key
 
 from ..physics import so3
@@ -92,18 +93,24 @@ class PoseFilter(eqx.Module):
 
         seen = jnp.repeat(visible, 2).astype(pixels.dtype)
         r = jnp.tile(noise**2, 7)
-        off = jnp.zeros(12, dtype=self.P.dtype)
-        for _ in range(ITERATIONS):
+        here = (jnp.zeros(12, dtype=self.P.dtype), self.P)
+
+        def scalar(carry: tuple[Array, Array], row: tuple[Array, ...]) -> tuple[tuple[Array, Array], None]:
+            """Take in one number of a pixel; this needs no matrix inverse."""
+            (off, P), (h, level, r, seen) = carry, row
+            Ph = P @ h
+            s = h @ Ph + r
+            limit = GATE * jnp.sqrt(s)
+            gain = seen * Ph / s
+            return (off + gain * jnp.clip(level - h @ off, -limit, limit), P - jnp.outer(gain, Ph)), None
+
+        def look(_: Array, before: tuple[Array, Array]) -> tuple[Array, Array]:
+            off, _ = before
             H = jax.jacfwd(expected)(off)
             level = pixels.reshape(14) - expected(off) + H @ off
-            off, P = jnp.zeros_like(off), self.P
-            for i in range(14):  # scalar updates need no matrix inverse
-                Ph = P @ H[i]
-                s = H[i] @ Ph + r[i]
-                miss = level[i] - H[i] @ off
-                miss = jnp.clip(miss, -GATE * jnp.sqrt(s), GATE * jnp.sqrt(s))
-                gain = seen[i] * Ph / s
-                off, P = off + gain * miss, P - jnp.outer(gain, Ph)
+            return lax.scan(scalar, here, (H, level, r, seen))[0]
+
+        off, P = lax.fori_loop(0, ITERATIONS, look, here)
         return PoseFilter(_moved(self.x, off), self.d + off[9:], 0.5 * (P + P.T), self.acting)
 
 

@@ -20,6 +20,7 @@ from .primitives import EXPRESSIONS, no_form
 
 CONSTANT, PARAMETER, INPUT = range(3)
 INLINE = ("jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "remat", "checkpoint")
+LONGEST = 100  # steps of a loop
 Ref = tuple[str, int]
 """Name of a value in the source, and the kind of what it depends on."""
 
@@ -87,6 +88,8 @@ class _Writer:
                 if isinstance(inner, Jaxpr):
                     inner = ClosedJaxpr(inner, ())
                 results = self.inline(inner, operands)
+            elif name == "scan":
+                results = self._unrolled(eqn, operands)
             elif name in EXPRESSIONS:
                 results = self._write(eqn, operands)
             else:
@@ -95,26 +98,40 @@ class _Writer:
         return [read(atom) for atom in jaxpr.outvars]
 
     def _write(self, eqn: Any, operands: list[Ref]) -> list[Ref]:
-        names, kind = [name for name, _ in operands], max((kind for _, kind in operands), default=CONSTANT)
-        text = EXPRESSIONS[eqn.primitive.name](eqn, *names)
-        many = eqn.primitive.multiple_results
-        if text in names:  # nothing happens to it
-            return [operands[names.index(text)]]
+        text = EXPRESSIONS[eqn.primitive.name](eqn, *(name for name, _ in operands))
+        for name, kind in operands:
+            if text == name:  # nothing happens to it
+                return [(name, kind)]
+        if not eqn.primitive.multiple_results:
+            return [self._line(text, operands)]
+        if max((kind for _, kind in operands), default=CONSTANT) == CONSTANT:
+            return [self.constant(value) for value in eval(text, self._scope)]
+        whole = self._line(text, operands)
+        return [self._line(f"{whole[0]}[{i}]", [whole]) for i in range(len(eqn.outvars))]
+
+    def _line(self, text: str, operands: Sequence[Ref]) -> Ref:
+        """Return the name of an expression of operands; the same one is written once."""
+        kind = max((kind for _, kind in operands), default=CONSTANT)
         if kind == CONSTANT:
-            value = eval(text, self._scope)
-            return [self.constant(v) for v in (value if many else [value])]
+            return self.constant(eval(text, self._scope))
         if text not in self._known:
             self._known[text] = (f"v{len(self.lines)}", kind)
-            self.lines.append((f"v{len(self.lines)}", text, kind, tuple(names)))
-        whole = self._known[text]
-        return [self._item(whole, i) for i in range(len(eqn.outvars))] if many else [whole]
-
-    def _item(self, whole: Ref, i: int) -> Ref:
-        text = f"{whole[0]}[{i}]"
-        if text not in self._known:
-            self._known[text] = (f"v{len(self.lines)}", whole[1])
-            self.lines.append((self._known[text][0], text, whole[1], (whole[0],)))
+            self.lines.append((f"v{len(self.lines)}", text, kind, tuple(name for name, _ in operands)))
         return self._known[text]
+
+    def _unrolled(self, eqn: Any, operands: list[Ref]) -> list[Ref]:
+        """Write the body of a loop of known length once for each of its steps."""
+        params = eqn.params
+        length, held, carried = params["length"], params["num_consts"], params["num_consts"] + params["num_carry"]
+        if not 0 < length <= LONGEST:
+            raise no_form(f"a loop of {length} steps, more than {LONGEST},")
+        carry, rows = operands[held:carried], [list[Ref]() for _ in range(length)]
+        for i in reversed(range(length)) if params["reverse"] else range(length):
+            given = [self._line(f"{each[0]}[{i}]", [each]) for each in operands[carried:]]
+            after = self.inline(params["jaxpr"], [*operands[:held], *carry, *given])
+            carry, rows[i] = after[: len(carry)], after[len(carry) :]
+        columns = zip(*rows, strict=True)
+        return [*carry, *(self._line(f"np.stack([{', '.join(n for n, _ in c)}])", c) for c in columns)]
 
     def source(self, given: Sequence[Ref], outputs: Sequence[Ref]) -> str:
         """Return the source of both functions, without lines that nobody needs."""
