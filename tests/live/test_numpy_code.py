@@ -1,5 +1,7 @@
 """A controller written as NumPy decides as it does in JAX, tick after tick."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -7,13 +9,18 @@ import numpy as np
 import pytest
 from jax import lax, random
 
+from retrim import Measurement
 from retrim.config.named_presets import PRESETS
 from retrim.config.setup import Setup
+from retrim.control.mppi import Mppi
 from retrim.errors import ConfigError
+from retrim.live.controllers import plain_source
 from retrim.live.numpy_code import numpy_program, plain
+from retrim.onboard.pilot import LivePilot
 from retrim.onboard.program import NumpyProgram
 from retrim.physics import so3
 from retrim.physics.state import State
+from retrim.runtime import ControllerPilot
 
 
 def leaves(tree):
@@ -152,3 +159,22 @@ def test_a_preset_flies_the_same_commands(preset, reference):
         remembered = found[2:]
         for one, other in zip(found, leaves((u, memory)), strict=True):
             np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)
+
+
+def test_a_controller_that_plans_by_random_roll_outs_flies_the_same_commands():
+    """MPPI: loops, and a random key among the parameters."""
+    setup = Setup.of(PRESETS["hover/fast"])
+    pilot = setup.pilot(setup.new_policy(random.key(0)), "mppi", random.key(1))
+    assert isinstance(pilot, ControllerPilot)
+    assert isinstance(pilot.controller, Mppi)
+    controller = dataclasses.replace(pilot.controller, samples=8, horizon=6)
+    live, lockstep = LivePilot(plain_source(setup, controller)), ControllerPilot(controller)
+    for i in range(5):
+        x = State(jnp.array([0.1 * i, 0.0, 1.0]), so3.exp(jnp.array([0.1, 0.05 * i, 0.0])), jnp.zeros(3))
+        flat = np.concatenate([np.ravel(leaf) for leaf in (x.p, x.R, x.v)])
+        if i == 0:
+            live.reset(flat)
+            lockstep.reset(Measurement(0.0, x))
+        np.testing.assert_allclose(
+            live.act(0.02 * i, 0.0, flat), lockstep.act(Measurement(0.02 * i, x)).vector(), rtol=1e-9, atol=1e-9
+        )

@@ -12,6 +12,7 @@ from jax import random
 from helpers import CheapModel
 from live_helpers import TOPICS, Holds, holding, plan, setup
 from live_processes import DT, HOME, level, moved
+from retrim import PlantError
 from retrim.adapt.learner import LearnerState
 from retrim.live.controllers import adaptive_source, plain_source
 from retrim.onboard.control import ControlLoop
@@ -354,6 +355,15 @@ def test_the_report_has_the_last_ticks_and_what_the_plant_accepted():
     assert rows.shape == (30, len(COLUMNS))
     np.testing.assert_array_equal(rows[:, 0], np.arange(9, 39))
     assert rows[10, COMMAND][0] == pytest.approx(flight.issued[19][0] + 0.5)
+
+
+def test_a_controller_that_is_too_slow_for_its_tick_never_takes_off(monkeypatch):
+    flight = Flight(holding())
+    flight.loop.warm_up()
+    act = flight.loop.pilot.act
+    monkeypatch.setattr(flight.loop.pilot, "act", lambda *given: time.sleep(0.8 * DT) or act(*given))
+    with pytest.raises(PlantError, match=r"takes 1\d ms to decide, here and in NumPy, of a tick of 20 ms"):
+        flight.loop.warm_up()
 
 
 def test_land_is_an_order():

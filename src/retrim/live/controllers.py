@@ -18,7 +18,7 @@ from ..onboard.pilot import ControllerSource
 from ..physics.dynamics import f_a
 from ..physics.state import Command, State
 from ..transport import wire
-from .numpy_code import numpy_program
+from .numpy_code import numpy_program, plain
 
 
 def flown(policy: Policy, residual: Any) -> dict[str, Any]:
@@ -92,7 +92,7 @@ def _source(setup: Setup, controller: Any, predicted: Any, parameters: dict[str,
         "target": numpy_program(lambda _, t: setup.flown.target(t), (), t),
         "predicted": numpy_program(predicted, parameters, (x, u)),
     }
-    named = {half: {n: np.asarray(a) for n, a in wire.names(tree).items()} for half, tree in parameters.items()}
+    named = {half: {n: plain(a) for n, a in wire.names(tree).items()} for half, tree in parameters.items()}
     digest = hashlib.sha256()
     for program in programs.values():
         digest.update(program.text.encode())

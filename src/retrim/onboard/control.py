@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import MessageError
+from ..errors import MessageError, PlantError
 from ..transport.bus import Bus
 from .guard import UP, Fallback, G, GeometricHover, Mode
 from .intake import Intake
@@ -16,6 +16,7 @@ from .plan import ControlPlan
 
 REPORT_EVERY = 5  # ticks
 LANDING = "landing"
+ROOM = 0.7  # share of a tick that a decision may take
 FELT = 0.1  # share of a tick in the mean of what is felt
 
 
@@ -48,16 +49,27 @@ class ControlLoop:
         return self.bus.latest("sample", self._known["sample"]) is not None
 
     def warm_up(self) -> None:
-        """Touch every program once, before it is urgent."""
-        x = np.concatenate([np.zeros(3), np.eye(3).ravel(), np.zeros(3)])
+        """Touch every program, before it is urgent.
+
+        Raises:
+            PlantError: The controller is too slow for its tick.
+        """
+        x, took = np.concatenate([np.zeros(3), np.eye(3).ravel(), np.zeros(3)]), list[float]()
         self.pilot.reset(x)
         for i in range(20):
+            began = time.monotonic()
             u = self.pilot.act(self.plan.dt * i, 0.0, x)
+            took.append(time.monotonic() - began)
             self.pilot.accepted(u)
             self.pilot.predicted(x, u)
             self.pilot.target(0.0)
             self._fallback.hover.command(x, x[:3])
         self._fallback.rest()
+        if (usual := float(np.median(took))) > ROOM * self.plan.dt:
+            raise PlantError(
+                f"this controller takes {1e3 * usual:.0f} ms to decide, here and in NumPy, of a tick of "
+                f"{1e3 * self.plan.dt:.0f} ms"
+            )
 
     def tick(self, now: float, lateness: float = 0.0) -> Setpoint | None:
         """Take the newest sample, decide, and return what was published; None before the first sample."""
