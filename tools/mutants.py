@@ -10,7 +10,9 @@ test, or is equivalent to the original.
 
 import argparse
 import ast
+import bisect
 import copy
+import itertools
 import json
 import os
 import random
@@ -36,7 +38,7 @@ TESTS = {
     "config": ("tests/config", "tests/runtime", "tests/io"),
     "experiments": ("tests/experiments", "tests/cli"),
 }
-MOST = 300  # tests that run for one fault
+REACH, BESIDE = 300.0, 60.0  # [s] of tests that run for one fault: of those that reach it, and of others of its room
 SWAPS: dict[type, type] = {
     ast.Lt: ast.GtE, ast.GtE: ast.Lt, ast.Gt: ast.LtE, ast.LtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
     ast.Is: ast.IsNot, ast.IsNot: ast.Is, ast.In: ast.NotIn, ast.NotIn: ast.In,
@@ -130,8 +132,15 @@ class Reached:
         room = TESTS[mutant.room] if not found else TESTS[mutant.room][:1]
         beside = [test for test in self._seconds if test.startswith(room) and test not in found]
         near = sorted(found, key=lambda test: (not test.startswith(TESTS[mutant.room][0]), self._seconds[test]))
-        tests = (near + sorted(beside, key=self._seconds.__getitem__))[:MOST]
+        tests = self._within(REACH, near) + self._within(
+            BESIDE if found else REACH, sorted(beside, key=self._seconds.__getitem__)
+        )
         return tests, sum(self._seconds[test] for test in tests)
+
+    def _within(self, seconds: float, tests: list[str]) -> list[str]:
+        """Return the first of some tests that take so long together."""
+        ends = list(itertools.accumulate(self._seconds[test] for test in tests))
+        return tests[: bisect.bisect_right(ends, seconds)]
 
 
 def tried(reached: Reached, mutant: Mutant) -> dict[str, object]:
@@ -156,7 +165,20 @@ def _fails(tree: Path, mutant: Mutant, tests: list[str], timeout: float) -> bool
         shutil.copy(ROOT / name, tree / name)
     (tree / mutant.name).write_text(mutant.source)
     environment = {**os.environ, "PYTHONPATH": str(tree / "src"), "PYTHONDONTWRITEBYTECODE": "1"}
-    command = [sys.executable, "-m", "pytest", "-q", "-x", "-n", "0", "-p", "no:cacheprovider", *tests]
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-x",
+        "-n",
+        "0",
+        "-p",
+        "no:cacheprovider",
+        "--timeout",
+        "120",
+        *tests,
+    ]
     try:
         ran = subprocess.run(command, cwd=tree, env=environment, capture_output=True, timeout=timeout, check=False)
     except subprocess.TimeoutExpired:
