@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -22,7 +23,7 @@ from retrim.experiments.tables.document import Document, TableSection
 from retrim.experiments.tables.kept import files_behind
 from retrim.experiments.tables.levels import Levels, fly_levels
 from retrim.experiments.tables.reversing import METHODS, _errors, _moments, _section
-from retrim.experiments.tables.study import train_all
+from retrim.experiments.tables.study import refuse_misfits, train_all
 
 # The package has functions of some of these names.
 TABLES = "retrim.experiments.tables"
@@ -106,6 +107,46 @@ def test_a_run_goes_on_where_it_was_killed(tmp_path, monkeypatch):
     monkeypatch.setattr(provenance, "commit", lambda: "abc-dirty")
     table(sections[:1])
     assert flown[4:] == ["1"]
+
+
+def test_a_section_is_made_again_for_every_thing_that_it_follows_from(tmp_path, monkeypatch):
+    base = Levels("title", brief_preset(), Scenario(plant="simple"), "x", ("indi", "datt"))
+    monkeypatch.setattr(provenance, "commit", lambda: "abc")
+    asked = []
+    monkeypatch.setattr(levels, "_level_section", lambda *a, **k: asked.append(0) or (TableSection((), ()), []))
+    monkeypatch.setattr(levels, "figures_table", lambda *_: TableSection((), ()))
+
+    def fly(section=base, *, seeds=(0,), starts=1, seconds=1.0, datt_steps=1):
+        asked.clear()
+        document = Document(Run("test", tmp_path), "table", "Title", "Intro.", list(seeds), Silent())
+        fly_levels(document, [section], starts=starts, seconds=seconds, datt_steps=datt_steps)
+        return len(asked)
+
+    assert [fly(), fly()] == [1, 0]
+    sections = [
+        dataclasses.replace(base, title="other"), dataclasses.replace(base, methods=("indi", "geometric")),
+        dataclasses.replace(base, preset=brief_preset(goal=(0.0, 0.0, 2.0))),
+        dataclasses.replace(base, scenario=Scenario()), dataclasses.replace(base, levels={"none": "calm"}),
+    ]  # fmt: skip
+    assert [fly(section) for section in sections] == [1] * len(sections)
+    assert [fly(seeds=(1,)), fly(starts=2), fly(seconds=2.0), fly(datt_steps=2)] == [1] * 4
+    assert fly(dataclasses.replace(base, methods=("indi", "geometric")), datt_steps=2) == 0  # nobody there is trained
+    assert fly() == 0
+
+
+def test_what_does_not_fit_together_is_refused_before_training():
+    refuse = partial(refuse_misfits, load("hover/fast"), starts=1, seconds=1.0)
+    refuse([Scenario()], methods=["base"])
+    with pytest.raises(ConfigError, match="no method 'best'"):
+        refuse([Scenario()], methods=["base", "best"])
+    with pytest.raises(ConfigError, match="method 'raptor' reads the state on board"):
+        refuse([Scenario(sensors="mocap")], methods=["raptor"])
+    with pytest.raises(ConfigError, match="a hover policy follows none"):
+        refuse([Scenario(), Scenario(reference="circle")], methods=["base"])
+    with pytest.raises(ConfigError, match="flights of 0 s"):
+        refuse_misfits(load("hover/fast"), [Scenario()], methods=["base"], starts=1, seconds=0.0)
+    with pytest.raises(ConfigError, match="0 starts"):
+        refuse_misfits(load("hover/fast"), [Scenario()], methods=["base"], starts=0, seconds=1.0)
 
 
 def test_a_section_follows_from_the_files_behind_its_names(tmp_path, monkeypatch):
