@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib
+import inspect
 from functools import partial
 from pathlib import Path
 
@@ -258,3 +259,28 @@ def test_errors_are_read_around_reversals_and_updates(tmp_path):
     assert updates == [1, 2, 4, 8, 16, 30]
     np.testing.assert_allclose(often[0], [15, 15.1, 15.6, 16.1, 17.1, 19.1, 23.1, 30])
     np.testing.assert_allclose(_errors(ramp, often, 0.5), often - 0.24, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["hover", "track", "phase", "vision", "fast", "transfer"])
+def test_a_table_flies_what_it_was_asked_to(name, tmp_path, monkeypatch):
+    """Plant, methods, seeds, starts, length: nothing is lost between an option and a flight."""
+    table = importlib.import_module(f"{TABLES}.{name}")
+    planned = []
+    monkeypatch.setattr(
+        table, "fly_levels", lambda document, sections, **how: planned.append((document, sections, how))
+    )
+    asked = {"plant": "simple", "methods": ("indi",), "seeds": (3, 4), "starts": 2, "seconds": 7.0}
+    made = getattr(table, name)
+    if "datt_steps" in inspect.signature(made).parameters:
+        asked["datt_steps"] = 5
+    made(Run("test", tmp_path), Silent(), **asked)
+    assert planned
+    for document, sections, how in planned:
+        assert (document.name, tuple(document.seeds)) == (name, (3, 4))
+        assert how == {key: asked[key] for key in ("starts", "seconds", "datt_steps") if key in asked}
+        assert sections
+        assert len({section.stem for section in sections}) == len(sections)  # no picture is written over
+        for section in sections:
+            assert {scenario.plant for scenario in section.scenarios} == {"simple"}
+            assert tuple(section.methods) in (("indi",), ())
+        assert any(section.methods for section in sections)
