@@ -5,7 +5,8 @@ a number changed, two arguments exchanged, a keyword left out, a condition negat
 tests reach which line. Then each fault is planted in a copy of the tree, and tests run until one fails: those that
 reach it, first those of its own room, the quick ones before the slow ones; then the others of its room, since a line of
 a compiled program is seen only by the test that compiled it, and a line that runs at import by none. A survivor wants a
-test, or is equivalent to the original.
+test, or is equivalent to the original. Numbers that a module states at its top, as those of the presets, are choices: a
+test of them would only repeat them.
 """
 
 import argparse
@@ -46,6 +47,8 @@ SWAPS: dict[type, type] = {
 }  # fmt: skip
 TEXT = (ast.JoinedStr, ast.Raise, ast.AnnAssign, ast.arguments)
 """Nodes below which nothing is planted: messages and annotations."""
+QUIET = {"strict", "check", "maxsize", "capture_output", "color", "dashed", "marks"}
+"""Keywords that change nothing where the rest is right, or only how a picture looks."""
 
 
 class Mutant(NamedTuple):
@@ -191,8 +194,9 @@ def _fails(tree: Path, mutant: Mutant, tests: list[str], timeout: float) -> bool
 def mutants(path: Path) -> Iterator[Mutant]:
     """All faults of one file."""
     tree = ast.parse(path.read_text())
+    stated = {node for each in tree.body if isinstance(each, ast.Assign) for node in ast.walk(each)}
     for statement, node in list(_sites(tree, 0)):
-        for what, change in _changes(node):
+        for what, change in _changes(node, numbers=node not in stated):
             planted = copy.deepcopy(tree)
             twin = next(n for a, n in zip(ast.walk(tree), ast.walk(planted), strict=True) if a is node)
             change(twin)
@@ -210,7 +214,7 @@ def _sites(node: ast.AST, statement: int) -> Iterator[tuple[int, ast.AST]]:
             yield from _sites(child, statement)
 
 
-def _changes(node: ast.AST) -> Iterator[tuple[str, object]]:
+def _changes(node: ast.AST, *, numbers: bool) -> Iterator[tuple[str, object]]:
     """Names of faults at a node, and functions that plant them in its twin."""
     if isinstance(node, ast.Compare) and type(node.ops[0]) in SWAPS:
         new = SWAPS[type(node.ops[0])]
@@ -220,14 +224,14 @@ def _changes(node: ast.AST) -> Iterator[tuple[str, object]]:
         yield f"{ast.unparse(node)}: {other.__name__}", lambda n: setattr(n, "op", other())
     if isinstance(node, ast.Constant) and isinstance(node.value, bool):
         yield f"not {node.value}", lambda n: setattr(n, "value", not n.value)
-    elif isinstance(node, ast.Constant) and isinstance(node.value, (int, float)):
+    elif numbers and isinstance(node, ast.Constant) and isinstance(node.value, (int, float)):
         yield f"{node.value} changed", lambda n: setattr(n, "value", 2 * n.value + 1)
     if isinstance(node, (ast.If, ast.IfExp, ast.While)):
         negate = lambda n: setattr(n, "test", ast.UnaryOp(ast.Not(), n.test))  # noqa: E731
         yield f"not ({ast.unparse(node.test)})", negate
     if isinstance(node, ast.Call):
         for k, keyword in enumerate(node.keywords):
-            if keyword.arg is not None:
+            if keyword.arg is not None and keyword.arg not in QUIET:
                 yield f"without {keyword.arg}=", lambda n, k=k: n.keywords.pop(k)
         if len(node.args) >= 2 and not any(isinstance(a, ast.Starred) for a in node.args):
             yield f"arguments of {ast.unparse(node.func)} exchanged", lambda n: n.args.insert(0, n.args.pop(1))

@@ -203,7 +203,9 @@ def test_a_table_grows_by_its_command(tmp_path, monkeypatch):
     monkeypatch.setitem(named_presets.PRESETS, "hover/fast", brief_preset())
     words = "--preset", "hover/fast", "--flights", "4", "8", "--seconds", "1.2"
     said = retrim("reproduce", "scaling", *words, "--out", "s", cwd=tmp_path)
-    found = json.loads((tmp_path / "s" / "scaling.json").read_text())["rows"]
+    whole = json.loads((tmp_path / "s" / "scaling.json").read_text())
+    found = whole["rows"]
+    assert whole["seeds"] == [0]
     assert [row["flights"] for row in found] == [4, 8]
     assert all(row["run_s"] > 0 and row["peak_mb"] > 50 for row in found)
     assert "flights a second" in said

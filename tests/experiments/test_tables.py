@@ -19,6 +19,7 @@ from retrim.config import named_presets as presets
 from retrim.config.disturbances import DISTURBANCES
 from retrim.config.presets import Adapt
 from retrim.experiments import Run, provenance, rivals
+from retrim.experiments.lots import LOT
 from retrim.experiments.reporter import Silent
 from retrim.experiments.tables.document import Document, TableSection
 from retrim.experiments.tables.kept import files_behind
@@ -28,7 +29,7 @@ from retrim.experiments.tables.study import refuse_misfits, train_all
 
 # The package has functions of some of these names.
 TABLES = "retrim.experiments.tables"
-fast, levels = (importlib.import_module(f"{TABLES}.{name}") for name in ("fast", "levels"))
+fast, levels, scaling = (importlib.import_module(f"{TABLES}.{name}") for name in ("fast", "levels", "scaling"))
 
 pytestmark = pytest.mark.usefixtures("as_a_user")
 
@@ -284,3 +285,34 @@ def test_a_table_flies_what_it_was_asked_to(name, tmp_path, monkeypatch):
             assert {scenario.plant for scenario in section.scenarios} == {"simple"}
             assert tuple(section.methods) in (("indi",), ())
         assert any(section.methods for section in sections)
+
+
+def test_many_machines_are_limited_by_flying_then_by_the_network_then_by_the_scheduler():
+    """A million flights: time falls with the machines until it is that of what they share."""
+
+    def longest(run_s, size):
+        rows = [{"flights": 1000, "run_s": run_s, "flight_bytes": size, "compile_s": 60.0}]
+        section = scaling._on_machines(rows)
+        return [(int(m), time, what) for m, time, what in section.rows]
+
+    flying = longest(run_s=1e6, size=1)
+    assert {what for _, _, what in flying} == {"flying"}
+    assert flying[0][1] == f"{(1e9 + 60) / 86_400:.1f} days"
+    assert flying[-1][1] == f"{(1e6 + 60) / 86_400:.1f} days"  # a thousand machines
+    network = longest(run_s=1.0, size=scaling.LINK)
+    assert {what for _, _, what in network} == {"the client's network"}
+    assert {time for _, time, _ in network} == {f"{(1e6 + 60) / 86_400:.1f} days"}
+    scheduler = longest(run_s=1e-9, size=0)
+    assert {what for _, _, what in scheduler} == {"the scheduler"}
+    assert {time for _, time, _ in scheduler} == {f"{60 + 1e6 / LOT * scaling.JOB_S:.0f} s"}
+    first, *others = longest(run_s=1.1, size=scaling.LINK / 1000)
+    assert first[2] == "flying"
+    assert {what for *_, what in others} == {"the client's network"}
+
+
+def test_steps_of_datt_have_bounds():
+    for steps in (1, 10**10):
+        rivals.check_steps(steps)
+    for steps in (0, 10**10 + 1):
+        with pytest.raises(ConfigError, match=f"--datt-steps {steps} must be between 1 and 10,000,000,000"):
+            rivals.check_steps(steps)
