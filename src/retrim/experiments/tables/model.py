@@ -1,7 +1,5 @@
 """The blade-element plant: curves and figures beside published ones."""
 
-from collections.abc import Callable
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -14,7 +12,7 @@ from ...physics.bem import BemQuadrotor, BemState
 from ...physics.effects import ExternalEffects
 from ...physics.propeller import five_inch, vortex_ring
 from ...physics.state import STANDARD_GRAVITY, Command, State
-from ...physics.substep import SUBSTEP
+from ...physics.substep import SUBSTEP, RotorState
 from ...viz import plots
 from ...viz.panels import Curve, Panel, panel_figure
 from ..published import GOLDEN_HOVER, Settled, published, settled_rotor
@@ -84,7 +82,7 @@ def drag_panel() -> Panel:
 def _drag(bem: BemQuadrotor, speed: float) -> tuple[float, float]:
     x = State(jnp.zeros(3), jnp.eye(3), jnp.array([speed, 0.0, 0.0]))
     s = _init(bem, x)
-    total = float(_loads(bem, s)[0])
+    total = float(_force(bem, s, ExternalEffects.calm(x.p.dtype))[0])
     body = float(bem.body_drag(s.body, jnp.zeros(3))[0])
     mass = float(bem.vehicle.mass)
     return -total / mass, -(total - body) / mass
@@ -96,10 +94,9 @@ def _init(bem: BemQuadrotor, x: State) -> BemState:
 
 
 @eqx.filter_jit
-def _loads(bem: BemQuadrotor, s: BemState) -> Float[Array, "3"]:
-    still = jnp.zeros_like(s.body.x.p)
-    blades, _ = bem.rotors(s.body, s.body.motors, s.inflow, still)
-    return bem.loads(s.body, s.body.motors, blades, ExternalEffects.calm(still.dtype)).force
+def _force(bem: BemQuadrotor, s: BemState, effects: ExternalEffects) -> Float[Array, "3"]:
+    blades, _ = bem.rotors(s.body, s.body.motors, s.inflow, jnp.zeros_like(s.body.x.p))
+    return bem.loads(s.body, s.body.motors, blades, effects).force
 
 
 def inflow_panel() -> Panel:
@@ -130,7 +127,7 @@ def rate_panel() -> Panel:
         bem = BemQuadrotor.of(VEHICLES[name](), DT)
         for axis, word in ((0, "roll"), (2, "yaw")):
             u = Command(jnp.array(STANDARD_GRAVITY), 2.0 * jnp.eye(3)[axis])
-            rates = np.asarray(_flown(bem, u, lambda s: s.body.omega, 300))[:, axis]
+            rates = np.asarray(_flown(bem, u, 300).omega)[:, axis]
             curves.append(
                 Curve(np.arange(1, 301) * 1.0, rates / 2.0, f"{name}, {word}", dashed=axis == 2, color=len(curves) // 2)
             )
@@ -143,7 +140,7 @@ def step_panel() -> Panel:
     for name in VEHICLES:
         bem = BemQuadrotor.of(VEHICLES[name](), DT)
         u = Command(jnp.array(STANDARD_GRAVITY + 5.0), jnp.zeros(3))
-        speeds = np.asarray(_flown(bem, u, lambda s: s.body.x.v, 300))[:, 2]
+        speeds = np.asarray(_flown(bem, u, 300).x.v)[:, 2]
         curves.append(Curve(np.arange(2, 301) * 1.0, np.diff(speeds) / SUBSTEP, name))
     curves.append(Curve(np.array([0.0, 300.0]), np.array([5.0, 5.0]), "commanded", dashed=True))
     return Panel("Step of collective thrust by 5 m/s²", "time [ms]", "vertical acceleration [m/s²]", curves)
@@ -155,12 +152,8 @@ def sag_panel() -> Panel:
     x = State.at(jnp.zeros(3))
     found = []
     for t in times:
-        s = _init(bem, x)
-        effects = sag(jnp.array(float(t)), x)
-        still = jnp.zeros(3)
-        blades, _ = bem.rotors(s.body, s.body.motors, s.inflow, still)
-        force = bem.loads(s.body, s.body.motors, blades, effects).force[2]
-        found.append(float(force / bem.vehicle.mass) - STANDARD_GRAVITY)
+        force = _force(bem, _init(bem, x), sag(jnp.array(float(t)), x))
+        found.append(float(force[2] / bem.vehicle.mass) - STANDARD_GRAVITY)
     return Panel(
         "Battery sag: u_hover held still",
         "time [s]",
@@ -170,12 +163,12 @@ def sag_panel() -> Panel:
 
 
 @eqx.filter_jit
-def _flown(bem: BemQuadrotor, u: Command, see: Callable[[BemState], Array], steps: int) -> Array:
-    """What ``see`` sees after each millisecond, from hover."""
+def _flown(bem: BemQuadrotor, u: Command, steps: int) -> RotorState:
+    """The state after each millisecond, from hover."""
     effects = ExternalEffects.calm(jnp.zeros(3).dtype)
 
-    def step(s: BemState, _: None) -> tuple[BemState, Array]:
+    def step(s: BemState, _: None) -> tuple[BemState, RotorState]:
         after = bem.substep(s, u, effects)
-        return after, see(after)
+        return after, after.body
 
     return lax.scan(step, bem.init(State.at(jnp.zeros(3))), None, length=steps)[1]
