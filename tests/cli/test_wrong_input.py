@@ -132,6 +132,10 @@ WRONG = [
     (("reproduce", "vision", "--methods", "indy"), "no method 'indy'; did you mean 'indi'?"),
     (("reproduce", "plants", "--plant", "nope"), "no plant 'nope'"),
     (("reproduce", "reversing", "--preset", "track/paper"), "preset 'track/paper' is for track, not for hover"),
+    (("gauntlet", "--only", "storm"), "no condition 'storm'; there are "),
+    (("gauntlet", "--only", "none", "--methods", "best"), "no method 'best'"),
+    (("reproduce", "transfer", "--presets", "hover/retrim", "hover/fast"), "'hover/fast' is for hover, not for track"),
+    (("reproduce", "scaling", "--flights", "6"), "--flights 6 must be a positive multiple of 4"),
     # files
     (("pretrain", "hover", "--config", "missing.toml"), "missing.toml: no such file"),
     (("pretrain", "hover", "--config", "/dev/zero"), "/dev/zero: not a regular file"),
