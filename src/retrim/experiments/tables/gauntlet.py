@@ -59,7 +59,7 @@ def gauntlet(
     """
     task = load(preset).task
     if task not in METHODS:
-        raise ConfigError(f"preset {preset!r} is for {task}; the gauntlet is flown at hover or on references")
+        raise ConfigError(f"preset {preset!r} is for {task}; the gauntlet is flown for {', '.join(METHODS)}")
     methods = methods or METHODS[task]
     (loaded,) = table_presets([preset], task, seeds=seeds, starts=starts, seconds=seconds)
     known = conditions(loaded)
