@@ -49,6 +49,29 @@ def test_a_seven_inch_quadrotor(vehicle_file):
     assert read_vehicle(vehicle_file(file_name="other.toml")).name == "other"
 
 
+@pytest.mark.parametrize("size", [0.5, 1.3])
+def test_what_a_file_leaves_out_follows_from_its_size(vehicle_file, size):
+    """A vehicle of so many times every length: areas by its square, rotors by the fourth and fifth power."""
+    spec = read_vehicle(vehicle_file(propeller_diameter="5.5", propeller="'5 inch'"))
+    arm = tuple(size * length for length in spec.arm)
+    other = dataclasses.replace(
+        spec, arm=arm, propeller_diameter=5.5 * size, inertia=tuple(size**2 * moment for moment in spec.inertia)
+    )
+    one, scaled = spec.build(), other.build()
+    for name, power in (("radius", 1), ("chord_root", 1), ("chord_tip", 1)):
+        assert getattr(scaled.propeller, name) == pytest.approx(size**power * getattr(one.propeller, name))
+    for name, power in (
+        ("drag_area", 2), ("thrust_coefficient", 4), ("rotor_inertia", 5), ("torque_ratio", 1),
+        ("motor_max", -2), ("motor_min", -2),
+    ):  # fmt: skip
+        np.testing.assert_allclose(getattr(scaled, name), size**power * getattr(one, name), rtol=1e-6, err_msg=name)
+    for name in ("base", "linear", "root"):
+        assert getattr(scaled.esc, name) == pytest.approx(size**-2 * getattr(one.esc, name))
+    # Without propellers of its own, they are as large as nine tenths of what the shorter arm leaves them:
+    bare = read_vehicle(vehicle_file(propeller_diameter=None)).build()
+    assert float(bare.propeller.radius) == pytest.approx(0.9 * 0.105, rel=0.02)
+
+
 @pytest.mark.parametrize("plant", ["bem", "simple"])
 @pytest.mark.parametrize("propeller", [None, "7.0"])
 def test_it_hovers_on_hover_commands(vehicle_file, plant, propeller):
