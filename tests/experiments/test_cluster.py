@@ -9,7 +9,7 @@ import subprocess
 import sys
 import threading
 import time
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 
 import jax
 import pytest
@@ -197,6 +197,38 @@ def test_a_sweep_elsewhere_is_the_same_table_and_flies_again_what_had_failed(her
     retrim("sweep", "study.toml", "--on", here, "--out", "there", cwd=tmp_path)
     assert [row["n"] for row in rows(tmp_path / "there")] == [2] * 6
     assert not any("failures" in row for row in rows(tmp_path / "there"))
+
+
+@pytest.mark.parametrize("lost", range(cluster.ATTEMPTS + 1))
+def test_a_job_that_is_lost_is_given_to_the_scheduler_again_but_not_for_ever(lost):
+    """Its result is there unless it was lost as often as it may be."""
+
+    class Gone:
+        def __init__(self, status):
+            self.status = status
+
+        def add_done_callback(self, over):
+            over(self)
+
+        def result(self):
+            return "whole"
+
+        def release(self):
+            pass
+
+    given, outer = [], Future()
+
+    def submit():
+        given.append("lost" if len(given) < lost else "finished")
+        return Gone(given[-1])
+
+    Cluster.__new__(Cluster)._start(outer, submit, cluster.ATTEMPTS)
+    assert len(given) == min(lost + 1, cluster.ATTEMPTS)
+    if lost < cluster.ATTEMPTS:
+        assert outer.result(0) == "whole"
+    else:
+        with pytest.raises(JobError, match=rf"lost {cluster.ATTEMPTS} times \(lost\)"):
+            outer.result(0)
 
 
 def test_a_table_grows_by_its_command(tmp_path, monkeypatch):

@@ -1,5 +1,6 @@
 """Tables at reduced size, and what stands in them."""
 
+import contextlib
 import dataclasses
 import importlib
 import inspect
@@ -25,7 +26,7 @@ from retrim.experiments.tables.document import Document, TableSection
 from retrim.experiments.tables.kept import files_behind
 from retrim.experiments.tables.levels import Levels, fly_levels
 from retrim.experiments.tables.reversing import METHODS, _errors, _moments, _section
-from retrim.experiments.tables.study import refuse_misfits, train_all
+from retrim.experiments.tables.study import Study, fly_all, refuse_misfits, train_all
 
 # The package has functions of some of these names.
 TABLES = "retrim.experiments.tables"
@@ -134,6 +135,22 @@ def test_a_section_is_made_again_for_every_thing_that_it_follows_from(tmp_path, 
     assert [fly(seeds=(1,)), fly(starts=2), fly(seconds=2.0), fly(datt_steps=2)] == [1] * 4
     assert fly(dataclasses.replace(base, methods=("indi", "geometric")), datt_steps=2) == 0  # nobody there is trained
     assert fly() == 0
+
+
+def test_progress_of_flights_goes_from_nothing_to_all(tmp_path):
+    told = []
+
+    class Watching(Silent):
+        def progress(self, title):
+            return contextlib.nullcontext(lambda share, text: told.append(share))
+
+    preset = brief_preset()
+    study = Study(preset, {0: Setup.of(preset).new_policy(jax.random.key(0))}, ())
+    flown = fly_all(study, [Scenario(plant="simple")], Run("test", tmp_path), Watching(),
+                    methods=("indi",), starts=2, seconds=1.0)  # fmt: skip
+    assert len(flown.flown) == 2
+    assert (told[0], told[-1]) == (0.0, 1.0)
+    assert told == sorted(told)
 
 
 def test_what_does_not_fit_together_is_refused_before_training():
