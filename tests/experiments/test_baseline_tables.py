@@ -105,6 +105,28 @@ def test_the_design_study_by_its_command(tmp_path, monkeypatch):
     assert "--epochs 15 must be a positive multiple of 10" in said
 
 
+def test_the_design_study_s_rows_are_of_all_seeds_and_flights():
+    """Times are medians, relative to what was trained first; a crashed flight is counted and in no mean."""
+    one, other = list(design.CHOICES)[:2]
+
+    def row(model, order, epoch_s, errors, compile_s=1.0):
+        return {"model": model, "order": order, "epoch_s": epoch_s, "errors": errors, "compile_s": compile_s,
+                "residual_rms": 0.25 * (order + 1)}  # fmt: skip
+
+    rows = [
+        row(one, 0, [1.0, 2.0, 3.0], [0.1, 0.3], 4.0), row(other, 1, [8.0, 8.0], [0.5, np.nan]),
+        row(one, 0, [2.0], [0.2, 0.2]),
+    ]  # fmt: skip
+    section = design_table._section(rows)
+    assert section.rows == (
+        (one, "2000.0 (1000.0 to 3000.0)", "1.00", "4.0", "0.250", "0.200 ± 0.082"),
+        (other, "8000.0 (8000.0 to 8000.0)", "4.00", "1.0", "0.500", "0.500 ± 0.000, 1 crashed"),
+    )
+    (lost,) = design_table._section([row(one, 0, [1.0], [np.nan])]).rows
+    assert lost[-1] == "all crashed"
+    assert section.about == f"{design_table.PAPER[:1].upper()}{design_table.PAPER[1:]}."
+
+
 def test_a_policy_is_retrained_from_where_it_was():
     setup = Setup.of(tiny_preset())
     policy = setup.new_policy(random.key(0))

@@ -242,6 +242,7 @@ def test_a_table_grows_by_its_command(tmp_path, monkeypatch):
     assert all(row["run_s"] > 0 and row["peak_mb"] > 50 for row in found)
     assert "flights a second" in said
     assert (tmp_path / "s" / "scaling.png").stat().st_size > 5000
+    assert "(scaling.png)" in (tmp_path / "s" / "scaling.md").read_text()
     assert "--flights 6 must be a positive multiple of 4" in retrim(
         "reproduce", "scaling", "--flights", "6", cwd=tmp_path, code=1
     )
