@@ -74,7 +74,7 @@ def design(
             for i, (name, choice) in enumerate(CHOICES.items()):
                 if run.interrupted:
                     break
-                advance((len(rows) + 0.0) / (len(CHOICES) * len(study.policies)), f"{name}, seed {seed}")
+                advance(len(rows) / (len(CHOICES) * len(study.policies)), f"{name}, seed {seed}")
                 made = retrained(setup, policy, logs, random.key(seed), choice, epochs=epochs)
                 spec = FlightSpec(Scenario(PUSH, PLANT), "base", 0, seed)
                 landed = fly_as_it_is(setup, made.policy, starts, SCORED_S, seed)
