@@ -66,6 +66,19 @@ def test_no_room_outgrows_the_house(room):
     assert room != "cli" or mine <= 900
 
 
+def test_what_is_stated_once_stays_as_it_is():
+    """Data classes are frozen, but for those of something that goes on: documents, processes, guards."""
+
+    def melted(path):
+        classes = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ClassDef)]
+        return {each.name for each in classes for mark in map(ast.unparse, each.decorator_list)
+                if mark.partition("(")[0] == "dataclass" and "frozen=True" not in mark}  # fmt: skip
+
+    rooms = {path.relative_to(HOUSE).parts[0] for path in SOURCES if melted(path)}
+    assert rooms <= {"experiments", "live", "onboard"}
+    assert set().union(*map(melted, (HOUSE / "experiments").rglob("*.py"))) == {"Document"}
+
+
 def test_only_viz_imports_matplotlib():
     importers = {p for p in SOURCES if re.search(r"^\s*(import|from) matplotlib", p.read_text(), re.M)}
     assert {p.parent.name for p in importers} == {"viz"}

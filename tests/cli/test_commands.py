@@ -160,6 +160,8 @@ def test_demo_at_reduced_size(folder, monkeypatch):
         (level, method) for level in ("none", "small", "large") for method in ("base", "full")
     ]
     assert all((folder / "d" / f"hover_{level}.png").exists() for level in ("none", "small", "large"))
+    whole = results(folder / "d")
+    assert (whole["preset"], whole["seeds"], len(whole["losses"])) == (small.name, [0], small.pretrain.num_updates)
     assert load_policy(folder / "d")[1] == small
 
 

@@ -210,6 +210,7 @@ def test_every_table_of_the_paper_has_a_quick_look_of_options_that_it_has():
     for name, smaller in quick.QUICK.items():
         options = {each.name: each.default for each in quick.options_of(made[name])}
         assert options["quick"] is False
+        assert all(each.annotation is not inspect.Parameter.empty for each in quick.options_of(made[name]))
         assert set(smaller) <= set(options), name
         assert any(options[option] != value for option, value in smaller.items()), name
 
