@@ -118,7 +118,7 @@ def test_what_has_no_numpy_form_is_named_before_take_off():
         numpy_program(lambda p, x: jnp.sort(x), jnp.array(0.0), X)
     with pytest.raises(ConfigError, match="rounding away from zero in this controller has no NumPy form"):
         numpy_program(lambda p, x: lax.round(x), jnp.array(0.0), X)
-    with pytest.raises(ConfigError, match="a loop of 101 steps, more than 100, in this controller has no NumPy form"):
+    with pytest.raises(ConfigError, match="a loop of 101 steps, not of 1 to 100, in this controller has no NumPy form"):
         numpy_program(lambda p, x: lax.fori_loop(0, 101, lambda i, c: c + p, x), jnp.array(0.0), X)
 
 

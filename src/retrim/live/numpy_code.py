@@ -124,7 +124,7 @@ class _Writer:
         params = eqn.params
         length, held, carried = params["length"], params["num_consts"], params["num_consts"] + params["num_carry"]
         if not 0 < length <= LONGEST:
-            raise no_form(f"a loop of {length} steps, more than {LONGEST},")
+            raise no_form(f"a loop of {length} steps, not of 1 to {LONGEST},")
         carry, rows = operands[held:carried], [list[Ref]() for _ in range(length)]
         for i in reversed(range(length)) if params["reverse"] else range(length):
             given = [self._line(f"{each[0]}[{i}]", [each]) for each in operands[carried:]]
