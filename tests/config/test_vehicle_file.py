@@ -9,6 +9,7 @@ import pytest
 from retrim import ConfigError
 from retrim.config import PRESETS, Scenario, Setup, changed, load, read_vehicle
 from retrim.physics import Command, State
+from retrim.physics.vehicle import kingfisher
 from retrim.runtime import FunctionPilot, fly
 
 SEVEN_INCH = {
@@ -67,6 +68,8 @@ def test_what_a_file_leaves_out_follows_from_its_size(vehicle_file, size):
         np.testing.assert_allclose(getattr(scaled, name), size**power * getattr(one, name), rtol=1e-6, err_msg=name)
     for name in ("base", "linear", "root"):
         assert getattr(scaled.esc, name) == pytest.approx(size**-2 * getattr(one.esc, name))
+    like = dataclasses.replace(spec, arm=(0.075, 0.1), inertia=(0.004, 0.005, 0.008)).build()  # as far as kingfisher's
+    np.testing.assert_allclose(like.drag_area, kingfisher().drag_area)
     # Without propellers of its own, they are as large as nine tenths of what the shorter arm leaves them:
     bare = read_vehicle(vehicle_file(propeller_diameter=None)).build()
     assert float(bare.propeller.radius) == pytest.approx(0.9 * 0.105, rel=0.02)
