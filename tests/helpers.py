@@ -102,7 +102,7 @@ def tiny_preset(**changes):
 
 def brief_preset(name="hover/fast", **changes):
     """A preset for flights of a second or two: it learns at once, and hardly; one size, so that programs are shared."""
-    preset = changed(load(name), pretrain=BRIEF["pretrain"], adapt=BRIEF["adapt"])
+    preset = changed(load(name), **BRIEF)
     return changed(preset, **changes) if changes else preset
 
 

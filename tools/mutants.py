@@ -168,20 +168,8 @@ def _fails(tree: Path, mutant: Mutant, tests: list[str], timeout: float) -> bool
         shutil.copy(ROOT / name, tree / name)
     (tree / mutant.name).write_text(mutant.source)
     environment = {**os.environ, "PYTHONPATH": str(tree / "src"), "PYTHONDONTWRITEBYTECODE": "1"}
-    command = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-q",
-        "-x",
-        "-n",
-        "0",
-        "-p",
-        "no:cacheprovider",
-        "--timeout",
-        "120",
-        *tests,
-    ]
+    options = ["-q", "-x", "-n", "0", "-p", "no:cacheprovider", "--timeout", "120"]
+    command = [sys.executable, "-m", "pytest", *options, *tests]
     try:
         ran = subprocess.run(command, cwd=tree, env=environment, capture_output=True, timeout=timeout, check=False)
     except subprocess.TimeoutExpired:

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import numpy as np
 from jax import random
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from ..adapt.gate import all_finite
 from ..config.loading import changed
@@ -77,8 +77,8 @@ def refitted(model: ResidualModel, state: Any, rows: Targets) -> Any:
 
 
 @eqx.filter_jit
-def _predicted(model: ResidualModel, state: Any, rows: Targets) -> Float[jax.Array, "n 3"]:
-    predicted: Float[jax.Array, "n 3"] = jax.vmap(lambda x, u: model.predict(state, x, u))(rows.x, rows.u)
+def _predicted(model: ResidualModel, state: Any, rows: Targets) -> Float[Array, "n 3"]:
+    predicted: Float[Array, "n 3"] = jax.vmap(lambda x, u: model.predict(state, x, u))(rows.x, rows.u)
     return predicted
 
 
