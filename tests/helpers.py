@@ -13,6 +13,7 @@ from jax import lax, random
 from retrim import learn
 from retrim.config import changed, load
 from retrim.learn import Env, Window
+from retrim.learn.pretrain import random_starts as training_starts
 from retrim.physics import AbstractSubstepDynamics, Command, PointMass, State, small, so3
 from retrim.tasks import Hover, StateObs
 
@@ -24,7 +25,9 @@ BRIEF = {
               "fit_steps": 5, "num_updates": 2, "num_envs": 2},
 }  # fmt: skip
 
-residual_targets = eqx.filter_jit(learn.residual_targets)  # one program instead of one for each operation
+# One program each, instead of one for each operation.
+residual_targets = eqx.filter_jit(learn.residual_targets)
+random_starts = eqx.filter_jit(training_starts)
 
 
 class CheapModel(AbstractSubstepDynamics[State]):
@@ -45,11 +48,19 @@ class CheapModel(AbstractSubstepDynamics[State]):
         return PointMass(1e-3).step(s, u, effects.push)
 
 
+@eqx.filter_jit
+def draw_starts(task, key, n):
+    """Draw ``n`` starts of a task."""
+    return jax.vmap(task.reset)(random.split(key, n))
+
+
+@jax.jit
 def random_state(key, spread=1.0):
     kp, kr, kv = random.split(key, 3)
     return State(spread * random.normal(kp, (3,)), so3.exp(random.normal(kr, (3,))), spread * random.normal(kv, (3,)))
 
 
+@jax.jit
 def random_command(key):
     kc, kw = random.split(key)
     return Command(9.81 + random.normal(kc, ()), random.normal(kw, (3,)))

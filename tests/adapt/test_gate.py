@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import pytest
 from jax import random
 
-from helpers import tiny_preset
+from helpers import draw_starts, tiny_preset
 from retrim.adapt import judge
 from retrim.config import Setup
 
@@ -22,7 +22,7 @@ def trained():
 
 
 def verdict(candidate, incumbent, env):
-    return judge(candidate, incumbent, env, jax.vmap(env.task.reset)(random.split(random.key(5), 4)))
+    return judge(candidate, incumbent, env, draw_starts(env.task, random.key(5), 4))
 
 
 def broken(policy):

@@ -10,13 +10,12 @@ import optax
 import pytest
 from jax import random
 
-from helpers import replaced, tiny_preset
+from helpers import random_starts, replaced, tiny_preset
 from retrim.adapt import OnlineLearner, RollingBuffer, Verdict
 from retrim.adapt import learner as module
 from retrim.adapt.optimisers import CarriedAdam, FreshAdam
 from retrim.config import Setup
 from retrim.learn import PolicyState, bptt
-from retrim.learn.pretrain import random_starts
 from retrim.learn.residuals import FittedResidual
 from retrim.physics import Command, PointMass, State
 

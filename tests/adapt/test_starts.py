@@ -1,15 +1,17 @@
 """Where updates start: in the flown region, and where the task says."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import random
 
-from helpers import hover_task, random_state
+from helpers import hover_task, random_starts, random_state
 from retrim.adapt.starts import FlownStarts, TaskStarts
 from retrim.learn import Window
-from retrim.learn.pretrain import random_starts
+
+drawn = eqx.filter_jit(lambda starts, *more: starts(*more))
 
 
 @pytest.fixture
@@ -23,14 +25,14 @@ def window(key):
 
 
 def test_the_papers_starts_are_those_of_training(window, key):
-    found = TaskStarts()(hover_task(), window, key, 3, 4)
+    found = drawn(TaskStarts(), hover_task(), window, key, 3, 4)
     jax.tree.map(np.testing.assert_array_equal, found, random_starts(hover_task(), key, 3, 4))
 
 
 @pytest.mark.parametrize("from_task", [0, 2, 4, 9])
 def test_flown_starts_lie_where_the_vehicle_was(window, key, from_task):
     task = hover_task()
-    found = FlownStarts(jnp.array(0.0), from_task)(task, window, key, 5, 4)
+    found = drawn(FlownStarts(jnp.array(0.0), from_task), task, window, key, 5, 4)
     assert found.x.R.shape == (5, 4, 3, 3)
     far = min(from_task, 4)
     p = np.asarray(found.x.p)
@@ -43,7 +45,7 @@ def test_flown_starts_lie_where_the_vehicle_was(window, key, from_task):
 
 
 def test_their_noise_has_the_stated_size(window, key):
-    exact, noisy = (FlownStarts(jnp.array(s), 0)(hover_task(), window, key, 50, 40) for s in (0.0, 0.1))
+    exact, noisy = (drawn(FlownStarts(jnp.array(s), 0), hover_task(), window, key, 50, 40) for s in (0.0, 0.1))
     for name in ("p", "v"):
         moved = np.asarray(getattr(noisy.x, name)) - np.asarray(getattr(exact.x, name))
         assert moved.std() == pytest.approx(0.1, rel=0.05)

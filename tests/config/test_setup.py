@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from jax import random
 
-from helpers import tiny_preset
+from helpers import draw_starts, tiny_preset
 from retrim import ConfigError
 from retrim.adapt.optimisers import CarriedAdam, FreshAdam
 from retrim.adapt.starts import TaskStarts
@@ -233,7 +233,8 @@ def moves(optimiser, gradients):
         change, memory = optimiser.update(gradient, memory, jnp.zeros(4))
         return memory, change[0]
 
-    return np.asarray(jax.lax.scan(step, optimiser.init(jnp.zeros(4)), jnp.tile(jnp.array(gradients)[:, None], 4))[1])
+    rows = np.tile(np.array(gradients)[:, None], 4)
+    return np.asarray(jax.jit(lambda rows: jax.lax.scan(step, optimiser.init(jnp.zeros(4)), rows)[1])(rows))
 
 
 def test_pretraining_falls_along_a_cosine(built):
@@ -350,7 +351,7 @@ def test_a_hundred_hertz_trains_flies_and_adapts():
     chunks = list(made.pretraining(1))
     assert sum(losses.shape[0] for _, losses in chunks) == 150
     policy = chunks[-1][0]
-    x0 = jax.vmap(made.env.task.reset)(random.split(random.key(7), 16))
+    x0 = draw_starts(made.env.task, random.key(7), 16)
     fresh, trained = (policy_loss(p, made.env, x0) for p in (made.new_policy(random.key(1)), policy))
     assert float(trained) < 0.7 * float(fresh)
     plant = Scenario("small", "simple").make(preset.vehicle, dt=preset.dt)

@@ -8,7 +8,7 @@ import optax
 import pytest
 from jax import random
 
-from helpers import hover_env, tiny_preset
+from helpers import draw_starts, hover_env, random_starts, tiny_preset
 from retrim.adapt.buffer import RollingBuffer
 from retrim.adapt.gate import judge
 from retrim.adapt.starts import drawn
@@ -16,7 +16,6 @@ from retrim.config import Setup
 from retrim.control import LoraPolicy, Policy
 from retrim.control.lora import LowRankFactors
 from retrim.learn import PolicyState, bptt, policy_gradient, policy_loss
-from retrim.learn.pretrain import random_starts
 from retrim.physics import Command, State, small
 
 RANKS = (3, 4, 1)
@@ -107,7 +106,7 @@ def test_gradient_through_the_pull_is_exact(touched, lora, key):
     """What bptt does, perturbations and then back through the merger, against autodiff of the loss in the delta."""
     env = hover_env(horizon=5, delay_ticks=1)
     lora = moved(lora, key) if touched else lora
-    x0 = jax.vmap(env.task.reset)(random.split(key, 3))
+    x0 = draw_starts(env.task, key, 3)
 
     @eqx.filter_jit
     def both(lora):
@@ -151,7 +150,7 @@ def test_training_moves_the_delta_only_and_lowers_the_loss(key):
     for thin, fresh in zip(trained.delta, lora.delta, strict=True):
         assert float(jnp.abs(thin.up - fresh.up).max()) > 1e-3
         assert float(jnp.abs(thin.down - fresh.down).max()) > 1e-4
-    x0 = jax.vmap(env.task.reset)(random.split(random.key(9), 32))
+    x0 = draw_starts(env.task, random.key(9), 32)
     loss = eqx.filter_jit(lambda policy: policy_loss(policy, env, x0))
     assert float(loss(trained.merged())) < 0.9 * float(loss(base))
 
@@ -193,7 +192,7 @@ def test_the_learner_beside_the_flight_takes_it(key, monkeypatch):
     assert bool(verdict.finite)
     assert bool(verdict.admitted) == (float(verdict.candidate) <= float(verdict.incumbent))
     # a broken delta is found in the merged weights
-    x0 = jax.vmap(setup.env.task.reset)(random.split(key, 2))
+    x0 = draw_starts(setup.env.task, key, 2)
     bad = eqx.tree_at(lambda p: p.delta[0].up, after.policy, jnp.full_like(after.policy.delta[0].up, jnp.nan))
     found = judge(bad.merged(), base, setup.env, x0)
     assert found.reason() == "a weight is not finite"
@@ -204,7 +203,7 @@ def test_starts_are_drawn_from_what_was_flown(key):
     buffer = RollingBuffer(5)
     for i in range(3):
         buffer.push(0.02 * (i + 1), State.at(jnp.array([float(i + 1), 0.0, 1.0])), Command.hover())
-    found = drawn(buffer.window(), key, (60,))
+    found = eqx.filter_jit(drawn)(buffer.window(), key, (60,))
     np.testing.assert_allclose(found.t, 0.02 * found.x.p[:, 0])
     assert set(np.asarray(found.x.p[:, 0]).tolist()) == {1.0, 2.0, 3.0}
     assert found.x.R.shape == (60, 3, 3)

@@ -1,4 +1,4 @@
-"""Run the Python blocks of pages as a reader would, with untrained policies and short flights; results as JSON.
+"""Run the Python blocks of pages as a reader would, with small, untrained policies and short flights; results as JSON.
 
 Usage: ``python run_pages.py PAGE...`` in an empty folder. A block with a title is written to the file of that name.
 """
@@ -10,9 +10,16 @@ import traceback
 from pathlib import Path
 
 import retrim
+from retrim.config import PRESETS
 
 BLOCK = re.compile(r'^```(?P<language>python|toml)(?: title="(?P<title>[^"]+)")?\n(?P<code>.*?)^```', re.M | re.S)
 SHORTER = {"ticks=1500": "ticks=4", "seconds=30": "seconds=1"}
+
+
+SMALL = {
+    "pretrain": {"hidden_sizes": (16, 16)},
+    "adapt": {"num_updates": 2, "num_envs": 2, "fit_steps": 5, "window": 20},
+}
 
 
 def untrained(setup, seed=0):
@@ -42,6 +49,7 @@ def run(page: Path) -> str | None:
 if __name__ == "__main__":
     sys.path.insert(0, str(Path.cwd()))
     retrim.Setup.pretrained = untrained
+    PRESETS.update({name: retrim.changed(preset, **SMALL) for name, preset in PRESETS.items()})
     retrim.enable_compile_cache()
     found = {name: run(Path(name)) for name in sys.argv[1:]}
     Path("pages.json").write_text(json.dumps(found))

@@ -8,11 +8,10 @@ import optax
 import pytest
 from jax import random
 
-from helpers import GOAL, hover_env, hover_task, replaced
+from helpers import GOAL, draw_starts, hover_env, hover_task, random_starts, replaced
 from retrim import learn
 from retrim.control import Policy
 from retrim.learn import Env, PolicyState, pretrain
-from retrim.learn.pretrain import random_starts
 from retrim.learn.residuals import EnsembleResidual
 from retrim.physics import Command, Hybrid, LinearDragQuadrotor, PointMass, State, StraightThrough, small
 from retrim.tasks import Start
@@ -21,11 +20,6 @@ from retrim.tasks import Start
 bptt, policy_gradient, policy_loss, rollout = map(
     eqx.filter_jit, (learn.bptt, learn.policy_gradient, learn.policy_loss, learn.rollout)
 )
-
-
-@eqx.filter_jit
-def starts(task, key, n):
-    return jax.vmap(task.reset)(random.split(key, n))
 
 
 def awake(key, size, hidden=(8, 8)):
@@ -59,7 +53,7 @@ def models(key):
 def test_perturbations_equal_plain_gradient(which, delay, key):
     env = hover_env(models(key)[which], horizon=6, history=2, delay_ticks=delay)
     policy = awake(key, env.task.observation.size)
-    x0 = starts(env.task, key, 3)
+    x0 = draw_starts(env.task, key, 3)
     value, gradient = policy_gradient(policy, env, x0)
 
     def plain(layers):
@@ -76,7 +70,7 @@ def test_perturbations_equal_plain_gradient(which, delay, key):
 def test_gradient_against_finite_differences(key):
     """Residual off, horizon 3: along random directions in weight space."""
     env, policy = hover_env(horizon=3), awake(key, 15)
-    x0 = starts(env.task, key, 2)
+    x0 = draw_starts(env.task, key, 2)
     _, gradient = policy_gradient(policy, env, x0)
     loss = jax.jit(lambda layers: policy_loss(eqx.tree_at(lambda p: p.layers, policy, layers), env, x0))
     for k in random.split(key, 4):
@@ -121,7 +115,7 @@ def test_a_jump_costs_its_square_when_it_is_issued(key, delay):
 def test_a_cost_of_jumps_is_in_the_gradient(key):
     env = replaced(hover_env(horizon=6, history=2), jump_cost=jnp.array(0.3))
     policy = awake(key, env.task.observation.size)
-    x0 = starts(env.task, key, 3)
+    x0 = draw_starts(env.task, key, 3)
     plain = jax.grad(lambda layers: policy_loss(eqx.tree_at(lambda p: p.layers, policy, layers), env, x0))(
         policy.layers
     )
@@ -176,7 +170,7 @@ def test_training_lowers_the_loss_and_leaves_limits_alone(key):
     history = list(run)
     assert jnp.concatenate([losses for _, losses in history]).shape == (40,)
     trained = history[-1][0].policy
-    x0 = starts(env.task, random.key(9), 32)
+    x0 = draw_starts(env.task, random.key(9), 32)
     before, after = (float(policy_loss(p, env, x0)) for p in (policy, trained))
     assert after < 0.5 * before
     jax.tree.map(np.testing.assert_array_equal, (trained.u_min, trained.u_max), (policy.u_min, policy.u_max))

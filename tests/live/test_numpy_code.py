@@ -31,7 +31,7 @@ def check(function, parameters, inputs, tolerance=1e-12):
     """Assert that the program returns what JAX returns, in the same shapes and types."""
     program = NumpyProgram(numpy_program(function, parameters, inputs))
     found = program.step(program.prepare(leaves(parameters)), leaves(inputs))
-    wanted = leaves(function(parameters, inputs))
+    wanted = leaves(jax.jit(function)(parameters, inputs))
     assert len(found) == len(wanted)
     for a, b in zip(found, wanted, strict=True):
         assert (np.shape(a), np.asarray(a).dtype) == (np.shape(b), np.asarray(b).dtype)

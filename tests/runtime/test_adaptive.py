@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from jax import random
 
-from helpers import tiny_preset
+from helpers import draw_starts, tiny_preset
 from retrim.adapt import OnlineLearner, PolicyUpdate, Rejection, ResidualUpdate, ResidualWorker, Skip, judge
 from retrim.config import Scenario, Setup, changed
 from retrim.learn import PolicyState
@@ -308,7 +308,7 @@ def test_adaptation_cuts_the_error_under_the_large_disturbance():
 def broken_update(self, state, residual, window, key):
     """An update that went wrong."""
     bad = eqx.tree_at(lambda p: p.layers[0].bias, state.policy, jnp.full_like(state.policy.layers[0].bias, jnp.nan))
-    x0 = jax.vmap(self.env.task.reset)(random.split(key, 2))
+    x0 = draw_starts(self.env.task, key, 2)
     return PolicyState(bad, state.optimiser), judge(bad, state.policy, self.env, x0)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jax import random
 
-from helpers import random_field_flight, tiny_preset
+from helpers import draw_starts, random_field_flight, tiny_preset
 from retrim.adapt.updates import PolicyUpdate, Rejection, Skip
 from retrim.adapt.workers import PolicyWorker, ResidualWorker
 from retrim.config.setup import Setup
@@ -48,7 +48,7 @@ def test_a_base_serves_a_vehicle_that_has_learnt_nothing(fleet):
     for i in range(40):
         base = learn_base(workers, windows, base, random.key(i))
     corrected = learner.view(learner.env, FittedResidual(learner.residual_model, workers[0].state.residual))
-    starts = jax.vmap(learner.env.task.reset)(random.split(random.key(9), 32))
+    starts = draw_starts(learner.env.task, random.key(9), 32)
     before, after = (float(policy_loss(each.policy, corrected, starts)) for each in (first, base))
     assert after < before - 0.01 * abs(before)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from jax import random
 
-from helpers import GOAL, hover_env, hover_task, random_command, random_state, replaced
+from helpers import GOAL, draw_starts, hover_env, hover_task, random_command, random_state, replaced
 from retrim.config import PRESETS, Setup
 from retrim.control import Policy, PolicyController
 from retrim.learn import rollout
@@ -72,7 +72,7 @@ def test_reward_is_differentiable_everywhere(make, key):
 @pytest.mark.parametrize("heading", [math.pi, 0.1 * math.pi])
 def test_starts_keep_to_their_bounds(heading):
     task = hover_task(heading=heading)
-    x = jax.vmap(task.reset)(random.split(random.key(3), 2000)).x
+    x = draw_starts(task, random.key(3), 2000).x
     away = np.asarray(x.p) - GOAL
     assert np.abs(away).max() <= 1.0
     assert np.abs(away).max(axis=0).min() > 0.95  # and use them

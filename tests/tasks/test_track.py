@@ -35,9 +35,10 @@ def tracking(reference, make=Track, *, history=2, spread=1.0, box=5.0, horizon=1
     return make(reference, seen, jnp.array(spread), jnp.array(box), 0.02, horizon)
 
 
+@eqx.filter_jit
 def on(reference, t):
     """The state that is the reference at ``t``, level, heading as it says."""
-    here = reference(jnp.array(t))
+    here = reference(jnp.asarray(t))
     return State(here.p, so3.rotz(here.heading), here.v)
 
 
@@ -163,7 +164,10 @@ def test_starts_repeat_and_head_along(nose):
 
 def seen_by(observation, t, x, last=None, memory=None):
     memory = observation.init(x) if memory is None else memory
-    return observation(memory, jnp.array(t), x, Command.hover() if last is None else last)
+    return seen(observation, memory, jnp.array(t), x, Command.hover() if last is None else last)
+
+
+seen = eqx.filter_jit(lambda observation, *more: observation(*more))
 
 
 @pytest.mark.parametrize("history", [0, 2, 3])

@@ -3,6 +3,7 @@
 import itertools
 import math
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -33,7 +34,12 @@ def sampled(tmp_path, path, times, *, decimals=6, header="t,x,y,z,yaw"):
 
 
 def at(reference, times):
-    return jax.vmap(reference)(jnp.asarray(times, dtype=float))
+    return places(reference, jnp.asarray(times, dtype=float))
+
+
+@eqx.filter_jit
+def places(reference, times):
+    return jax.vmap(reference)(times)
 
 
 def round_lap(t):

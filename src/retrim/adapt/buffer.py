@@ -51,6 +51,6 @@ class RollingBuffer:
         missing = self._size - len(self._rows)
         rows = [self._rows[0]] * missing + list(self._rows)
         columns = zip(*(leaves for _, _, leaves in rows), strict=True)
-        x, u = jax.tree.unflatten(self._structure, [jnp.asarray(np.stack(column)) for column in columns])
+        x, u = jax.tree.unflatten(self._structure, jax.device_put([np.stack(column) for column in columns]))
         t, age = (jnp.asarray(np.array(column), dtype=x.p.dtype) for column in list(zip(*rows, strict=True))[:2])
         return Window(t, x, u, jnp.arange(self._size) >= missing, age)

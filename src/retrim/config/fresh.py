@@ -41,7 +41,7 @@ def flight_starts(home: Float[Array, "3"], n: int, seed: int) -> list[State]:
         seed: The same seed gives the same starts.
     """
     batch = _starts(home, random.fold_in(random.key(seed), START_TAG), n)
-    return [jax.tree.map(lambda leaf, i=i: jnp.asarray(np.asarray(leaf)[i]), batch) for i in range(n)]
+    return [jax.tree.map(lambda leaf, i=i: jax.device_put(np.asarray(leaf)[i]), batch) for i in range(n)]
 
 
 def low_rank(policy: Policy | LoraPolicy, key: Key[Array, ""]) -> LoraPolicy:

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import optax
 from jax import random
@@ -116,7 +115,8 @@ def retrained(setup: Setup, policy: Policy, logs: Sequence[Log], key: Key[Array,
     """
     k_fit, k_train = random.split(key)
     nominal = _nominal(setup, choice)
-    windows = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *(log.window(len(log.t) - 1) for log in logs))
+    flown = (log.window(len(log.t) - 1) for log in logs)
+    windows = jax.device_put(jax.tree.map(lambda *leaves: np.stack(leaves), *flown))
     rows = _rows(windows, nominal, setup.preset.plant_delay_ticks)
     adapt = setup.preset.adapt
     adam = _adam(adapt.fit_learning_rate)

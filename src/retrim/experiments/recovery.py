@@ -2,12 +2,14 @@
 
 from collections.abc import Sequence
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from ..config.disturbances import disturbance
+from ..physics.disturbance import Disturbance
 from ..physics.effects import ExternalEffects
 from ..physics.state import State
 
@@ -29,10 +31,16 @@ def timeline(name: str, home: Array, seconds: float) -> tuple[np.ndarray, Extern
     """
     times = np.linspace(0.0, seconds, max(1, round(seconds / STEP)), endpoint=False)
     acting, x = disturbance(name), State.at(home)
-    found: ExternalEffects = jax.vmap(lambda t: acting(t, x))(jnp.asarray(times, dtype=x.p.dtype))
+    found = _effects(acting, jnp.asarray(times, dtype=x.p.dtype), x)
     values = np.concatenate([np.asarray(leaf).reshape(len(times), -1) for leaf in jax.tree.leaves(found)], axis=1)
     changes = np.flatnonzero(np.any(np.diff(values, axis=0) != 0, axis=1)) + 1
     return times, found, changes.tolist()
+
+
+@eqx.filter_jit
+def _effects(acting: Disturbance, times: Float[Array, " n"], x: State) -> ExternalEffects:
+    found: ExternalEffects = jax.vmap(lambda t: acting(t, x))(times)
+    return found
 
 
 def change_times(name: str, home: Array, seconds: float) -> list[float]:

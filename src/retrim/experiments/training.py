@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import random
-from jaxtyping import Array
+from jaxtyping import Array, Key
 
 from ..config.loading import changed, dump, parse
 from ..config.presets import Preset
@@ -19,7 +19,6 @@ from ..errors import JobError
 from ..learn.env import Env
 from ..learn.residuals.model import FittedResidual
 from ..learn.rollout import rollout
-from ..tasks.task import Start
 from .reporter import Reporter, Silent
 
 
@@ -141,17 +140,17 @@ def _long(setup: Setup) -> Setup:
 
 
 def _mean_error(setup: Setup, env: Env, policy: Policy, n: int, seed: int) -> float:
-    x0 = jax.vmap(env.task.reset)(random.split(random.key(seed), n))
-    return float(_settled(policy, env, x0, round(0.5 / setup.preset.dt)))
+    return float(_settled(policy, env, random.key(seed), n, round(0.5 / setup.preset.dt)))
 
 
 @eqx.filter_jit
-def _settled(policy: Policy, env: Env, x0: Start, ticks: int) -> Array:
-    def error(start: Start) -> Array:
+def _settled(policy: Policy, env: Env, key: Key[Array, ""], n: int, ticks: int) -> Array:
+    def error(k: Key[Array, ""]) -> Array:
+        start = env.task.reset(k)
         flown = rollout(env, policy, start)
         last = jax.tree.map(lambda leaf: leaf[-ticks:], flown.x)
         horizon = env.task.horizon
         times = start.t + env.task.dt * jnp.arange(horizon - ticks, horizon, dtype=start.t.dtype)
         return jnp.mean(jax.vmap(env.task.error)(times, last))
 
-    return jnp.mean(jax.vmap(error)(x0))
+    return jnp.mean(jax.vmap(error)(random.split(key, n)))

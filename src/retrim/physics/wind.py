@@ -1,6 +1,7 @@
 """Wind: steady, Dryden gusts, the jet of a fan. Wind acts through the relative air velocity at rotors and body."""
 
 import math
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -53,22 +54,29 @@ class Turbulence(eqx.Module):
         with s = L omega / V, the energy below s is 2 atan(s) / pi along the wind, and (2 atan(s) - s / (1 + s^2)) / pi
         across it (MIL-F-8785C).
         """
-        k_quantile, k_phase = random.split(key)
-        share = (jnp.arange(n, dtype=float)[:, None] + random.uniform(k_quantile, (n, 3))) / n
-        grid = jnp.tan(jnp.linspace(0.0, 1.0, 2001)[:-1] * jnp.pi / 2)
-        across = (2.0 * jnp.arctan(grid) - grid / (1.0 + grid**2)) / jnp.pi
-        s = jnp.stack(
-            [jnp.tan(share[:, 0] * jnp.pi / 2), *(jnp.interp(share[:, i], across, grid) for i in (1, 2))], axis=1
-        )
-        fastest = 200.0  # [rad/s]: a millisecond step resolves no more
-        rate = jnp.minimum(s * speed / length[None], fastest)
-        return cls(rate, 2.0 * jnp.pi * random.uniform(k_phase, (n, 3)), sigma)
+        rate, phase = _eddies(speed, length, key, n)
+        return cls(rate, phase, sigma)
 
     def __call__(self, t: Float[Array, ""]) -> Float[Array, "3"]:
         """Return the gust at ``t``: along, across and up [m/s]."""
         n = self.rate.shape[0]
         amplitude = self.sigma * math.sqrt(2.0 / n)
         return amplitude * jnp.sum(jnp.cos(self.rate * t + self.phase), axis=0)
+
+
+@partial(jax.jit, static_argnums=3)
+def _eddies(
+    speed: Float[Array, ""], length: Float[Array, "3"], key: Key[Array, ""], n: int
+) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
+    """Rate [rad/s] and phase of each sinusoid."""
+    k_quantile, k_phase = random.split(key)
+    share = (jnp.arange(n, dtype=float)[:, None] + random.uniform(k_quantile, (n, 3))) / n
+    grid = jnp.tan(jnp.linspace(0.0, 1.0, 2001)[:-1] * jnp.pi / 2)
+    across = (2.0 * jnp.arctan(grid) - grid / (1.0 + grid**2)) / jnp.pi
+    s = jnp.stack([jnp.tan(share[:, 0] * jnp.pi / 2), *(jnp.interp(share[:, i], across, grid) for i in (1, 2))], axis=1)
+    fastest = 200.0  # [rad/s]: a millisecond step resolves no more
+    rate = jnp.minimum(s * speed / length[None], fastest)
+    return rate, 2.0 * jnp.pi * random.uniform(k_phase, (n, 3))
 
 
 def axes_along(direction: Float[Array, "3"]) -> Float[Array, "3 3"]:

@@ -70,9 +70,9 @@ class Batch:
     def blank_window(self, size: int) -> Window:
         """Return windows of the shapes of a flight, of vehicles that hover where they start."""
         n = self._starts.p.shape[0]
-        x = jax.tree.map(lambda leaf: jnp.asarray(np.repeat(np.asarray(leaf)[:, None], size, axis=1)), self._starts)
+        x = jax.tree.map(lambda leaf: jax.device_put(np.repeat(np.asarray(leaf)[:, None], size, axis=1)), self._starts)
         hover = Command.hover(x.p.dtype)
-        u = jax.tree.map(lambda leaf: jnp.asarray(np.broadcast_to(leaf, (n, size, *leaf.shape))), hover)
+        u = jax.tree.map(lambda leaf: jax.device_put(np.broadcast_to(leaf, (n, size, *leaf.shape))), hover)
         nothing, every = jnp.zeros((n, size), x.p.dtype), jnp.ones((n, size), dtype=bool)
         blank: Window = spread(jax.vmap(Window)(nothing, x, u, every, nothing))
         return blank
@@ -81,13 +81,13 @@ class Batch:
         """Return the windows that learners are offered at ``tick``; it has been flown."""
         wanted = np.arange(tick - size + 1, tick + 1)
         at = np.maximum(wanted, 0)
-        x = jax.tree.map(lambda leaf: jnp.asarray(leaf[:, at]), self._measured)
+        x = jax.tree.map(lambda leaf: jax.device_put(leaf[:, at]), self._measured)
         # The plant has not accepted the newest command yet.
-        newest = lambda old, new: jnp.asarray(np.concatenate([old[:, at[:-1]], new[:, at[-1:]]], axis=1))  # noqa: E731
+        newest = lambda old, new: jax.device_put(np.concatenate([old[:, at[:-1]], new[:, at[-1:]]], axis=1))  # noqa: E731
         u = jax.tree.map(newest, self._rows.accepted, self._rows.issued)
         n = x.p.shape[0]
         t = jnp.asarray(np.broadcast_to(at * self.dt, (n, size)), dtype=x.p.dtype)
-        valid, age = jnp.asarray(np.broadcast_to(wanted >= 0, (n, size))), jnp.full_like(t, self._simulations.age)
+        valid, age = jax.device_put(np.broadcast_to(wanted >= 0, (n, size))), jnp.full_like(t, self._simulations.age)
         windows: Window = spread(jax.vmap(Window)(t, x, u, valid, age))
         return windows
 
@@ -124,7 +124,7 @@ def stacked(trees: Sequence[T]) -> T:
 
 def one(tree: T, i: int) -> T:
     """Return one of :func:`stacked` trees."""
-    found: T = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[i]), tree)
+    found: T = jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf)[i]), tree)
     return found
 
 
@@ -132,7 +132,8 @@ def _stack(leaves: Sequence[Any]) -> Array:
     """Stack arrays, without a program to compile for every shape."""
     if jnp.issubdtype(leaves[0].dtype, jax.dtypes.prng_key):
         return jnp.stack(leaves)
-    return jnp.asarray(np.stack([np.asarray(leaf) for leaf in leaves]))
+    stacked: Array = jax.device_put(np.stack([np.asarray(leaf) for leaf in leaves]))
+    return stacked
 
 
 def _recorded(record: Any, flown: Any, at: int, size: int, *, rows: int) -> Any:

@@ -63,7 +63,7 @@ class AbstractTrack(AbstractTask):
 
     def home(self) -> Float[Array, "3"]:
         """Return the start of the reference, world [m]."""
-        return self.reference(jnp.array(0.0)).p
+        return _start(self.reference)
 
     def target(self, t: Float[Array, ""]) -> Float[Array, "3"]:
         """Return where the reference is at time ``t`` [s], world [m]."""
@@ -89,6 +89,11 @@ class AbstractTrack(AbstractTask):
         """Return tracking of the turned reference."""
         observation = self.observation.in_frame(frame)
         return dataclasses.replace(self, reference=self.reference.in_frame(frame), observation=observation)
+
+
+@eqx.filter_jit
+def _start(reference: AbstractReference) -> Float[Array, "3"]:
+    return reference(jnp.array(0.0)).p
 
 
 class Track(AbstractTrack):

@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from typing import Any, TypeVar
 
 import jax
-import jax.numpy as jnp
 
 from .message import MAX_BYTES as MAX_BYTES
 from .message import describe as describe
@@ -47,5 +46,5 @@ def unpack(data: bytes, like: T, *, kind: str, source: str) -> T:
         MessageError: The message is truncated, damaged, of another kind or shape, or has values that are not finite.
     """
     arrays = unpack_arrays(data, names(like), kind=kind, source=source)
-    tree: T = jax.tree.unflatten(jax.tree.structure(like), [jnp.asarray(array) for array in arrays.values()])
+    tree: T = jax.tree.unflatten(jax.tree.structure(like), jax.device_put(list(arrays.values())))
     return tree
