@@ -3,6 +3,7 @@
 import importlib
 import inspect
 import json
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -93,10 +94,11 @@ def test_the_gradient_is_that_of_the_model_or_of_the_point_mass(key):
 def test_the_design_study_by_its_command(tmp_path, monkeypatch):
     monkeypatch.setitem(named_presets.PRESETS, "hover/fast", tiny_preset())
     monkeypatch.setattr(design, "CHUNK", 10)
+    monkeypatch.setattr(design_table, "retrained", partial(design.retrained, fit_epochs=20, envs=4))
     for name, small in (("ROLLOUTS", 2), ("ROLLOUT_S", 1.0), ("SCORED_S", 3.0)):
         monkeypatch.setattr(design_table, name, small)
     monkeypatch.setattr(design_table, "CHOICES", dict(list(design.CHOICES.items())[1:3]))
-    out = retrim("reproduce", "design", "--seeds", "0", "--starts", "1", "--epochs", "10", "--out", "d", cwd=tmp_path)
+    out = retrim("reproduce", "design", "--seeds", "0", "--starts", "2", "--epochs", "10", "--out", "d", cwd=tmp_path)
     assert "low fidelity, res-fwd + res-back" in out
     rows = json.loads((tmp_path / "d" / "design.json").read_text())["rows"]
     assert [row["model"] for row in rows] == list(design.CHOICES)[1:3]

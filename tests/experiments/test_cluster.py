@@ -34,9 +34,9 @@ SWEEP = (
 presets = ["hover/retrim"]
 seeds = [0, 1]
 methods = ["base", "full"]
-disturbances = ["none", "small", "gusts"]
+disturbances = ["none", "gusts"]
 starts = {starts}
-seconds = 2
+seconds = 1.2
 """
     + OVERLAY
 )
@@ -130,7 +130,7 @@ def test_a_flight_that_fails_leaves_the_others_and_an_exit_code(here, tmp_path, 
 
     monkeypatch.setattr(jobs, "fly_lot", failing)
     monkeypatch.setattr("retrim.experiments.lots.lanes", lambda: 1)
-    (tmp_path / "study.toml").write_text(SWEEP.format(starts=1).replace('"none", "small", "gusts"', '"none"'))
+    (tmp_path / "study.toml").write_text(SWEEP.format(starts=1).replace('"none", "gusts"', '"none"'))
     said = retrim("sweep", "study.toml", "--on", here, "--out", "s", cwd=tmp_path, code=1)
     assert "2 flights failed elsewhere, the first by OSError: gone; the same command flies them" in said
     base, full = rows(tmp_path / "s")
@@ -195,7 +195,7 @@ def test_a_sweep_elsewhere_is_the_same_table_and_flies_again_what_had_failed(her
     kept[0] |= {"failed": "OSError: gone", "error": None}
     (tmp_path / "there/flights.jsonl").write_text("".join(json.dumps(row) + "\n" for row in kept))
     retrim("sweep", "study.toml", "--on", here, "--out", "there", cwd=tmp_path)
-    assert [row["n"] for row in rows(tmp_path / "there")] == [2] * 6
+    assert [row["n"] for row in rows(tmp_path / "there")] == [2] * 4
     assert not any("failures" in row for row in rows(tmp_path / "there"))
 
 

@@ -181,6 +181,13 @@ def test_a_section_follows_from_the_files_behind_its_names(tmp_path, monkeypatch
     assert [after[name] == before[name] for name in sorted(before)] == [False, True]
 
 
+@pytest.fixture
+def small_datt(monkeypatch):
+    for name, size in (("envs", 8), ("steps", 16)):
+        monkeypatch.setitem(rivals.DATT_PPO, name, size)
+
+
+@pytest.mark.usefixtures("small_datt")
 def test_datt_is_trained_once_for_a_folder(tmp_path, monkeypatch):
     """Of a seed and a vehicle; a file that is damaged, or made by code that has changed, is made again."""
     monkeypatch.setattr(provenance, "commit", lambda: "abc")
@@ -188,22 +195,23 @@ def test_datt_is_trained_once_for_a_folder(tmp_path, monkeypatch):
     reporter = Silent()
     reporter.say = said.append
     run, preset = Run("test", tmp_path), load("hover/retrim")
-    first = rivals.trained_datt(preset, [0, 1], run, reporter, steps=20_000)
-    again = rivals.trained_datt(preset, [0], run, reporter, steps=20_000)
+    first = rivals.trained_datt(preset, [0, 1], run, reporter, steps=200)
+    again = rivals.trained_datt(preset, [0], run, reporter, steps=200)
     jax.tree.map(np.testing.assert_array_equal, first[0], again[0])
     assert any(np.any(a != b) for a, b in zip(jax.tree.leaves(first[0]), jax.tree.leaves(first[1]), strict=True))
     (file,) = tmp_path.glob("datt_*_seed0.safetensors")
     file.write_bytes(file.read_bytes()[:-100])
-    other = rivals.trained_datt(preset, [0], run, reporter, steps=20_000)
+    other = rivals.trained_datt(preset, [0], run, reporter, steps=200)
     assert "trained again" in said[0]
     jax.tree.map(np.testing.assert_array_equal, first[0], other[0])
     monkeypatch.setattr(provenance, "commit", lambda: "abd")
-    rivals.trained_datt(preset, [0], run, reporter, steps=20_000)
+    rivals.trained_datt(preset, [0], run, reporter, steps=200)
     assert len(list(tmp_path.glob("datt_*_seed0.safetensors"))) == 2
     with pytest.raises(ConfigError, match=r"DATT looks ahead in steps of 0\.06 s, which must be whole control periods"):
         rivals.check_rival(changed(preset, dt=0.025))
 
 
+@pytest.mark.usefixtures("small_datt")
 def test_baselines_fly_without_a_trained_policy(tmp_path, monkeypatch):
     """One flight of each, DATT too, and nothing is trained for policies that nobody flies."""
     monkeypatch.setattr(levels, "train_all", lambda *_: pytest.fail("a policy is trained"))
