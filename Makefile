@@ -7,6 +7,9 @@ STAMP := $(VENV)/.installed
 
 DEV := $(VENV)/.installed-dev
 
+# Some containers forbid compiled Python files; every process would then compile JAX anew, a second and a half each.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: setup dev demo test check docs wheel mutants drill test-page test-links test-cluster test-ros test-px4 test-crazyflie betaflight test-betaflight bench tables pins clean
 
 setup: $(STAMP)
