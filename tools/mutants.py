@@ -167,7 +167,7 @@ def _fails(tree: Path, mutant: Mutant, tests: list[str], timeout: float) -> bool
     for name in ("pyproject.toml", "README.md", "CONTRIBUTING.md"):
         shutil.copy(ROOT / name, tree / name)
     (tree / mutant.name).write_text(mutant.source)
-    environment = {**os.environ, "PYTHONPATH": str(tree / "src"), "PYTHONDONTWRITEBYTECODE": "1"}
+    environment = {**os.environ, "PYTHONPATH": str(tree / "src")}
     options = ["-q", "-x", "-n", "0", "-p", "no:cacheprovider", "--timeout", "120"]
     command = [sys.executable, "-m", "pytest", *options, *tests]
     try:
