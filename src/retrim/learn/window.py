@@ -2,6 +2,7 @@
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
@@ -44,6 +45,6 @@ class Window(eqx.Module):
         Returns:
             A window in which every tick is valid.
         """
-        states = jax.vmap(State)(*jax.device_put((p, R, v)))
-        commands = jax.vmap(Command)(*jax.device_put((c, omega)))
-        return cls(jax.device_put(t), states, commands, jax.device_put(np.ones(len(t), dtype=bool)))
+        states = jax.vmap(State)(jnp.asarray(p), jnp.asarray(R), jnp.asarray(v))
+        commands = jax.vmap(Command)(jnp.asarray(c), jnp.asarray(omega))
+        return cls(jnp.asarray(t), states, commands, jnp.ones(len(t), dtype=bool))

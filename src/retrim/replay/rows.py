@@ -1,6 +1,7 @@
 """What the nominal model missed at each tick of a log."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from ..io.logs import FlightLog
@@ -50,6 +51,6 @@ def rows_of(log: FlightLog, *, delay: float = 0.0, lag: float = 0.0) -> Targets:
     c = acting(log.c, log.dt, delay, lag)
     told = log.rates if log.command is None else log.command
     missed = log.a + UP - c[:, None] * log.R[:, :, 2]
-    x = jax.vmap(State)(*jax.device_put((log.p, log.R, log.v)))
-    u = jax.vmap(Command)(*jax.device_put((c, told)))
-    return Targets(x, u, *jax.device_put((missed, log.rates, log.valid)))
+    x = jax.vmap(State)(jnp.asarray(log.p), jnp.asarray(log.R), jnp.asarray(log.v))
+    u = jax.vmap(Command)(jnp.asarray(c), jnp.asarray(told))
+    return Targets(x, u, jnp.asarray(missed), jnp.asarray(log.rates), jnp.asarray(log.valid))

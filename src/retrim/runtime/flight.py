@@ -32,7 +32,7 @@ class States(NamedTuple):
 
     def as_state(self) -> State:
         """Return the same as a :class:`State` of JAX arrays."""
-        state: State = jax.vmap(State)(*jax.device_put(tuple(self)))
+        state: State = jax.vmap(State)(*map(jnp.asarray, self))
         return state
 
 
