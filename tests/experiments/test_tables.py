@@ -255,6 +255,24 @@ def test_an_interrupted_table_flies_nothing_more(tmp_path):
     assert results(tmp_path, "table.json")["interrupted"]
 
 
+def test_a_training_of_a_table_ends_soon_after_it_is_stopped(tmp_path):
+    run, told = Run("test", tmp_path), []
+
+    def advance(share, text):
+        if share:
+            told.append(share)
+            run.stop.set()
+
+    class Stopping(Silent):
+        def progress(self, title):
+            return contextlib.nullcontext(advance)
+
+    preset = brief_preset(pretrain={"num_updates": 30})
+    assert train_all(preset, [0, 1], run, Stopping()).policies == {}
+    assert len(told) == 1
+    assert told[0] < 1.0
+
+
 def test_every_section_is_written_when_it_is_added(tmp_path):
     document = Document(Run("test", tmp_path), "table", "Title", "Intro.", [0, 4], Silent(), {"more": 1})
     document.add(TableSection(("a", "b"), (("1", "2"),), "First", "About it."), [{"x": 1}])

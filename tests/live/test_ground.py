@@ -49,29 +49,30 @@ def station(address, over):
                 return
 
 
-@pytest.mark.parametrize("lost", ["ground", "bridge", "page hangs"])
-def test_a_flight_with_learners_elsewhere(tmp_path, controller, lost):  # noqa: F811
-    pytest.importorskip("zenoh")
+def flown_while(lost, folder, controller):  # noqa: F811
+    """Fly with learners at a ground station, and lose ``lost`` after a second; return the last status, the events, and
+    who flew at each tick before the landing."""
     address, over = Address("zenoh", "127.0.0.1", unused_port()), threading.Event()
     page = PageSpec("127.0.0.1", free_port("127.0.0.1", 18180), "drill", HOME[None].repeat(2, 0), (), 0.06, 0.19)
     changes = {"learners": address, "seconds": SECONDS, "page": page if lost == "page hangs" else None}
     thread = threading.Thread(target=station, args=(address, over))
     thread.start()
-    events = LiveEvents()
+    events, there = LiveEvents(), True
     try:
-        with Drill(spec_in(tmp_path, controller, **changes)) as drill:
+        with Drill(spec_in(folder, controller, **changes)) as drill:
             for _ in drill.warm_up():
                 pass
             drill.take_off()
             while (status := drill.watch()).ended is None and status.t < 20.0:
                 events.take(status)
-                if status.t > 1.0 and lost == "ground":
-                    over.set()
-                elif status.t > 1.0 and lost == "bridge":
-                    drill.processes["bridge"].kill()
-                    lost = "bridge, and it came back"
-                elif status.t > 1.0 and lost == "page hangs":
-                    os.kill(drill.processes["page"].pid, signal.SIGSTOP)
+                if status.t > 1.0 and there:
+                    there = False
+                    if lost == "ground":
+                        over.set()
+                    elif lost == "bridge":
+                        drill.processes["bridge"].kill()
+                    else:
+                        os.kill(drill.processes["page"].pid, signal.SIGSTOP)
                 if status.t > SECONDS:
                     drill.land()
                 time.sleep(0.02)
@@ -79,10 +80,20 @@ def test_a_flight_with_learners_elsewhere(tmp_path, controller, lost):  # noqa: 
     finally:
         over.set()
         thread.join(20.0)
-    rows = whole_log(tmp_path, status)
+    rows = whole_log(folder, status)
     assert status.ended == "landed"
-    flown_by = rows[rows[:, 1] < SECONDS - 0.1, -1]
-    assert np.mean(flown_by == Mode.POLICY) > 0.5  # on a busy machine the watchdog steps in now and then
+    return status, events, rows[rows[:, 1] < SECONDS - 0.1, -1]
+
+
+@pytest.mark.parametrize("lost", ["ground", "bridge", "page hangs"])
+def test_a_flight_with_learners_elsewhere(tmp_path, controller, lost):  # noqa: F811
+    pytest.importorskip("zenoh")
+    for attempt in ("first", "second", "third"):  # a busy machine may hold a process back until the guard takes over
+        (tmp_path / attempt).mkdir()
+        status, events, flown_by = flown_while(lost, tmp_path / attempt, controller)
+        if (share := np.mean(flown_by == Mode.POLICY)) > 0.9:
+            break
+    assert share > 0.9
     swaps = [at for at, half, *_ in events.swaps if half == "policy"]
     assert swaps
     assert swaps[0] < 1.0
@@ -91,7 +102,7 @@ def test_a_flight_with_learners_elsewhere(tmp_path, controller, lost):  # noqa: 
         assert not status.alive["policy"]
     else:
         assert swaps[-1] > 2.0
-    if lost.startswith("bridge"):
+    if lost == "bridge":
         assert status.restarts == {"bridge": 1}
 
 

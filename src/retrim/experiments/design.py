@@ -29,7 +29,6 @@ from ..plants.sim import SimPlant
 from ..runtime.flight import Log
 from ..runtime.pilot import ControllerPilot
 from ..runtime.together import fly_together
-from .flights import FlightSpec
 
 PUSH, PLANT = "push-x=2", "bem"  # the paper's push: 2 m/s^2 along +x
 ROLLOUTS, ROLLOUT_S = 50, 3.0
@@ -72,13 +71,11 @@ class Trained(NamedTuple):
 
 def flown(setup: Setup, policy: Policy, n: int, seconds: float, seed: int) -> list[Log]:
     """Fly a policy as it is from random starts, on the study's plant, as one batch."""
-    scenario = Scenario(PUSH, PLANT)
-    specs = [FlightSpec(scenario, "base", start, seed) for start in range(n)]
-    plants = [scenario.make(setup.preset.vehicle, dt=setup.preset.dt, seed=spec.plant_seed) for spec in specs]
+    plants = [Scenario(PUSH, PLANT).make(setup.preset.vehicle, dt=setup.preset.dt) for _ in range(n)]
     controller = PolicyController(setup.flown.observation_in_flight, policy)
     return fly_together(
         [plant for plant in plants if isinstance(plant, SimPlant)],
-        [ControllerPilot(controller) for _ in specs],
+        [ControllerPilot(controller) for _ in plants],
         setup.flight_starts(n, seed),
         ticks=round(seconds / setup.preset.dt),
     )
