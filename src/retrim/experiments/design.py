@@ -26,6 +26,7 @@ from ..learn.window import Window
 from ..physics.dynamics import AbstractDynamics, Hybrid, PointMass, StraightThrough
 from ..physics.rotors import LinearDragQuadrotor
 from ..plants.sim import SimPlant
+from ..runtime.batched import stacked
 from ..runtime.flight import Log
 from ..runtime.pilot import ControllerPilot
 from ..runtime.together import fly_together
@@ -112,8 +113,7 @@ def retrained(setup: Setup, policy: Policy, logs: Sequence[Log], key: Key[Array,
     """
     k_fit, k_train = random.split(key)
     nominal = _nominal(setup, choice)
-    flown = (log.window(len(log.t) - 1) for log in logs)
-    windows = jax.device_put(jax.tree.map(lambda *leaves: np.stack(leaves), *flown))
+    windows = stacked([log.window(len(log.t) - 1) for log in logs])
     rows = _rows(windows, nominal, setup.preset.plant_delay_ticks)
     adapt = setup.preset.adapt
     adam = _adam(adapt.fit_learning_rate)

@@ -2,14 +2,12 @@
 
 from collections.abc import Sequence
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from ..config.disturbances import disturbance
-from ..physics.disturbance import Disturbance
+from ..physics.disturbance import effects_at
 from ..physics.effects import ExternalEffects
 from ..physics.state import State
 
@@ -30,17 +28,10 @@ def timeline(name: str, home: Array, seconds: float) -> tuple[np.ndarray, Extern
         Times [s], the effects at each (leading axis), and the samples at which they differ from the one before.
     """
     times = np.linspace(0.0, seconds, max(1, round(seconds / STEP)), endpoint=False)
-    acting, x = disturbance(name), State.at(home)
-    found = _effects(acting, jnp.asarray(times, dtype=x.p.dtype), x)
+    found = effects_at(times, State.at(home), disturbance(name))
     values = np.concatenate([np.asarray(leaf).reshape(len(times), -1) for leaf in jax.tree.leaves(found)], axis=1)
     changes = np.flatnonzero(np.any(np.diff(values, axis=0) != 0, axis=1)) + 1
     return times, found, changes.tolist()
-
-
-@eqx.filter_jit
-def _effects(acting: Disturbance, times: Float[Array, " n"], x: State) -> ExternalEffects:
-    found: ExternalEffects = jax.vmap(lambda t: acting(t, x))(times)
-    return found
 
 
 def change_times(name: str, home: Array, seconds: float) -> list[float]:

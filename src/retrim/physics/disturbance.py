@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import random
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, ArrayLike, Float, Key
 
 from .effects import ExternalEffects
 from .state import State
@@ -24,6 +24,13 @@ class Disturbance(Protocol):
     def __call__(self, t: Float[Array, ""], x: State, /) -> ExternalEffects:
         """Return the external effects at time ``t`` in the state ``x``."""
         ...
+
+
+@eqx.filter_jit
+def effects_at(times: ArrayLike, x: State, disturbance: Disturbance) -> ExternalEffects:
+    """Return the external effects in the state ``x`` at each of ``times`` [s] (leading axis)."""
+    found: ExternalEffects = jax.vmap(lambda t: disturbance(t, x))(jnp.asarray(times, dtype=x.p.dtype))
+    return found
 
 
 class Push(eqx.Module):

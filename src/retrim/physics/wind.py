@@ -1,7 +1,6 @@
 """Wind: steady, Dryden gusts, the jet of a fan. Wind acts through the relative air velocity at rotors and body."""
 
 import math
-from functools import partial
 
 import equinox as eqx
 import jax
@@ -64,7 +63,7 @@ class Turbulence(eqx.Module):
         return amplitude * jnp.sum(jnp.cos(self.rate * t + self.phase), axis=0)
 
 
-@partial(jax.jit, static_argnums=3)
+@eqx.filter_jit
 def _eddies(
     speed: Float[Array, ""], length: Float[Array, "3"], key: Key[Array, ""], n: int
 ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:

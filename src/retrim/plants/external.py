@@ -1,15 +1,14 @@
 """Base class of plants that wrap another simulator: tick, command delay, external effects, measurements."""
 
 import abc
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from ..errors import PlantError
-from ..physics.disturbance import Disturbance
+from ..physics.disturbance import Disturbance, effects_at
 from ..physics.effects import ExternalEffects
 from ..physics.state import STANDARD_GRAVITY, Command, State
 from .plant import Measurement, Plant, check_command
@@ -68,7 +67,7 @@ class ExternalPlant(Plant, abc.ABC):
         if self._x is None:
             raise PlantError(f"{name}: not flying; call reset first")
         times = self._ticks * self.dt + self._instants
-        effects = jax.tree.map(np.asarray, _effects(self._disturbance, times, self._x))
+        effects = jax.tree.map(np.asarray, effects_at(times, self._x, self._disturbance))
         after = self._advance(self._held, effects)
         dtype = self._x.p.dtype
         self._x = State(*(jnp.asarray(a, dtype=dtype) for a in after))
@@ -83,12 +82,6 @@ class ExternalPlant(Plant, abc.ABC):
     def stop(self) -> None:
         """Forget the flight."""
         self._x = None
-
-
-@eqx.filter_jit
-def _effects(disturbance: Disturbance, times: Any, x: State) -> ExternalEffects:
-    """Conditions at each of ``times`` [s], stacked."""
-    return jax.vmap(lambda t: disturbance(t, x))(jnp.asarray(times, dtype=x.p.dtype))
 
 
 def whole_steps(dt: float, step: float) -> int:
