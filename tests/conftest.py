@@ -36,7 +36,7 @@ enable_compile_cache()  # shared by the workers and by the commands that tests s
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.03)
 # What a shell starts in the background ignores Ctrl-C; tests raise it, wherever they run.
 signal.signal(signal.SIGINT, signal.default_int_handler)
-gc.set_threshold(100_000, 20, 100)  # tracing makes millions of small objects, and little garbage
+gc.set_threshold(100_000, 20, 100)  # as it is by default, it takes some per cent of the time
 settings.register_profile("repeatable", derandomize=True)  # the same examples on every machine
 settings.load_profile("repeatable")
 

@@ -14,8 +14,6 @@ from retrim.config import PRESETS
 
 BLOCK = re.compile(r'^```(?P<language>python|toml)(?: title="(?P<title>[^"]+)")?\n(?P<code>.*?)^```', re.M | re.S)
 SHORTER = {"ticks=1500": "ticks=4", "seconds=30": "seconds=1"}
-
-
 SMALL = {
     "pretrain": {"hidden_sizes": (16, 16)},
     "adapt": {"num_updates": 2, "num_envs": 2, "fit_steps": 5, "window": 20},

@@ -57,7 +57,7 @@ def flown_while(lost, folder, controller):  # noqa: F811
     changes = {"learners": address, "seconds": SECONDS, "page": page if lost == "page hangs" else None}
     thread = threading.Thread(target=station, args=(address, over))
     thread.start()
-    events, there = LiveEvents(), True
+    events, complete = LiveEvents(), True
     try:
         with Drill(spec_in(folder, controller, **changes)) as drill:
             for _ in drill.warm_up():
@@ -65,8 +65,8 @@ def flown_while(lost, folder, controller):  # noqa: F811
             drill.take_off()
             while (status := drill.watch()).ended is None and status.t < 20.0:
                 events.take(status)
-                if status.t > 1.0 and there:
-                    there = False
+                if status.t > 1.0 and complete:
+                    complete = False
                     if lost == "ground":
                         over.set()
                     elif lost == "bridge":

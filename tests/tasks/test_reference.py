@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from jax import random
 
-from helpers import replaced
+from helpers import at, replaced
 from retrim.physics import Command, PointMass, State, kingfisher, small, with_payload
 from retrim.tasks import REFERENCES, Reference, joined, smooth_start
 from retrim.tasks.reference import POINTS
@@ -30,17 +30,6 @@ named = pytest.mark.parametrize("name", REFERENCES)
 @pytest.fixture(scope="module")
 def tables():
     return {name: make() for name, make in REFERENCES.items()}
-
-
-_thousand = eqx.filter_jit(lambda reference, times: jax.vmap(reference)(times))
-
-
-def at(reference, times):
-    """The reference at many times, by one compiled program."""
-    times = np.asarray(times, dtype=float)
-    padded = np.append(times, np.zeros(-len(times) % 1000)).reshape(-1, 1000)
-    found = [_thousand(reference, jnp.asarray(part)) for part in padded]
-    return jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(times)], *found)
 
 
 def at_one(reference, t):

@@ -3,14 +3,13 @@
 import itertools
 import math
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from helpers import at
 from retrim.errors import ConfigError
 from retrim.physics import small
 from retrim.tasks import from_csv, smooth_start
@@ -31,15 +30,6 @@ def sampled(tmp_path, path, times, *, decimals=6, header="t,x,y,z,yaw"):
     names = ",".join(header.split(",")[: len(rows[0])])
     lines = [",".join(f"{value:.{decimals}f}" for value in row) for row in rows]
     return written(tmp_path, "\n".join([names, *lines]) + "\n")
-
-
-def at(reference, times):
-    return places(reference, jnp.asarray(times, dtype=float))
-
-
-@eqx.filter_jit
-def places(reference, times):
-    return jax.vmap(reference)(times)
 
 
 def round_lap(t):
