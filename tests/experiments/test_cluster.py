@@ -320,7 +320,7 @@ def processes(folder):
 
 @pytest.mark.slow
 def test_a_killed_worker_and_a_cut_connection_change_nothing(tmp_path):
-    (tmp_path / "study.toml").write_text(SWEEP.format(starts=5))
+    (tmp_path / "study.toml").write_text(SWEEP.format(starts=8))
     flights = tmp_path / "there" / "flights.jsonl"
     with processes(tmp_path) as (port, workers), ThreadPoolExecutor(1) as beside:
         wire = Wire(port)
@@ -339,4 +339,4 @@ def test_a_killed_worker_and_a_cut_connection_change_nothing(tmp_path):
     retrim("sweep", "study.toml", "--out", "here", cwd=tmp_path)
     assert rows(tmp_path / "there") == rows(tmp_path / "here")
     keys = [json.loads(line)["key"] for line in flights.read_text().splitlines()]
-    assert len(keys) == len(set(keys)) == 60
+    assert len(keys) == len(set(keys)) == 2 * 2 * 2 * 8
