@@ -4,6 +4,8 @@ import numpy as np
 
 from retrim import Log, Scenario
 from retrim.experiments import Flight, FlightSpec
+from retrim.experiments.gathering import Flights
+from retrim.experiments.tables.study import Study
 from retrim.runtime.flight import States
 
 DT = 0.02
@@ -22,3 +24,31 @@ def flight(error, *, spec=None, flown=None, steady_seconds=2.0, cross=None, **of
     error = np.broadcast_to(np.asarray(error, dtype=float), flown.t.shape)
     spec = FlightSpec(Scenario("large"), "base", 0) if spec is None else spec
     return Flight(spec, "small", flown, error, "steady_error_m", steady_seconds, cross)
+
+
+class Imaginary:
+    """In the place of training and flying: what was asked, and flights of made-up errors."""
+
+    def __init__(self, error):
+        """``error`` of a specification [m]: a number, one for each row of the log, or None for a crash."""
+        self._error, self.trained, self.flown, self.flights = error, [], [], []
+
+    def train(self, preset, seeds, run, reporter):
+        self.trained.append((preset, tuple(seeds)))
+        return Study(preset, {seed: f"policy {seed}" for seed in seeds}, tuple(0.001 * (1 + s) for s in seeds))
+
+    def fly(self, study, scenarios, run, reporter, *, methods=("base", "full"), starts, seconds):
+        self.flown.append((study, tuple(scenarios), tuple(methods), starts, seconds))
+        specs = [
+            FlightSpec(scenario, method, start, seed)
+            for scenario in scenarios for method in methods for seed in study.policies for start in range(starts)
+        ]  # fmt: skip
+        found = [self._one(spec, seconds) for spec in specs]
+        self.flights += found
+        return Flights(found, interrupted=False)
+
+    def _one(self, spec, seconds):
+        error = self._error(spec)
+        if error is None:
+            return flight(3.0, spec=spec, seconds=2.0, terminated=True)
+        return flight(error, spec=spec, seconds=seconds)
