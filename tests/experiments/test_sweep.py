@@ -4,10 +4,17 @@ import json
 import signal
 import time
 
+import jax
 import pytest
 
 from commands import OVERLAY, results, retrim, started
-from retrim import Scenario
+from helpers import brief_preset
+from made_up import flight
+from retrim import Fleet, Scenario, Setup
+from retrim.experiments import FlightSpec, Run, sweep
+from retrim.experiments.gathering import Flights
+from retrim.experiments.metrics import record
+from retrim.experiments.reporter import Silent
 from retrim.experiments.sweep import Sweep
 
 pytestmark = pytest.mark.usefixtures("as_a_user")
@@ -56,9 +63,7 @@ def test_a_sweep_leaves_a_table_json_a_picture_policies_and_rows(folder):
 
 
 def test_a_killed_sweep_goes_on_to_the_same_rows(folder):
-    process = started(
-        ("sweep", "sweep.toml", "--out", "cut"), folder, setup="import retrim.experiments.sweep as s\ns.BATCH = 2"
-    )
+    process = started(("sweep", "sweep.toml", "--out", "cut"), folder)
     deadline = time.monotonic() + 180
     while not flown(folder / "cut") and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.002)
@@ -103,3 +108,71 @@ def test_a_sweep_is_every_combination():
     found = sweep.scenarios()
     assert len(set(found)) == 8
     assert Scenario("wind", "simple", None, "mocap") in found
+
+
+def test_a_report_has_a_row_for_each_combination_and_bars_for_each_flight(tmp_path, monkeypatch):
+    """Crashes are infinite in the bars and counted in the cells; a flight that failed elsewhere is in no bar."""
+    shown = []
+
+    def draw(title, groups):
+        shown.append(groups)
+
+    monkeypatch.setattr(sweep, "bars", draw)
+    monkeypatch.setattr(sweep, "save", lambda figure, folder, stem: (folder / f"{stem}.png", folder / f"{stem}.svg"))
+    asked = Sweep(seeds=(0, 1), methods=("base", "indi"), disturbances=("none", "large"), starts=2)
+    kept = []
+    for scenario in asked.scenarios():
+        for method in asked.methods:
+            for k, error in enumerate((0.1, 0.2, 0.4, 0.1 if scenario.disturbance == "none" else None)):
+                spec = FlightSpec(scenario, method, k % 2, k // 2)
+                crashed = method == "base" and error is None
+                row = record(flight(0.1 if error is None else error, spec=spec, terminated=crashed))
+                row |= {"error": error}  # a mean is one to rounding
+                if method == "indi" and error is None:
+                    row |= {"failed": "OSError: gone"}
+                kept.append({"preset": "p", **row})
+    found = sweep._report(asked, kept, Run("test", tmp_path), Silent())
+    assert [(row["disturbance"], row["method"], row["n"], row["crashes"]) for row in found] == [
+        ("none", "base", 4, 0), ("none", "indi", 4, 0), ("large", "base", 4, 1), ("large", "indi", 4, 0)
+    ]  # fmt: skip
+    text = (tmp_path / "sweep.md").read_text()
+    assert "| disturbance | method | mean ± std [m] | median [m] | maximum [m] |" in text
+    assert "| none | base | 0.200 ± 0.141 | 0.150 | 0.400 |" in text
+    assert "| large | base | 0.233 ± 0.153, 1 of 4 crashed | 0.300 | crashed |" in text
+    assert "| large | indi | 0.233 ± 0.153, 1 of 4 failed | 0.200 | 0.400 |" in text
+    assert results(tmp_path, "sweep.json")["rows"] == found
+    (bars,) = shown
+    assert bars == {
+        "none": {"base": [0.1, 0.2, 0.4, 0.1], "indi": [0.1, 0.2, 0.4, 0.1]},
+        "large": {"base": [0.1, 0.2, 0.4, float("inf")], "indi": [0.1, 0.2, 0.4]},
+    }
+    one = [row for row in kept if row["disturbance"] == "large"]
+    sweep._report(asked, one, Run("test", tmp_path), Silent())
+    assert list(shown[1]) == ["large"]  # where nothing varies, the disturbance is the label
+
+
+def test_what_failed_elsewhere_is_kept_and_flown_again(tmp_path, monkeypatch):
+    """The others of a sweep land; the run's exit code says that some did not."""
+    preset, said = brief_preset(), []
+    policies = {0: Setup.of(preset).new_policy(jax.random.key(0))}
+    fleet = Fleet(preset, policies, [Scenario(plant="simple")], methods=("base",), starts=2, seconds=1.2)
+    kept = sweep._Kept(tmp_path / "flights.jsonl")
+    reporter, run = Silent(), Run("test", tmp_path)
+    reporter.say = said.append
+    asked = []
+
+    def flies(executor, *, stop, only, landed, progress, by_lot, forget):
+        asked.append((executor, list(only), by_lot, forget))
+        landed([flight(0.1, spec=spec) for spec in only[:1]])
+        return Flights([], interrupted=False, failed=dict.fromkeys(only[1:], "OSError: gone"))
+
+    monkeypatch.setattr(fleet, "run", flies)
+    sweep._fly(fleet, kept, run, reporter)
+    assert (run.failed, run.exit_code) == (True, 1)
+    assert said == ["1 flights failed elsewhere, the first by OSError: gone; the same command flies them"]
+    rows = [json.loads(line) for line in flown(tmp_path)]
+    assert [(row["start"], row["failed"], row["preset"], row["vehicle"]) for row in rows] == [
+        (0, None, preset.name, "small"), (1, "OSError: gone", preset.name, "small")
+    ]  # fmt: skip
+    sweep._fly(fleet, sweep._Kept(tmp_path / "flights.jsonl"), run, reporter)
+    assert asked == [(None, fleet.specs, True, True), (None, fleet.specs[1:], True, True)]
