@@ -259,3 +259,29 @@ def test_vision_flies_what_a_preset_can(tmp_path):
     assert "--methods datt: it is trained by a measured state" in said
     said = retrim("reproduce", "vision", "--presets", "vision/paper", "--methods", "indi", cwd=tmp_path, code=1)
     assert "method 'indi' needs the state, and preset 'vision/paper' shows keypoints" in said
+
+
+def test_re_training_goes_on_from_chunk_to_chunk_and_forgets_the_first(monkeypatch):
+    """Which compiles: what it came to is not kept, and its time is told apart."""
+    setup = Setup.of(tiny_preset())
+    policy = setup.new_policy(random.key(0))
+    logs = design.flown(setup, policy, 2, 1.0, 0)
+    asked = []
+
+    def chunk(state, env, key, optimiser, updates, envs):
+        asked.append((state, env, random.key_data(key).tolist(), updates, envs))
+        moved = jax.tree.map(lambda leaf: leaf + 1.0, state.policy.params)
+        return design.PolicyState(state.policy.with_params(moved), state.optimiser), jnp.zeros(updates)
+
+    monkeypatch.setattr(design, "train_chunk", chunk)
+    made = design.retrained(setup, policy, logs, random.key(1), design.CHOICES["low fidelity, res-fwd"],
+                            fit_epochs=5, epochs=30, envs=6)  # fmt: skip
+    assert [(updates, envs) for *_, updates, envs in asked] == [(design.CHUNK, 6)] * 4
+    assert len({tuple(key) for _, _, key, *_ in asked}) == 4
+    begins = [float(state.policy.layers[0].weight[0, 0] - policy.layers[0].weight[0, 0]) for state, *_ in asked]
+    np.testing.assert_allclose(begins, [0.0, 0.0, 1.0, 2.0], atol=1e-6)
+    assert float(made.policy.layers[0].weight[0, 0] - policy.layers[0].weight[0, 0]) == pytest.approx(3.0, abs=1e-6)
+    assert len(made.epoch_s) == 3
+    assert all(0.0 < seconds < 1.0 for seconds in made.epoch_s)
+    env = asked[0][1]
+    assert (env.task, env.delay_ticks) == (setup.env.task, setup.env.delay_ticks)

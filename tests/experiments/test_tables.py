@@ -7,6 +7,7 @@ import inspect
 from functools import partial
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -209,6 +210,53 @@ def test_datt_is_trained_once_for_a_folder(tmp_path, monkeypatch):
     assert len(list(tmp_path.glob("datt_*_seed0.safetensors"))) == 2
     with pytest.raises(ConfigError, match=r"DATT looks ahead in steps of 0\.06 s, which must be whole control periods"):
         rivals.check_rival(changed(preset, dt=0.025))
+
+
+def test_a_network_of_datt_is_of_its_vehicle_its_lag_its_steps_and_its_seed(tmp_path, monkeypatch):
+    """Another of these is another file; what is learnt goes on from update to update."""
+    monkeypatch.setattr(provenance, "commit", lambda: "abc")
+    preset, told, asked = load("hover/retrim"), [], []
+
+    class Watching(Silent):
+        def progress(self, title):
+            return contextlib.nullcontext(lambda share, text: told.append((share, text)))
+
+    def ppo(problem, net, key, settings, *, steps):
+        asked.append((problem, tuple(jax.random.key_data(key).tolist()), steps))
+        for i in range(settings.updates(steps)):
+            net = jax.tree.map(lambda leaf: leaf + 1.0 if eqx.is_array(leaf) else leaf, net)
+            yield net, {"reward": i}
+
+    monkeypatch.setattr(rivals, "ppo", ppo)
+    size = rivals.DATT_PPO["envs"] * rivals.DATT_PPO["steps"]
+
+    def weights(net):
+        return jax.tree.leaves(eqx.filter(net, eqx.is_array))
+
+    def train(preset=preset, seeds=(0,), steps=2 * size):
+        return rivals.trained_datt(preset, seeds, Run("test", tmp_path), Watching(), steps=steps)
+
+    nets = train(seeds=(0, 3))
+    assert told == [(0.5, "reward 0.000"), (1.0, "reward 1.000")] * 2
+    assert [steps for *_, steps in asked] == [2 * size] * 2
+    assert asked[0][1] != asked[1][1]
+    assert any(np.any(a != b) for a, b in zip(weights(nets[0]), weights(nets[3]), strict=True))
+    others = changed(preset, vehicle="large"), changed(preset, dt=0.01), changed(preset, actuator_tau=0.2)
+    for other in others:
+        train(other)
+    train(steps=size)
+    assert len(list(tmp_path.glob("datt_*_seed0.safetensors"))) == 5
+    assert len(list(tmp_path.glob("datt_*_seed3.safetensors"))) == 1
+    np.testing.assert_array_equal(asked[2][0].high.c, Setup.of(others[0]).vehicle.command_max.c)
+    assert asked[3][0].dt == 0.01
+    before = len(asked)
+    again = train(seeds=(0, 3))
+    assert len(asked) == before
+    for one, other in zip(weights(again[3]), weights(nets[3]), strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert rivals.steps_made(1) == size
+    assert rivals.steps_made(2 * size) == 2 * size
+    assert rivals.steps_made(2 * size + 1) == 3 * size
 
 
 @pytest.mark.usefixtures("small_datt")
