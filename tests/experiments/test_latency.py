@@ -1,0 +1,188 @@
+"""The other ends of the buses whose latency is measured: what is sent, where, and that nothing is left behind."""
+
+import itertools
+import os
+import socket
+import subprocess
+import sys
+import time
+from types import SimpleNamespace
+
+import pytest
+
+from retrim.experiments import compile_cache, latency, provenance
+from retrim.transport.bus import Bus
+
+MASTER = """#!{python}
+import socket, sys, time
+time.sleep(0.3)
+assert sys.argv[1] == "--core"
+server = socket.create_server(("127.0.0.1", int(sys.argv[sys.argv.index("-p") + 1])))
+time.sleep(60)
+"""
+
+
+class Sent(Bus):
+    """What was published, and when."""
+
+    closed = False
+
+    def __init__(self):
+        self.sent = []
+
+    def publish(self, topic, data):
+        self.sent.append((topic, data, time.monotonic_ns()))
+
+    def latest(self, topic, after=0):
+        return None
+
+    def close(self):
+        self.closed = True
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    for name, value in (("COUNT", 3), ("FIRST", 2), ("EVERY", 0.01), ("JOINED", 0.05)):
+        monkeypatch.setattr(latency, name, value)
+
+
+def test_messages_carry_their_number_and_when_they_were_sent(quick):
+    bus = Sent()
+    began = time.monotonic_ns()
+    latency.write(bus, 100)
+    assert [topic for topic, *_ in bus.sent] == ["message"] * 5  # those that do not count, too
+    assert {len(data) for _, data, _ in bus.sent} == {100}
+    assert [int.from_bytes(data[:8], "little") for _, data, _ in bus.sent] == [0, 1, 2, 3, 4]
+    stamps = [int.from_bytes(data[8:16], "little") for _, data, _ in bus.sent]
+    assert stamps[0] - began > 0.05e9  # both ends find each other first
+    for stamp, (*_, sent) in zip(stamps, bus.sent, strict=True):
+        assert 0 <= sent - stamp < 0.5e9
+    assert all(b - a > 0.009e9 for a, b in itertools.pairwise(stamps))
+
+
+@pytest.mark.parametrize("where", ["/tmp/some/folder", "zenoh:127.0.0.1:7447"])
+def test_the_other_process_joins_the_bus_that_it_is_told_and_leaves_it(where, monkeypatch):
+    bus, asked = Sent(), []
+
+    class Address:
+        @staticmethod
+        def of(text):
+            asked.append(text)
+            return Address()
+
+        def join(self, topics, *, listen):
+            asked.append((topics, listen))
+            return bus
+
+    def folder(path):
+        asked.append(str(path))
+        return bus
+
+    def write(one, size):
+        assert one is bus
+        asked.append(size)
+        raise RuntimeError("cut")
+
+    monkeypatch.setattr(latency, "Address", Address)
+    monkeypatch.setattr(latency, "SharedMemoryBus", folder)
+    monkeypatch.setattr(latency, "write", write)
+    monkeypatch.setattr(sys, "argv", ["latency", where, "500"])
+    with pytest.raises(RuntimeError, match="cut"):
+        latency.main()
+    assert bus.closed
+    assert asked == ([where, 500] if "/" in where else [where, (latency.TOPICS, False), 500])
+
+
+def test_a_rosmaster_answers_before_it_is_used_and_is_gone_afterwards(tmp_path, monkeypatch):
+    program = tmp_path / "rosmaster"
+    program.write_text(MASTER.format(python=sys.executable))
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with latency.rosmaster() as address:
+        assert (address.kind, address.host) == ("ros", "127.0.0.1")
+        socket.create_connection(("127.0.0.1", address.port), 1.0).close()
+    with pytest.raises(OSError, match="refused"):
+        socket.create_connection(("127.0.0.1", address.port), 1.0)
+    program.unlink()
+    with latency.rosmaster() as nobody:
+        assert nobody is None
+
+
+@pytest.mark.parametrize("allowed", [True, False])
+def test_two_machines_are_namespaces_with_a_cable_that_are_taken_away(allowed, monkeypatch):
+    ran = []
+
+    def run(words, **_):
+        ran.append(" ".join(words))
+        return subprocess.CompletedProcess(words, 0 if allowed else 1)
+
+    monkeypatch.setattr(latency.shutil, "which", lambda name: f"/sbin/{name}")
+    monkeypatch.setattr(latency.subprocess, "run", run)
+    name = f"retrim{os.getpid()}"
+    with latency.two_machines() as machines:
+        if not allowed:
+            assert machines is None
+            assert len(ran) == 1  # the rest is not tried
+        else:
+            host, inside = machines
+            assert " ".join(inside) == f"ip netns exec {name}"
+            assert any(words.startswith(f"ip addr add {host}/24 dev ") for words in ran)
+            there = [words for words in ran if words.startswith(f"ip netns exec {name} ip link set")]
+            assert len(there) == 2  # the cable's end, and its own loopback
+    assert ran[-1] == f"ip netns del {name}"
+    monkeypatch.setattr(latency.shutil, "which", lambda name: None)
+    ran.clear()
+    with latency.two_machines() as machines:
+        assert machines is None
+    assert ran == []
+
+
+@pytest.mark.parametrize("off", ["", "0"])
+def test_programs_are_kept_in_the_user_s_cache_unless_it_is_off(off, tmp_path, monkeypatch):
+    """And a folder that cannot be made is a warning."""
+    told = {}
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv("RETRIM_COMPILE_CACHE", off)
+    config = SimpleNamespace(values={"jax_compilation_cache_dir": None}, update=told.__setitem__)
+    monkeypatch.setattr(compile_cache, "jax", SimpleNamespace(config=config, __version__="1.2"))
+    found = compile_cache.enable_compile_cache()
+    if off:
+        assert (found, told) == (None, {})
+        return
+    assert found == tmp_path / "retrim" / "jax-1.2"
+    assert found.is_dir()
+    assert told["jax_compilation_cache_dir"] == str(found)
+    assert told["jax_persistent_cache_min_compile_time_secs"] == 0.0
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    with pytest.warns(UserWarning, match="no compile cache"):
+        assert compile_cache.enable_compile_cache() is None
+
+
+def test_a_commit_is_that_of_the_checkout_and_tells_local_changes(monkeypatch):
+    said = {"rev-parse --short=12 HEAD": "abc", "status --porcelain": ""}
+
+    def run(words, **_):
+        asked = " ".join(words[3:])
+        root = str(provenance.Path(provenance.__file__).resolve().parents[3])
+        if asked == "rev-parse --show-toplevel":
+            return subprocess.CompletedProcess(words, 0, stdout=f"{root if 'elsewhere' not in said else '/'}\n")
+        return subprocess.CompletedProcess(words, 0, stdout=f"{said[asked]}\n")
+
+    monkeypatch.setattr(provenance.subprocess, "run", run)
+    asked = provenance.commit.__wrapped__
+    assert asked() == "abc"
+    said["status --porcelain"] = " M file"
+    assert asked() == "abc-dirty"
+    said["elsewhere"] = ""
+    assert asked() == "unknown"  # a checkout of something else around an installed package
+
+    def nothing(*_, **__):
+        raise FileNotFoundError("git")
+
+    monkeypatch.setattr(provenance.subprocess, "run", nothing)
+    assert asked() == "unknown"
+    monkeypatch.setattr(provenance, "commit", lambda: "abc-dirty")
+    assert not provenance.is_committed()
+    monkeypatch.setattr(provenance, "commit", lambda: "abc")
+    assert provenance.is_committed()
