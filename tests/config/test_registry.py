@@ -257,3 +257,9 @@ def test_ones_own_reference(mine):
     np.testing.assert_allclose(setup.flown.reference(jnp.array(2.0)).p, [0.0, 0.0, 1.2], atol=1e-6)
     with pytest.raises(ConfigError, match=r"reference 'circle': a hover policy follows none"):
         Setup.of(tiny_preset(), "circle")
+    with pytest.raises(ConfigError, match=rf"reference '{mine}:no_vehicle' is a str, not a function that gives"):
+        make_reference(f"{mine}:no_vehicle")
+    with pytest.raises(ConfigError, match=rf"reference {mine}:no_task: "):
+        make_reference(f"{mine}:no_task")
+    with pytest.raises(ConfigError, match=r"nowhere\.csv: No such file or directory"):
+        make_reference("nowhere.csv")

@@ -1,0 +1,82 @@
+"""Methods by name: whom they fly for, and whom they refuse."""
+
+import jax.numpy as jnp
+import pytest
+from jax import random
+
+from helpers import brief_preset
+from retrim import ConfigError, Setup, load
+from retrim.config.methods import METHODS, MethodRequest, find_method
+from retrim.control.passive import Passive
+from retrim.control.seen_pose import SeenPose
+from retrim.plants.plant import Measurement
+
+
+@pytest.fixture(scope="module")
+def seeing():
+    """Set-ups whose policies see keypoints: with a pose filter, and without."""
+    return {name: Setup.of(brief_preset(f"vision/{name}")) for name in ("retrim", "ideal")}
+
+
+@pytest.mark.parametrize(
+    ("name", "method", "message"),
+    [
+        (
+            "retrim",
+            "base-i",
+            "method 'base-i' shifts the measured position; a policy that sees keypoints is shown none",
+        ),
+        ("ideal", "base-i", "method 'base-i' shifts the measured position"),
+        ("retrim", "raptor", "method 'raptor' needs the measured state; a policy that sees keypoints is shown none"),
+        (
+            "ideal",
+            "indi",
+            r"method 'indi' needs the state, and preset 'vision/ideal' shows keypoints.*occlusion = true",
+        ),
+        ("retrim", "datt", "method 'datt' flies a network of its own: `retrim reproduce hover --methods datt` trains"),
+    ],
+)
+def test_methods_that_need_what_keypoints_do_not_give_are_refused(seeing, name, method, message, key):
+    setup = seeing[name]
+    with pytest.raises(ConfigError, match=message) as error:
+        setup.pilot(setup.new_policy(key), method, key)
+    assert "\n" not in str(error.value)
+
+
+def test_a_controller_flies_by_the_pose_that_the_filter_sees(seeing, key):
+    setup = seeing["retrim"]
+    pilot = setup.pilot(setup.new_policy(key), "indi", key)
+    assert type(pilot.controller) is SeenPose
+    pilot.reset(Measurement(0.0, setup.flight_starts(1)[0]))
+    plain = Setup.of(brief_preset()).pilot(None, "indi", key)
+    assert type(plain.controller) is not SeenPose
+    own = Passive()
+    assert MethodRequest(Setup.of(brief_preset()), None).by_state(own) is own
+    with pytest.raises(ConfigError, match="method 'Passive' needs the state"):
+        MethodRequest(seeing["ideal"], None).by_state(own)
+
+
+@pytest.mark.parametrize("method", ["full", "lora"])
+def test_a_method_that_learns_needs_a_key(method):
+    setup = Setup.of(brief_preset(pretrain={"hidden_sizes": (16, 16)}))
+    with pytest.raises(ValueError, match="a method that learns needs a key"):
+        setup.pilot(setup.new_policy(random.key(0)), method)
+
+
+def test_every_method_has_a_label_of_its_own_and_only_raptor_is_on_board():
+    labels = [find_method(name).label for name in METHODS]
+    assert len(set(labels)) == len(labels)
+    assert [name for name in METHODS if find_method(name).on_board is not None] == ["raptor"]
+    with pytest.raises(ConfigError, match=r"method 'math:pi' is a float, not a retrim\.config\.MethodEntry"):
+        find_method("math:pi")
+
+
+def test_a_low_rank_delta_is_drawn_from_the_key_and_kept_where_there_is_one(key):
+    setup = Setup.of(load("hover/retrim"))
+    policy = setup.new_policy(key)
+    one, same, other = (setup.low_rank(policy, random.key(seed)).delta[0].down for seed in (1, 1, 2))
+    assert jnp.array_equal(one, same)
+    assert not jnp.array_equal(one, other)
+    has_one = setup.low_rank(policy, key)
+    assert setup.low_rank(has_one, random.key(3)) is has_one
+    assert setup.pilot(policy).dt == setup.preset.dt
