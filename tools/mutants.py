@@ -47,8 +47,12 @@ SWAPS: dict[type, type] = {
 }  # fmt: skip
 TEXT = (ast.JoinedStr, ast.Raise, ast.AnnAssign, ast.arguments)
 """Nodes below which nothing is planted: messages and annotations."""
-QUIET = {"strict", "check", "maxsize", "capture_output", "color", "dashed", "marks"}
+LOOKS = {"color", "dashed", "marks", "columns", "across"}
+"""Keywords of how a picture looks; nothing is planted in their values either."""
+QUIET = {"strict", "check", "maxsize", "capture_output"} | LOOKS
 """Keywords that change nothing where the rest is right, or only how a picture looks."""
+EITHER_WAY = {"min", "max", "minimum", "maximum"}
+"""Functions whose arguments may be exchanged."""
 
 
 class Mutant(NamedTuple):
@@ -195,6 +199,8 @@ def _sites(node: ast.AST, statement: int) -> Iterator[tuple[int, ast.AST]]:
     """Nodes where a fault changes what is computed, rather than a text, and the first lines of their statements."""
     if isinstance(node, TEXT) or (isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)):
         return
+    if isinstance(node, ast.keyword) and node.arg in LOOKS:
+        return
     statement = node.lineno if isinstance(node, ast.stmt) else statement
     yield statement, node
     for child in ast.iter_child_nodes(node):
@@ -221,7 +227,8 @@ def _changes(node: ast.AST, *, numbers: bool) -> Iterator[tuple[str, object]]:
         for k, keyword in enumerate(node.keywords):
             if keyword.arg is not None and keyword.arg not in QUIET:
                 yield f"without {keyword.arg}=", lambda n, k=k: n.keywords.pop(k)
-        if len(node.args) >= 2 and not any(isinstance(a, ast.Starred) for a in node.args):
+        called = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
+        if len(node.args) >= 2 and called not in EITHER_WAY and not any(isinstance(a, ast.Starred) for a in node.args):
             yield f"arguments of {ast.unparse(node.func)} exchanged", lambda n: n.args.insert(0, n.args.pop(1))
 
 

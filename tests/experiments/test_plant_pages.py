@@ -44,6 +44,9 @@ def test_thrust_and_inflow_lie_on_published_points():
     assert np.all(np.diff(ours.y) > 0)
     np.testing.assert_allclose(at(theirs, points.x), points.y, rtol=0.05)
     np.testing.assert_allclose(at(ours, points.x), points.y, rtol=0.03)
+    np.testing.assert_array_equal(ours.x, theirs.x)
+    np.testing.assert_allclose(ours.y / ours.x**2, ours.y[-1] / ours.x[-1] ** 2, rtol=1e-3)  # in still air
+    np.testing.assert_allclose(theirs.y / theirs.x**2, 1.562522e-6)
     inflow = curves(model.inflow_panel())
     ruled, plain = inflow["with the vortex-ring rule"], inflow["momentum theory alone"]
     exact = inflow["fine quadrature, bracketing search"]
@@ -60,6 +63,9 @@ def test_drag_grows_with_speed_and_most_of_it_is_the_rotors():
         assert np.all(np.diff(whole.y) > 0)
         assert np.all(whole.y[1:] >= rotors.y[1:] - 1e-6)
         assert at(rotors, 3.0) > 0.5 * at(whole, 3.0)
+        body, fast = (at(whole, v) - at(rotors, v) for v in (5.0, 10.0))
+        assert fast == pytest.approx(4.0 * body, rel=0.01)  # by the square of the speed
+        np.testing.assert_allclose((whole.x[0], whole.x[-1]), (0.0, 10.0))
     assert at(found["kingfisher: rotors"], 3.0) == pytest.approx(
         at(found["kingfisher, published: 0.24 1/s"], 3.0), rel=0.15
     )
@@ -76,12 +82,15 @@ def test_steps_are_answered_and_a_battery_sags():
         assert at(yaw, 50.0) < at(roll, 50.0)  # drag turns a body less than thrust does
     thrust = curves(model.step_panel())
     for name in model.VEHICLES:
+        assert (thrust[name].x[0], thrust[name].x[-1]) == (2.0, 300.0)  # [ms]
         assert thrust[name].y[0] < 1.0
         assert thrust[name].y[-1] == pytest.approx(at(thrust["commanded"], 300.0), rel=0.1)
     (sag,) = model.sag_panel().curves
     assert sag.y[0] == pytest.approx(0.0, abs=0.4)
     assert np.all(np.diff(sag.y[sag.x <= 100.0]) < 0)
     np.testing.assert_allclose(sag.y[sag.x >= 100.0], sag.y[-1], atol=1e-4)
+    assert (sag.x[0], sag.x[-1]) == (0.0, 120.0)
+    assert sag.y[-1] - sag.y[0] == pytest.approx(-0.2 * 9.81, rel=0.1)  # a fifth less thrust
 
 
 def test_the_model_s_page_has_each_figure_and_its_deviation(tmp_path, monkeypatch):
