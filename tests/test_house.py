@@ -59,6 +59,19 @@ def test_files_are_small_and_have_no_junk_drawers(path):
     assert ast.get_docstring(ast.parse(text)) or not text.strip()
 
 
+CHANGING = {"Document", "Fallback", "FleetProcess", "FlownError", "GeometricHover", "Status", "Supervisor"}
+"""Dataclasses that change: a page that grows, what watches processes, and what flies on board without JAX."""
+
+
+def test_values_are_frozen():
+    """Every dataclass but those that are no values; an ``equinox.Module`` is frozen by itself."""
+    for path in SOURCES:
+        for node in ast.walk(ast.parse(path.read_text())):
+            for how in getattr(node, "decorator_list", ()):
+                if re.match(r"(dataclasses\.)?dataclass\b", ast.unparse(how)) and node.name not in CHANGING:
+                    assert "frozen=True" in ast.unparse(how), f"{path.relative_to(HOUSE)}: {node.name}"
+
+
 @pytest.mark.parametrize("room", ROOMS)
 def test_no_room_outgrows_the_house(room):
     mine = lines((HOUSE / room).rglob("*.py"))
