@@ -140,6 +140,20 @@ def test_every_group_of_plants_is_a_scenario_that_can_be_made():
     assert len({title for title, *_ in plants.groups()}) == len(plants.groups())
 
 
+def test_a_group_of_plants_is_what_its_title_says():
+    found = {title: scenario for title, scenario, _ in plants.groups()}
+    said = {
+        "on the large one": {"vehicle": "large"}, "on the kingfisher": {"vehicle": "kingfisher"},
+        "map exact": {"thrust_error": 0.0}, "3.5 % below": {"thrust_error": -0.035},
+        "10.5 % above": {"thrust_error": 0.105}, "mocap sensors": {"sensors": "mocap"},
+        "rough sensors": {"sensors": "rough"},
+    }  # fmt: skip
+    for title, scenario in found.items():
+        (differs,) = [more for words, more in said.items() if words in title] or [{}]
+        assert scenario == Scenario(plant=scenario.plant, **differs), title
+    assert all(any(words in title for title in found) for words in said)
+
+
 def test_a_push_that_reverses_by_its_command(tmp_path, monkeypatch):
     monkeypatch.setitem(presets.PRESETS, "hover/retrim", brief_preset())
     monkeypatch.setattr(reversing, "PERIOD", 1.0)

@@ -353,7 +353,7 @@ def test_errors_are_read_around_reversals_and_updates(tmp_path):
     np.testing.assert_allclose(_errors(ramp, often, 0.5), often - 0.24, atol=1e-9)
 
 
-@pytest.mark.parametrize("name", ["hover", "track", "phase", "vision", "fast", "transfer"])
+@pytest.mark.parametrize("name", ["hover", "track", "phase", "vision", "fast", "transfer", "raptor"])
 def test_a_table_flies_what_it_was_asked_to(name, tmp_path, monkeypatch):
     """Plant, methods, seeds, starts, length: nothing is lost between an option and a flight."""
     table = importlib.import_module(f"{TABLES}.{name}")
@@ -361,10 +361,10 @@ def test_a_table_flies_what_it_was_asked_to(name, tmp_path, monkeypatch):
     monkeypatch.setattr(
         table, "fly_levels", lambda document, sections, **how: planned.append((document, sections, how))
     )
-    asked = {"plant": "simple", "methods": ("indi",), "seeds": (3, 4), "starts": 2, "seconds": 7.0}
+    asked = {"methods": ("indi",), "seeds": (3, 4), "starts": 2, "seconds": 7.0}
     made = getattr(table, name)
-    if "datt_steps" in inspect.signature(made).parameters:
-        asked["datt_steps"] = 5
+    options = inspect.signature(made).parameters
+    asked |= {key: value for key, value in (("plant", "simple"), ("datt_steps", 5)) if key in options}
     made(Run("test", tmp_path), Silent(), **asked)
     assert planned
     for document, sections, how in planned:
@@ -373,9 +373,24 @@ def test_a_table_flies_what_it_was_asked_to(name, tmp_path, monkeypatch):
         assert sections
         assert len({section.stem for section in sections}) == len(sections)  # no picture is written over
         for section in sections:
-            assert {scenario.plant for scenario in section.scenarios} == {"simple"}
+            assert {scenario.plant for scenario in section.scenarios} == {asked.get("plant", "bem")}
             assert tuple(section.methods) in (("indi",), ())
         assert any(section.methods for section in sections)
+
+
+def test_raptor_flies_beside_policies_that_were_trained_for_its_vehicles(tmp_path, monkeypatch):
+    table, planned = importlib.import_module(f"{TABLES}.raptor"), []
+    monkeypatch.setattr(table, "fly_levels", lambda document, sections, **how: planned.extend(sections))
+    table.raptor(Run("test", tmp_path), Silent(), vehicles=("kingfisher", "large"))
+    assert [(s.preset.vehicle, s.preset.task, s.scenario.reference) for s in planned] == [
+        (vehicle, task, reference)
+        for vehicle in ("kingfisher", "large") for task, reference in (("hover", None), ("track", "figure8"))
+    ]  # fmt: skip
+    for section in planned:
+        assert tuple(section.methods) == table.METHODS
+        assert section.levels == table.DISTURBED
+        assert section.drawn == ("raptor", "full")
+        assert section.title.endswith(section.preset.vehicle)
 
 
 def test_many_machines_are_limited_by_flying_then_by_the_network_then_by_the_scheduler():
