@@ -1,8 +1,6 @@
 """What a command is asked for reaches the preset and the scenario; what does not fit is refused."""
 
 import dataclasses
-import importlib.util
-import sys
 from pathlib import Path
 
 import pytest
@@ -91,25 +89,7 @@ def test_where_a_flight_takes_place_is_its_scenario():
     assert Where(plant="mavlink:udp:127.0.0.1:14550").scenario(load("hover/fast")).disturbance == "none"
 
 
-@pytest.mark.parametrize(
-    ("plant", "package"),
-    [("rotorpy", "rotorpy"), ("mujoco", "mujoco"), ("crazyflow", "crazyflow"), ("mavlink", "pymavlink")],
-)
-def test_a_plant_whose_package_is_missing_is_refused_where_it_is_asked_for(plant, package, monkeypatch):
-    """Before anything is trained, and without the time that an import takes."""
-    find = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *_: None if name == package else find(name))
-    with pytest.raises(PlantError, match=f"plant '{plant}' needs the package '{package}'"):
-        Where("none", plant).scenario(load("hover/fast"))
-
-
-def test_a_vehicle_behind_ros_needs_ros(monkeypatch):
-    monkeypatch.setitem(sys.modules, "rospy", None)
-    with pytest.raises(ConfigError, match="ROS 1 needs rospy from the system: apt install python3-rospy"):
-        Where("none", "ros").scenario(load("hover/fast"))
-
-
-def test_betaflight_needs_its_firmware(monkeypatch):
+def test_a_plant_whose_package_is_missing_is_refused_where_it_is_asked_for(monkeypatch):
     monkeypatch.setenv("RETRIM_BETAFLIGHT", "/nowhere/board")
     with pytest.raises(PlantError, match="RETRIM_BETAFLIGHT=/nowhere/board: no program that could be run"):
         Where("none", "betaflight").scenario(load("hover/fast"))

@@ -12,10 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import made_up
 from helpers import brief_preset, tiny_preset
-from retrim import ConfigError, Fleet, Scenario, Setup, enable_compile_cache, load
+from retrim import ConfigError, Fleet, PlantError, Scenario, Setup, enable_compile_cache, load
 from retrim.config.loading import dump
-from retrim.experiments import flying, gathering, lots
+from retrim.experiments import fleet as fleet_module
+from retrim.experiments import flying, gathering, jobs, lots
 from retrim.experiments.jobs import setup_for
 from retrim.physics import State
 
@@ -188,13 +190,10 @@ def test_an_interruption_keeps_what_was_flown(fleet, by):
 
 
 def test_a_plant_that_fails_ends_the_fleet(fleet, monkeypatch):
-    from retrim import PlantError
-    from retrim.experiments import fleet as module
-
     def broken(setup, policy, spec, *rest, **more):
         raise PlantError(f"no plant for {spec.method}")
 
-    monkeypatch.setattr(module, "fly_one", broken)
+    monkeypatch.setattr(fleet_module, "fly_one", broken)
     with ThreadPoolExecutor(1) as pool, pytest.raises(PlantError, match="no plant for"):
         fleet.run(pool)
 
@@ -246,3 +245,30 @@ def test_a_crash_says_why(fleet, off, why):
         assert flight.events[-1].kind == "terminated"
         assert flight.events[-1].t == pytest.approx(flight.log.t[-1])
         assert re.search(why, flight.events[-1].note)
+
+
+def test_what_was_learnt_before_reaches_every_flight(monkeypatch):
+    """Flown by itself, in a lot, or as a job elsewhere."""
+    preset, told = brief_preset(), []
+    setup = Setup.of(preset)
+    policy = setup.new_policy(jax.random.key(0))
+    state = setup.learner.init(policy, jax.random.key(1))
+    fleet = Fleet(preset, policy, SCENARIOS[:1], methods=("full",), starts=3, seconds=1.2, state=state)
+
+    def flies(kind, answer):
+        def flown(*_, state=None, **__):
+            told.append((kind, state))
+            return answer
+
+        return flown
+
+    monkeypatch.setattr(lots, "LOT", 2)
+    monkeypatch.setattr(lots, "lanes", lambda: 1)
+    for module in (fleet_module, jobs):
+        monkeypatch.setattr(module, "fly_lot", flies("lot", []))
+        monkeypatch.setattr(module, "fly_one", flies("one", made_up.flight(0.1)))
+    for lot in fleet.lots(fleet.specs):
+        fleet._fly(lot, lambda share: None, threading.Event())
+        jobs.fly_job(fleet._job(lot.specs, True))
+    assert [kind for kind, _ in told] == ["lot", "lot", "one", "one"]
+    assert all(each is state for _, each in told)

@@ -296,6 +296,8 @@ def test_an_interrupted_table_flies_nothing_more(tmp_path):
     run = Run("test", tmp_path)
     run.stop.set()
     assert train_all(tiny_preset(), [0, 1], run, Silent()).policies == {}
+    nothing = fly_all(Study(tiny_preset(), {0: "policy"}, ()), [Scenario()], run, Silent(), starts=1, seconds=1.0)
+    assert (nothing.flown, nothing.interrupted) == ([], True)
     document = Document(run, "table", "Title", "Intro.", [0], Silent())
     fly_levels(document, [Levels("", tiny_preset(), Scenario(), "x")] * 2, starts=1, seconds=1.0)
     assert document.sections == []

@@ -129,7 +129,7 @@ def rate_panel() -> Panel:
             u = Command(jnp.array(STANDARD_GRAVITY), 2.0 * jnp.eye(3)[axis])
             rates = np.asarray(_flown(bem, u, 300).omega)[:, axis]
             curves.append(
-                Curve(np.arange(1, 301) * 1.0, rates / 2.0, f"{name}, {word}", dashed=axis == 2, color=len(curves) // 2)
+                Curve(np.arange(1.0, 301.0), rates / 2.0, f"{name}, {word}", dashed=axis == 2, color=len(curves) // 2)
             )
     return Panel("Step of the body rate", "time [ms]", "rate / command", curves, columns=2)
 
@@ -141,7 +141,7 @@ def step_panel() -> Panel:
         bem = BemQuadrotor.of(VEHICLES[name](), DT)
         u = Command(jnp.array(STANDARD_GRAVITY + 5.0), jnp.zeros(3))
         speeds = np.asarray(_flown(bem, u, 300).x.v)[:, 2]
-        curves.append(Curve(np.arange(2, 301) * 1.0, np.diff(speeds) / SUBSTEP, name))
+        curves.append(Curve(np.arange(2.0, 301.0), np.diff(speeds) / SUBSTEP, name))
     curves.append(Curve(np.array([0.0, 300.0]), np.array([5.0, 5.0]), "commanded", dashed=True))
     return Panel("Step of collective thrust by 5 m/s²", "time [ms]", "vertical acceleration [m/s²]", curves)
 
