@@ -22,6 +22,7 @@ EVERY = 0.02  # [s] between two messages
 TOPICS = {"message": 2_000_000}
 FIRST = 10  # messages that are not counted: connections are made
 JOINED = 0.5  # [s], in which both ends find each other
+LONGEST, ANSWERS = 60.0, 20.0  # [s]: for all messages of a size to come, for a rosmaster to be there
 
 
 def measured(bus: Bus, words: Sequence[str], size: int) -> list[float]:
@@ -35,7 +36,7 @@ def measured(bus: Bus, words: Sequence[str], size: int) -> list[float]:
     known = getattr(bus.latest("message"), "version", 0)
     writer = subprocess.Popen([*words, str(size)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     took: dict[int, float] = {}
-    until = time.monotonic() + 60.0
+    until = time.monotonic() + LONGEST
     while time.monotonic() < until and writer.poll() is None and FIRST + COUNT - 1 not in took:
         message = bus.latest("message", known)
         if message is None:
@@ -79,7 +80,7 @@ def rosmaster() -> Iterator[Address | None]:
         words = ["rosmaster", "--core", "-p", str(address.port)]
         master = subprocess.Popen(words, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         try:
-            until = time.monotonic() + 20.0
+            until = time.monotonic() + ANSWERS
             while time.monotonic() < until:
                 with socket.socket() as probe:
                     if probe.connect_ex(("127.0.0.1", address.port)) == 0:
