@@ -41,6 +41,10 @@ def test_a_condition_at_hover_is_its_disturbance_with_one_thing_changed():
             assert scenario.vehicle == where.removesuffix("-quadrotor")
         else:
             assert (scenario.vehicle is not None) == where.startswith(("random", "slow"))
+    slow = ratios(found["step/slow-motors"].vehicle, small())
+    assert {name: np.unique(np.round(ratio, 6)).tolist() for name, ratio in slow.items()} == {
+        name: [2.0 if name == "motor_tau" else 1.0] for name in slow
+    }
 
 
 @pytest.mark.parametrize(("preset", "own"), [("track/retrim", small), ("track/fast", kingfisher)])

@@ -81,6 +81,8 @@ def test_steps_are_answered_and_a_battery_sags():
         assert roll.y[-1] == pytest.approx(1.0, abs=0.15)
         assert at(yaw, 50.0) < at(roll, 50.0)  # drag turns a body less than thrust does
     thrust = curves(model.step_panel())
+    np.testing.assert_array_equal(thrust["commanded"].x, [0.0, 300.0])
+    np.testing.assert_array_equal(thrust["commanded"].y, [5.0, 5.0])
     for name in model.VEHICLES:
         assert (thrust[name].x[0], thrust[name].x[-1]) == (2.0, 300.0)  # [ms]
         assert thrust[name].y[0] < 1.0
@@ -194,7 +196,16 @@ def test_latencies_of_buses_by_their_command(tmp_path, monkeypatch):
     monkeypatch.setattr(buses, "measured", measured)
     monkeypatch.setattr(buses, "rosmaster", nullcontext)
     monkeypatch.setattr(buses, "two_machines", nullcontext)
-    buses.buses(Run("test", tmp_path), Silent())
+    told = []
+
+    class Watching(Silent):
+        def progress(self, title):
+            return nullcontext(lambda share, text: told.append((title, share, text)))
+
+    buses.buses(Run("test", tmp_path), Watching())
+    assert [each for each in told if each[0] == "shared memory"] == [
+        ("shared memory", i / len(latency.SIZES), name) for i, name in enumerate(latency.SIZES)
+    ]
     rows = results(tmp_path, "buses.json")["rows"]
     assert [row["bytes"] for row in rows if row["bus"] == "shared memory"] == [500, 74_000]
     assert {(row["p50_ms"], row["max_ms"], row["n"]) for row in rows} == {(2.0, 3.0, 2)}

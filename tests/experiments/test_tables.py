@@ -136,6 +136,8 @@ def test_a_section_is_made_again_for_every_thing_that_it_follows_from(tmp_path, 
     assert [fly(seeds=(1,)), fly(starts=2), fly(seconds=2.0), fly(datt_steps=2)] == [1] * 4
     assert fly(dataclasses.replace(base, methods=("indi", "geometric")), datt_steps=2) == 0  # nobody there is trained
     assert fly() == 0
+    monkeypatch.setattr(levels, "files_behind", lambda *names: {"my_wind:breeze": "changed"})
+    assert fly() == 1
 
 
 def test_progress_of_flights_goes_from_nothing_to_all(tmp_path):
