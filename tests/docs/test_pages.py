@@ -45,6 +45,15 @@ def test_a_page_lists_every_key_and_no_other(page, kind):
     assert sorted(listed) == sorted(field.name for field in dataclasses.fields(kind))
 
 
+def test_the_page_of_sweeps_tells_the_defaults():
+    told = dict(re.findall(r"^\| `(\w+)` \| `([^`]+)` \|", (DOCS / "how-to" / "sweep.md").read_text(), re.M))
+    plain = Sweep()
+    assert set(told) == {field.name for field in dataclasses.fields(Sweep)} - {"seconds", "overlay"}
+    for key, text in told.items():
+        value = getattr(plain, key)
+        assert json.loads(text) == (list(value) if isinstance(value, tuple) else value), key
+
+
 def test_toml_files_of_pages_are_accepted(tmp_path):
     readers = {
         "my_quad": read_vehicle,
