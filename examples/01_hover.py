@@ -10,7 +10,7 @@ import numpy as np
 from retrim import Scenario, Setup, changed, fly, load
 
 QUICK = {
-    "pretrain": {"num_updates": 100, "num_envs": 8, "horizon": 100, "hidden_sizes": [32, 32]},
+    "pretrain": {"num_updates": 20, "num_envs": 4, "horizon": 60, "hidden_sizes": [32, 32]},
     "adapt": {"num_updates": 3, "num_envs": 4, "fit_steps": 20, "fit_every": 1.0, "update_every": 2.0},
 }
 
@@ -18,7 +18,7 @@ QUICK = {
 def main(*, quick: bool = False) -> None:
     """Pretrain a policy, fly it as it is, and fly it as it adapts."""
     preset = changed(load("hover/fast"), **(QUICK if quick else {}))
-    setup, ticks = Setup.of(preset), 250 if quick else 1500
+    setup, ticks = Setup.of(preset), 100 if quick else 1500
 
     # The model of training is one equation; it knows nothing of what follows.
     *_, (policy, losses) = setup.pretraining()

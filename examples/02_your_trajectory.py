@@ -17,7 +17,7 @@ from retrim.tasks import smooth_start
 
 QUICK = {
     "track": {"reference": "circle", "felt_copies": 0},
-    "pretrain": {"num_updates": 100, "num_envs": 8, "horizon": 60, "hidden_sizes": [32, 32]},
+    "pretrain": {"num_updates": 20, "num_envs": 4, "horizon": 40, "hidden_sizes": [32, 32]},
     "adapt": {"window": 50, "num_updates": 2, "num_envs": 3},
 }
 
@@ -38,7 +38,7 @@ def main(*, quick: bool = False) -> None:
     print(f"Three times as fast? {hasty.infeasibility(setup.vehicle) or 'yes'}")
 
     policy = setup.pretrained()
-    plant, x0, ticks = Scenario("wind=3").make(), setup.flight_starts(1)[0], 250 if quick else 1500
+    plant, x0, ticks = Scenario("wind=3").make(), setup.flight_starts(1)[0], 100 if quick else 1500
 
     def error(setup: Setup, method: str) -> float:
         """Fly; return the mean distance over the last 8 s from where the vehicle should have been [m]."""

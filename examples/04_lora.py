@@ -11,7 +11,7 @@ import numpy as np
 from retrim import Pilot, Scenario, Setup, changed, fly, load
 
 QUICK = {
-    "pretrain": {"num_updates": 100, "num_envs": 8, "horizon": 100, "hidden_sizes": [32, 32]},
+    "pretrain": {"num_updates": 20, "num_envs": 4, "horizon": 60, "hidden_sizes": [32, 32]},
     "adapt": {"num_updates": 3, "num_envs": 4, "fit_steps": 20, "fit_every": 1.0, "update_every": 2.0},
 }
 
@@ -29,7 +29,7 @@ def change(before: object, after: object) -> float:
 def main(*, quick: bool = False) -> None:
     """Adapt a delta, then merge it."""
     preset = changed(load("hover/fast"), **(QUICK if quick else {}))
-    setup, ticks = Setup.of(preset), 250 if quick else 1500
+    setup, ticks = Setup.of(preset), 100 if quick else 1500
     policy = setup.pretrained()
     thin = setup.low_rank(policy, jax.random.key(1))  # ranks 4, 10, 1; it starts as a delta of zero
     print(f"trained in flight: {size(thin.params)} numbers instead of {size(policy.params)}")

@@ -13,7 +13,7 @@ from jaxtyping import Array, Key
 from retrim import Command, Scenario, Setup, State, Targets, changed, fly, load
 
 QUICK = {
-    "pretrain": {"num_updates": 100, "num_envs": 8, "horizon": 100, "hidden_sizes": [32, 32]},
+    "pretrain": {"num_updates": 20, "num_envs": 4, "horizon": 60, "hidden_sizes": [32, 32]},
     "adapt": {"num_updates": 3, "num_envs": 4, "fit_steps": 20, "fit_every": 1.0, "update_every": 2.0},
 }
 
@@ -44,7 +44,7 @@ class Bias(eqx.Module):
 def main(*, quick: bool = False) -> None:
     """Adapt with the bias instead of the ensemble."""
     preset = changed(load("hover/fast"), **(QUICK if quick else {}))
-    setup, ticks = Setup.of(preset, residual_model=Bias()), 250 if quick else 1500
+    setup, ticks = Setup.of(preset, residual_model=Bias()), 100 if quick else 1500
     policy, x0 = setup.pretrained(), setup.flight_starts(1)[0]
     for method in ("base", "full"):
         pilot = setup.pilot(policy, method, jax.random.key(1))

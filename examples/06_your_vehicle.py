@@ -12,7 +12,7 @@ import numpy as np
 from retrim import Command, FunctionPilot, Scenario, Setup, changed, fly, load, read_vehicle
 
 QUICK = {
-    "pretrain": {"num_updates": 100, "num_envs": 8, "horizon": 100, "hidden_sizes": [32, 32]},
+    "pretrain": {"num_updates": 20, "num_envs": 4, "horizon": 60, "hidden_sizes": [32, 32]},
     "adapt": {"num_updates": 3, "num_envs": 4, "fit_steps": 20, "fit_every": 1.0, "update_every": 2.0},
 }
 FILE = Path(__file__).with_name("seven_inch.toml")
@@ -21,7 +21,7 @@ FILE = Path(__file__).with_name("seven_inch.toml")
 def main(*, quick: bool = False) -> None:
     """Check the vehicle, train for it, and fly it."""
     preset = changed(load("hover/fast"), vehicle=read_vehicle(FILE), **(QUICK if quick else {}))
-    setup, ticks = Setup.of(preset), 250 if quick else 1500
+    setup, ticks = Setup.of(preset), 100 if quick else 1500
     x0 = setup.flight_starts(1)[0]
 
     level = fly(Scenario().make(preset.vehicle), FunctionPilot(lambda measurement: Command.hover()), x0, ticks=25)

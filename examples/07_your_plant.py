@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from retrim import Command, Measurement, Plant, PlantError, Setup, State, as_numpy, changed, check_command, fly, load
 
 QUICK = {
-    "pretrain": {"num_updates": 100, "num_envs": 8, "horizon": 100, "hidden_sizes": [32, 32]},
+    "pretrain": {"num_updates": 20, "num_envs": 4, "horizon": 60, "hidden_sizes": [32, 32]},
     "adapt": {"num_updates": 3, "num_envs": 4, "fit_steps": 20, "fit_every": 1.0, "update_every": 2.0},
 }
 
@@ -52,7 +52,7 @@ def main(*, quick: bool = False) -> None:
     """Fly the toy with a policy that was trained without it."""
     # The toy acts at once: it has no delay of commands to declare, only lag.
     preset = changed(load("hover/fast"), plant_delay_ticks=0, **(QUICK if quick else {}))
-    setup, ticks = Setup.of(preset), 250 if quick else 1500
+    setup, ticks = Setup.of(preset), 100 if quick else 1500
     policy, x0 = setup.pretrained(), setup.flight_starts(1)[0]
     for method in ("base", "full"):
         log = fly(Toy(), setup.pilot(policy, method, jax.random.key(1)), x0, ticks=ticks)

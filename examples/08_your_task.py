@@ -32,7 +32,7 @@ from retrim import (
 from retrim.tasks import Start, huber
 
 QUICK = {
-    "pretrain": {"num_updates": 100, "num_envs": 8, "horizon": 100, "hidden_sizes": [32, 32]},
+    "pretrain": {"num_updates": 20, "num_envs": 4, "horizon": 60, "hidden_sizes": [32, 32]},
     "adapt": {"num_updates": 3, "num_envs": 4, "fit_steps": 20, "fit_every": 1.0, "update_every": 2.0},
 }
 
@@ -110,7 +110,7 @@ def main(*, quick: bool = False) -> None:
     """Register the task, train for it, and fly it."""
     register_task("follow", entry)
     preset = changed(load("hover/fast"), task="follow", **(QUICK if quick else {}))
-    setup, ticks = Setup.of(preset), 250 if quick else 1500
+    setup, ticks = Setup.of(preset), 100 if quick else 1500
     policy, plant, x0 = setup.pretrained(), Scenario("large").make(), setup.flight_starts(1)[0]
     for method in ("base", "full"):
         log = fly(plant, setup.pilot(policy, method, jax.random.key(1)), x0, ticks=ticks)

@@ -19,7 +19,9 @@ COMMANDS = ("pretrain", "fly", "demo", "sweep", "live", "gauntlet", "bench", "re
 def folder(tmp_path_factory, as_a_user):
     """A folder with a small policy in p/, and what it flew under a small push in f/."""
     here = tmp_path_factory.mktemp("user")
-    (here / "small.toml").write_text(SMALL)
+    (here / "small.toml").write_text(
+        SMALL.replace("num_updates = 150", "num_updates = 150\nnum_envs = 8\nhorizon = 100")
+    )
     out = retrim("pretrain", "hover", "--config", "small.toml", "--out", "p", cwd=here)
     assert "hover error in its own model" in out
     words = "--disturbance", "small", "--seconds", "4", "--starts", "2"
@@ -36,7 +38,7 @@ def test_pretrain_writes_policy_and_results(folder):
     assert not found["interrupted"]
     assert len(found["losses"]) == 150
     (row,) = found["rows"]
-    assert (row["task"], row["preset"], row["updates"], row["envs"]) == ("hover", "hover/retrim", 150, 16)
+    assert (row["task"], row["preset"], row["updates"], row["envs"]) == ("hover", "hover/retrim", 150, 8)
     assert row["loss"] == found["losses"][-1] < found["losses"][0]
     assert 0 < row["nominal_error_m"] < 0.5
     policy, preset = load_policy(folder / "p")

@@ -8,7 +8,7 @@ from commands import SMALL, results, retrim
 pytestmark = pytest.mark.usefixtures("as_a_user")
 
 TINY = (
-    SMALL.replace("num_updates = 150", "num_updates = 150\nnum_envs = 16\nhorizon = 60")
+    SMALL.replace("num_updates = 150", "num_updates = 80\nnum_envs = 8\nhorizon = 60")
     + 'window = 50\n[track]\nreference = "circle"\n'
 )
 SEE = (

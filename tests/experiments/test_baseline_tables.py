@@ -3,7 +3,6 @@
 import importlib
 import inspect
 import json
-from functools import partial
 from pathlib import Path
 
 import jax
@@ -22,8 +21,8 @@ from retrim.experiments import Run, design, effort, provenance, tables
 from retrim.experiments.reporter import Silent
 
 # The package has functions of these names.
-NAMES = ("design", "everything", "phase", "quick", "vision")
-design_table, everything, phase_table, quick, vision_table = (
+NAMES = ("design", "efficiency", "everything", "phase", "quick", "vision")
+design_table, efficiency_table, everything, phase_table, quick, vision_table = (
     importlib.import_module(f"retrim.experiments.tables.{n}") for n in NAMES
 )
 
@@ -89,22 +88,6 @@ def test_the_gradient_is_that_of_the_model_or_of_the_point_mass(key):
     simple, own, borrowed = (jacobian(design.Choice(*c, False)) for c in ((False, True), (True, True), (True, False)))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-9), borrowed, simple)
     assert float(jnp.abs(own.c - simple.c).max()) > 0.1 * float(jnp.abs(simple.c).max())  # motors take their time
-
-
-def test_the_design_study_by_its_command(tmp_path, monkeypatch):
-    monkeypatch.setitem(named_presets.PRESETS, "hover/fast", tiny_preset())
-    monkeypatch.setattr(design, "CHUNK", 10)
-    monkeypatch.setattr(design_table, "retrained", partial(design.retrained, fit_epochs=20, envs=4))
-    for name, small in (("ROLLOUTS", 2), ("ROLLOUT_S", 1.0), ("SCORED_S", 3.0)):
-        monkeypatch.setattr(design_table, name, small)
-    monkeypatch.setattr(design_table, "CHOICES", dict(list(design.CHOICES.items())[1:3]))
-    out = retrim("reproduce", "design", "--seeds", "0", "--starts", "2", "--epochs", "10", "--out", "d", cwd=tmp_path)
-    assert "low fidelity, res-fwd + res-back" in out
-    rows = json.loads((tmp_path / "d" / "design.json").read_text())["rows"]
-    assert [row["model"] for row in rows] == list(design.CHOICES)[1:3]
-    assert all(time > 0 for row in rows for time in row["epoch_s"])
-    said = retrim("reproduce", "design", "--epochs", "15", cwd=tmp_path, code=1)
-    assert "--epochs 15 must be a positive multiple of 10" in said
 
 
 def test_the_design_study_s_rows_are_of_all_seeds_and_flights():
@@ -239,10 +222,12 @@ def test_what_each_method_costs_by_its_command(tmp_path, monkeypatch):
     monkeypatch.setitem(named_presets.PRESETS, "hover/fast", small)
     monkeypatch.setattr(effort, "DECISIONS", 3)
     monkeypatch.setattr(effort, "RUNS", 2)
+    monkeypatch.setattr(efficiency_table, "BASELINES", {"indi": BASELINES["indi"]})
+    monkeypatch.setattr(efficiency_table, "trained_datt", lambda *_, **__: {})
     words = "--presets", "hover/fast", "--datt-steps", "1"
     out = retrim("reproduce", "efficiency", *words, "--out", "e", cwd=tmp_path)
     rows = {row["method"]: row for row in json.loads((tmp_path / "e" / "efficiency.json").read_text())["rows"]}
-    assert {"hover/fast", "hover/fast, LoRA", "datt", *BASELINES} == set(rows)
+    assert {"hover/fast", "hover/fast, LoRA", "indi"} == set(rows)
     assert rows["hover/fast"]["steps"] == 10 * small.pretrain.num_envs * 20
     assert all(row["decision_s"] > 0 for name, row in rows.items() if "LoRA" not in name)
     assert "DATT, the paper's" in out

@@ -10,7 +10,7 @@ import pytest
 from commands import results
 from helpers import brief_preset
 from made_up import Imaginary, flight
-from retrim import Scenario
+from retrim import ConfigError, Scenario
 from retrim.config import named_presets
 from retrim.experiments import Run
 from retrim.experiments.design import Trained
@@ -173,6 +173,8 @@ def test_the_design_study_asks_for_every_choice_of_every_seed(tmp_path, presets,
         )
         assert {tuple(key) for *_, key in mine} == {tuple(jax.random.key_data(jax.random.key(seed)).tolist())}
     np.testing.assert_allclose(told, np.arange(2 * n) / (2 * n))
+    with pytest.raises(ConfigError, match="--epochs 15 must be a positive multiple of 10"):
+        design.design(Run("test", tmp_path), Silent(), epochs=15)
     found = results(tmp_path, "design.json")["rows"]
     assert [(row["model"], row["seed"], row["order"]) for row in found] == [
         (name, seed, k) for seed in SEEDS for k, name in enumerate(design.CHOICES)

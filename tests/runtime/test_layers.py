@@ -18,21 +18,21 @@ pytestmark = pytest.mark.usefixtures("as_a_user")
 
 @pytest.fixture(scope="module")
 def trained(as_a_user):
-    sizes = {"hidden_sizes": (64, 64)}
+    sizes = {"hidden_sizes": (64, 64), "num_envs": 8}
     setup = Setup.of(changed(load("hover/retrim"), pretrain=sizes))
     return setup, setup.pretrained(0)
 
 
 @pytest.fixture(scope="module")
 def flights(trained):
-    """8 s from one start, a step of 2 m/s^2 per axis at 4 s, by each layer."""
-    step = Push(lambda t, x: jnp.where(t < 4.0, 0.0, 2.0) * jnp.ones(3))
+    """6 s from one start, a step of 2 m/s^2 per axis at 3 s, by each layer."""
+    step = Push(lambda t, x: jnp.where(t < 3.0, 0.0, 2.0) * jnp.ones(3))
     setup, policy = trained
 
     def flight(method, sensors=None):
         pilot = setup.pilot(policy, method, random.key(1))
         plant = SimPlant(CheapModel(0.02), step, sensors=sensors, seed=3)
-        log = fly(plant, pilot, setup.flight_starts(1, 4)[0], ticks=400)
+        log = fly(plant, pilot, setup.flight_starts(1, 4)[0], ticks=300)
         return log, np.linalg.norm(log.p - np.array(setup.preset.goal), axis=1), pilot
 
     rough = SensorModel.of(position=1e-3, velocity=1e-2, attitude=3e-3, latency=10, dropout=0.05)
@@ -43,19 +43,19 @@ def flights(trained):
 def test_a_step_is_answered_within_two_seconds(flights, layers):
     log, error, _ = flights[layers]
     base = flights["base"][1]
-    assert base[log.t > 7.0].min() > 0.2
-    assert error[(log.t > 3.0) & (log.t < 4.0)].max() < 0.03
-    assert error[log.t > 6.0].max() < 0.05
-    assert error[log.t > 7.0].mean() < 0.1 * base[log.t > 7.0].mean()
+    assert base[log.t > 5.2].min() > 0.2
+    assert error[(log.t > 2.0) & (log.t < 3.0)].max() < 0.03
+    assert error[log.t > 5.0].max() < 0.05
+    assert error[log.t > 5.2].mean() < 0.1 * base[log.t > 5.2].mean()
 
 
 def test_learning_does_not_harm_the_layer_below(flights):
     log, framed, _ = flights["base-do"]
     _, learning, pilot = flights["full"]
     kinds = [event.kind for event in pilot.events]
-    assert kinds.count("residual") > 30
-    assert kinds.count("policy") + kinds.count("rejected") > 10
-    for since in (3.0, 6.5):
+    assert kinds.count("residual") > 20
+    assert kinds.count("policy") + kinds.count("rejected") > 8
+    for since in (2.0, 5.0):
         late = (log.t > since) & (log.t < since + 1.0)
         assert learning[late].mean() < framed[late].mean() + 0.005
 
