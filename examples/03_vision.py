@@ -12,8 +12,8 @@ import numpy as np
 from retrim import Scenario, Setup, changed, fly, load
 
 QUICK = {
-    "vision": {"encoder_steps": 100},
-    "pretrain": {"num_updates": 20, "num_envs": 4, "horizon": 60, "hidden_sizes": [32, 32]},
+    "vision": {"encoder_steps": 10},
+    "pretrain": {"num_updates": 20, "num_envs": 4, "horizon": 40, "hidden_sizes": [32, 32]},
     "adapt": {"num_updates": 2, "num_envs": 3, "window": 50},
 }
 

@@ -34,8 +34,8 @@ preset = tiny_preset(pretrain=small, adapt={{"fit_steps": 3, **soon}})
 setup, losses = Setup.of(preset), []
 for policy, some in setup.pretraining(0):
     losses += [float(loss) for loss in some]
-gusts = Scenario("gusts", plant="simple", sensors="mocap")
-fleet = Fleet(preset, policy, [gusts], methods=("full",), starts=8, seconds=1.0)
+pushed = Scenario("small", plant="simple", sensors="mocap")
+fleet = Fleet(preset, policy, [pushed], methods=("full",), starts=8, seconds=1.0)
 fleet.lots(fleet.specs)
 flights = fleet.run().flown
 low_rank = setup.low_rank(policy, jax.random.key(0))

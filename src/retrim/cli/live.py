@@ -87,14 +87,14 @@ def live(
         if page and no_page:
             raise ConfigError("--page and --no-page: choose one")
         check_limits(fence, seconds, policy_age)
-        wanted = page or (seconds is None and not no_page)
-        address = page_address(page_host, page_port, demanded=page, say=RichReporter().say) if wanted else None
-        ground = learners_at(learners, RichReporter().say) if learners is not None else None
         state, weights, chosen = None, None, load_for(preset.partition("/")[0], preset)
         if policy is not None or resume is not None:
             weights, chosen, state = loaded(policy, resume)
         chosen = with_residual(chosen, residual, state)
         scenario = where.scenario(chosen)
+        wanted = page or (seconds is None and not no_page)
+        address = page_address(page_host, page_port, demanded=page, say=RichReporter().say) if wanted else None
+        ground = learners_at(learners, RichReporter().say) if learners is not None else None
         setup, run = Setup.of(chosen, scenario.reference), started(Run("live", out, stop=stop))
         if weights is None:
             weights, losses = train(Setup.of(chosen), seed, reporter=RichReporter(), stop=stop)
