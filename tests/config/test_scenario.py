@@ -72,6 +72,9 @@ def test_the_fan_blows_at_the_goal_and_nowhere_else():
     assert float(jnp.linalg.norm(aside)) < 0.2
     faster = np.stack([disturbance("fan=9")(jnp.array(t), HERE).wind for t in np.arange(0.0, 20.0, 1.0)]).mean(axis=0)
     assert np.linalg.norm(faster) == pytest.approx(6.0, rel=0.15)
+    disturbance("fan=0.1")
+    with pytest.raises(ConfigError, match=r"disturbance 'fan=0': Fan: speed = 0\.0"):
+        disturbance("fan=0")
 
 
 def test_a_walk_has_that_rate_and_stays_within_its_bounds():
@@ -170,6 +173,14 @@ def test_sizes_that_cannot_be(name, message):
     with pytest.raises(ConfigError, match=message) as error:
         disturbance(name)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("plant", ["bem", "simple", "rotorpy", "mujoco", "crazyflow"])
+def test_the_control_period_reaches_every_plant(plant):
+    try:
+        assert Scenario(plant=plant).make(dt=0.01).dt == 0.01
+    except PlantError as error:
+        pytest.skip(str(error))
 
 
 @pytest.mark.parametrize("plant", ["bem", "simple"])

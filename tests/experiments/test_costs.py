@@ -66,6 +66,13 @@ def test_scaling_flies_as_many_as_were_asked_for_and_forgets_them(tmp_path, pres
     np.testing.assert_allclose(memory.curves[0].y, [row["peak_mb"] for row in found])
 
 
+@pytest.mark.parametrize("flights", [(), (0,), (6,), (4, -4)])
+def test_numbers_of_flights_that_cannot_be_are_refused_before_training(flights, tmp_path, monkeypatch):
+    monkeypatch.setattr(scaling, "train_all", lambda *_: pytest.fail("trains"))
+    with pytest.raises(ConfigError, match="must be a positive multiple of 4"):
+        scaling.scaling(Run("test", tmp_path), Silent(), flights=flights, seconds=8.0)
+
+
 def test_rows_of_scaling_are_rates():
     class Watch(Stopwatch):
         compile_s, total_s = 3.0, 5.0
