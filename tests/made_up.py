@@ -1,10 +1,13 @@
-"""Flights that were never flown, for what is computed from flights."""
+"""Flights that were never flown, for what is computed from flights, and a reporter that remembers."""
+
+import contextlib
 
 import numpy as np
 
 from retrim import Log, Scenario
 from retrim.experiments import Flight, FlightSpec
 from retrim.experiments.gathering import Flights
+from retrim.experiments.reporter import Silent
 from retrim.experiments.tables.study import Study
 from retrim.runtime.flight import States
 
@@ -26,12 +29,30 @@ def flight(error, *, spec=None, flown=None, steady_seconds=2.0, cross=None, **of
     return Flight(spec, "small", flown, error, "steady_error_m", steady_seconds, cross)
 
 
+class Watching(Silent):
+    """Keeps what progress was told, as titles, shares and texts, and hands each share on."""
+
+    def __init__(self, then=lambda share: None):
+        self.told, self._then = [], then
+
+    def progress(self, title):
+        def advance(share, text):
+            self.told.append((title, share, text))
+            self._then(share)
+
+        return contextlib.nullcontext(advance)
+
+    @property
+    def shares(self):
+        return [share for _, share, _ in self.told]
+
+
 class Imaginary:
     """In the place of training and flying: what was asked, and flights of made-up errors."""
 
     def __init__(self, error):
         """``error`` of a specification [m]: a number, one for each row of the log, or None for a crash."""
-        self._error, self.trained, self.flown, self.flights = error, [], [], []
+        self._error, self.trained, self.flown = error, [], []
 
     def train(self, preset, seeds, run, reporter):
         self.trained.append((preset, tuple(seeds)))
@@ -43,9 +64,7 @@ class Imaginary:
             FlightSpec(scenario, method, start, seed)
             for scenario in scenarios for method in methods for seed in study.policies for start in range(starts)
         ]  # fmt: skip
-        found = [self._one(spec, seconds) for spec in specs]
-        self.flights += found
-        return Flights(found, interrupted=False)
+        return Flights([self._one(spec, seconds) for spec in specs], interrupted=False)
 
     def _one(self, spec, seconds):
         error = self._error(spec)

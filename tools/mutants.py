@@ -36,7 +36,7 @@ PLACE = ROOT / "build" / "mutants"
 TESTS = {
     "adapt": ("tests/adapt", "tests/runtime", "tests/control", "tests/test_house"),
     "runtime": ("tests/runtime", "tests/plants", "tests/test_house"),
-    "config": ("tests/config", "tests/runtime", "tests/io", "tests/test_house"),
+    "config": ("tests/config", "tests/runtime", "tests/io", "tests/plants", "tests/test_house"),
     "experiments": ("tests/experiments", "tests/cli", "tests/test_house"),
 }
 REACH, BESIDE = 300.0, 60.0  # [s] of tests that run for one fault: of those that reach it, and of others of its room

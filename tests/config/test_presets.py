@@ -1,15 +1,12 @@
 """Presets: their numbers, and what cannot be one."""
 
-import json
 import math
-from pathlib import Path
 
 import pytest
 
 from retrim import ConfigError
 from retrim.config import PRESETS, Setup, changed, load
 from retrim.config.loading import dump, parse
-from retrim.config.presets import Preset
 
 
 def test_presets_survive_json():
@@ -223,20 +220,3 @@ def test_results_depend_on_these_numbers():
     assert set(OURS) | {"hover/paper"} == set(PRESETS)
     for name, tables in OURS.items():
         assert PRESETS[name] == changed(PRESETS["hover/paper"], name=name, **tables), name
-
-
-def flat(tables, prefix=""):
-    found = {}
-    for key, value in tables.items():
-        found |= flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
-    return found
-
-
-def test_a_preset_is_what_its_name_has_meant():
-    """Results tell presets by name: who changes one says so here, by what differs from Preset(), and in a note."""
-    plain = flat(json.loads(dump(Preset())))
-    found = {}
-    for name, preset in PRESETS.items():
-        mine = flat(json.loads(dump(preset)))
-        found[name] = {key: value for key, value in mine.items() if key not in plain or plain[key] != value}
-    assert found == json.loads(Path(__file__).with_name("presets.json").read_text())

@@ -1,8 +1,6 @@
 """Where a flight takes place: disturbances with sizes, sensors, and a plant that gets what the scenario says."""
 
 import dataclasses
-import importlib.util
-import sys
 
 import jax.numpy as jnp
 import numpy as np
@@ -254,28 +252,6 @@ def test_the_error_of_the_thrust_map_reaches_the_plant(plant, error, expected):
     x0 = State.at(jnp.array([0.0, 0.0, 1.0]))
     log = fly(scenario.make(), FunctionPilot(lambda measurement: Command.hover()), x0, ticks=2)
     assert log.v[1, 2] / 0.02 == pytest.approx(9.81 * expected, abs=0.02 * 9.81 * abs(expected) + 0.01)
-
-
-@pytest.mark.parametrize(
-    ("plant", "package"),
-    [("rotorpy", "rotorpy"), ("mujoco", "mujoco"), ("crazyflow", "crazyflow"), ("mavlink", "pymavlink")],
-)
-def test_a_plant_says_that_its_package_is_missing(plant, package, monkeypatch):
-    """Without the time that an import takes."""
-    find = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *_: None if name == package else find(name))
-    with pytest.raises(PlantError, match=f"plant '{plant}' needs the package '{package}'"):
-        Scenario(plant=plant).entry.needs()
-
-
-def test_vehicles_say_that_ros_or_a_firmware_is_missing(monkeypatch):
-    monkeypatch.setitem(sys.modules, "rospy", None)
-    with pytest.raises(ConfigError, match="ROS 1 needs rospy from the system: apt install python3-rospy"):
-        Scenario(plant="ros").entry.needs()
-    monkeypatch.setenv("RETRIM_BETAFLIGHT", "/nowhere/board")
-    with pytest.raises(PlantError, match="RETRIM_BETAFLIGHT=/nowhere/board: no program that could be run"):
-        Scenario(plant="betaflight").entry.needs()
-    assert Scenario().entry.needs is None
 
 
 def test_scenarios_that_cannot_be():

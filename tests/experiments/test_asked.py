@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from helpers import brief_preset
-from retrim import ConfigError, PlantError, Setup, changed, load
+from retrim import ConfigError, Setup, changed, load
 from retrim.config.registry import told_of_own_module
 from retrim.experiments.asked import Where, asked_preset, flown_reference, loaded, same_policy, with_residual
 from retrim.io.trained import load_policy, save_policy
@@ -87,12 +87,6 @@ def test_where_a_flight_takes_place_is_its_scenario():
     assert (found.vehicle, found.sensors, found.thrust_error, found.delay) == ("large", "mocap", 0.01, 0.04)
     assert Where().scenario(load("hover/fast")).disturbance == "large"
     assert Where(plant="mavlink:udp:127.0.0.1:14550").scenario(load("hover/fast")).disturbance == "none"
-
-
-def test_a_plant_whose_package_is_missing_is_refused_where_it_is_asked_for(monkeypatch):
-    monkeypatch.setenv("RETRIM_BETAFLIGHT", "/nowhere/board")
-    with pytest.raises(PlantError, match="RETRIM_BETAFLIGHT=/nowhere/board: no program that could be run"):
-        Where("none", "betaflight").scenario(load("hover/fast"))
 
 
 def test_weights_are_of_a_policy_or_of_an_earlier_flight(tmp_path, key):

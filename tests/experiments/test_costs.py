@@ -1,6 +1,5 @@
 """Pages of searches, costs and numbers of flights: what they ask for, and what they lay out of it."""
 
-import contextlib
 import importlib
 
 import jax
@@ -9,7 +8,7 @@ import pytest
 
 from commands import results
 from helpers import brief_preset
-from made_up import Imaginary, flight
+from made_up import Imaginary, Watching, flight
 from retrim import ConfigError, Scenario
 from retrim.config import named_presets
 from retrim.experiments import Run
@@ -146,7 +145,7 @@ def test_the_best_settings_stand_below_the_present_ones():
 
 
 def test_the_design_study_asks_for_every_choice_of_every_seed(tmp_path, presets, monkeypatch):
-    done, logged, trained, told = Imaginary(None), [], [], []
+    done, logged, trained, watching = Imaginary(None), [], [], Watching()
     monkeypatch.setattr(design, "train_all", done.train)
 
     def fly(setup, policy, n, seconds, seed):
@@ -157,15 +156,11 @@ def test_the_design_study_asks_for_every_choice_of_every_seed(tmp_path, presets,
         trained.append((policy, tuple(logs), choice, epochs, jax.random.key_data(key).tolist()))
         return Trained(f"re-{policy}", 2.0, [0.5, 0.7], 0.25)
 
-    class Watching(Silent):
-        def progress(self, title):
-            return contextlib.nullcontext(lambda share, text: told.append(share))
-
     monkeypatch.setattr(design, "fly_as_it_is", fly)
     monkeypatch.setattr(design, "retrained", retrained)
     monkeypatch.setattr(design, "until_terminated", lambda task, log: log)
     monkeypatch.setattr(design, "scored", lambda setup, spec, log: flight(0.1 * (1 + spec.seed), seconds=4.0))
-    design.design(Run("test", tmp_path), Watching(), seeds=SEEDS, starts=5, epochs=30)
+    design.design(Run("test", tmp_path), watching, seeds=SEEDS, starts=5, epochs=30)
     n = len(design.CHOICES)
     assert [seeds for _, seeds in done.trained] == [SEEDS]
     for k, seed in enumerate(SEEDS):
@@ -179,7 +174,7 @@ def test_the_design_study_asks_for_every_choice_of_every_seed(tmp_path, presets,
             for policy, logs, _, epochs, _ in mine
         )
         assert {tuple(key) for *_, key in mine} == {tuple(jax.random.key_data(jax.random.key(seed)).tolist())}
-    np.testing.assert_allclose(told, np.arange(2 * n) / (2 * n))
+    np.testing.assert_allclose(watching.shares, np.arange(2 * n) / (2 * n))
     with pytest.raises(ConfigError, match="--epochs 15 must be a positive multiple of 10"):
         design.design(Run("test", tmp_path), Silent(), epochs=15)
     found = results(tmp_path, "design.json")["rows"]

@@ -139,9 +139,6 @@ def test_the_ablation_trains_what_differs_and_has_a_line_for_each_lever(task, tm
          SECONDS)
         for k, lever in enumerate(every) for reference in references
     ]  # fmt: skip
-    assert [how for _, _, *how in done.flown] == [
-        [(lever.method,), STARTS, SECONDS] for lever in every for _ in references
-    ]
     assert {seeds for _, seeds in done.trained} == {SEEDS}
     keys = [ablation.dump(ablation.replace(preset, adapt=ablation.Adapt())) for preset, _ in done.trained]
     assert len(set(keys)) == len(keys)

@@ -15,8 +15,7 @@ from retrim.experiments.metrics import failed_record, notes, summary
 from retrim.io.logs.recording import can_record
 from retrim.io.trained import load_learnt, load_policy
 
-SPECS = [FlightSpec(Scenario(name), method, start, 4) for name in ("none",) for method in ("base", "full")
-         for start in (0, 1)]  # fmt: skip
+SPECS = [FlightSpec(Scenario(), method, start, 4) for method in ("base", "full") for start in (0, 1)]
 
 
 @pytest.fixture(scope="module")

@@ -9,6 +9,7 @@ import pytest
 
 from commands import results, retrim
 from helpers import brief_preset
+from made_up import Watching
 from retrim import PlantError, Scenario
 from retrim.config import named_presets as presets
 from retrim.experiments import Run, latency
@@ -196,14 +197,9 @@ def test_latencies_of_buses_by_their_command(tmp_path, monkeypatch):
     monkeypatch.setattr(buses, "measured", measured)
     monkeypatch.setattr(buses, "rosmaster", nullcontext)
     monkeypatch.setattr(buses, "two_machines", nullcontext)
-    told = []
-
-    class Watching(Silent):
-        def progress(self, title):
-            return nullcontext(lambda share, text: told.append((title, share, text)))
-
-    buses.buses(Run("test", tmp_path), Watching())
-    assert [each for each in told if each[0] == "shared memory"] == [
+    watching = Watching()
+    buses.buses(Run("test", tmp_path), watching)
+    assert [each for each in watching.told if each[0] == "shared memory"] == [
         ("shared memory", i / len(latency.SIZES), name) for i, name in enumerate(latency.SIZES)
     ]
     rows = results(tmp_path, "buses.json")["rows"]

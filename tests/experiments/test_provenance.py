@@ -3,13 +3,14 @@
 import importlib.metadata
 import json
 import signal
+import subprocess
 import sys
 import threading
 
 import pytest
 
 from retrim.errors import ConfigError
-from retrim.experiments import Run
+from retrim.experiments import Run, provenance
 from retrim.experiments.interrupts import interrupts_only_set
 from retrim.experiments.provenance import command_line, versions
 from retrim.experiments.stopwatch import Stopwatch
@@ -74,3 +75,32 @@ def test_ctrl_c_is_remembered_and_raises_where_it_may(tmp_path):
     assert stop.is_set()
     with pytest.raises(KeyboardInterrupt):
         signal.raise_signal(signal.SIGINT)
+
+
+def test_a_commit_is_that_of_the_checkout_and_tells_local_changes(monkeypatch):
+    said = {"rev-parse --short=12 HEAD": "abc", "status --porcelain": ""}
+
+    def run(words, **_):
+        asked = " ".join(words[3:])
+        root = str(provenance.Path(provenance.__file__).resolve().parents[3])
+        if asked == "rev-parse --show-toplevel":
+            return subprocess.CompletedProcess(words, 0, stdout=f"{root if 'elsewhere' not in said else '/'}\n")
+        return subprocess.CompletedProcess(words, 0, stdout=f"{said[asked]}\n")
+
+    monkeypatch.setattr(provenance.subprocess, "run", run)
+    asked = provenance.commit.__wrapped__
+    assert asked() == "abc"
+    said["status --porcelain"] = " M file"
+    assert asked() == "abc-dirty"
+    said["elsewhere"] = ""
+    assert asked() == "unknown"  # a checkout of something else around an installed package
+
+    def nothing(*_, **__):
+        raise FileNotFoundError("git")
+
+    monkeypatch.setattr(provenance.subprocess, "run", nothing)
+    assert asked() == "unknown"
+    monkeypatch.setattr(provenance, "commit", lambda: "abc-dirty")
+    assert not provenance.is_committed()
+    monkeypatch.setattr(provenance, "commit", lambda: "abc")
+    assert provenance.is_committed()

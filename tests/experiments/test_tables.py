@@ -1,6 +1,5 @@
 """Tables at reduced size, and what stands in them."""
 
-import contextlib
 import dataclasses
 import importlib
 import inspect
@@ -15,7 +14,7 @@ import pytest
 
 from commands import results, retrim
 from helpers import brief_preset, tiny_preset
-from made_up import DT, flight, log
+from made_up import DT, Watching, flight, log
 from retrim import ConfigError, Scenario, Setup, changed, load
 from retrim.config import named_presets as presets
 from retrim.config.disturbances import DISTURBANCES
@@ -141,19 +140,13 @@ def test_a_section_is_made_again_for_every_thing_that_it_follows_from(tmp_path, 
 
 
 def test_progress_of_flights_goes_from_nothing_to_all(tmp_path):
-    told = []
-
-    class Watching(Silent):
-        def progress(self, title):
-            return contextlib.nullcontext(lambda share, text: told.append(share))
-
-    preset = brief_preset()
+    preset, watching = brief_preset(), Watching()
     study = Study(preset, {0: Setup.of(preset).new_policy(jax.random.key(0))}, ())
-    flown = fly_all(study, [Scenario(plant="simple")], Run("test", tmp_path), Watching(),
+    flown = fly_all(study, [Scenario(plant="simple")], Run("test", tmp_path), watching,
                     methods=("indi",), starts=2, seconds=1.0)  # fmt: skip
     assert len(flown.flown) == 2
-    assert (told[0], told[-1]) == (0.0, 1.0)
-    assert told == sorted(told)
+    assert (watching.shares[0], watching.shares[-1]) == (0.0, 1.0)
+    assert watching.shares == sorted(watching.shares)
 
 
 def test_what_does_not_fit_together_is_refused_before_training():
@@ -217,11 +210,7 @@ def test_datt_is_trained_once_for_a_folder(tmp_path, monkeypatch):
 def test_a_network_of_datt_is_of_its_vehicle_its_lag_its_steps_and_its_seed(tmp_path, monkeypatch):
     """Another of these is another file; what is learnt goes on from update to update."""
     monkeypatch.setattr(provenance, "commit", lambda: "abc")
-    preset, told, asked = load("hover/retrim"), [], []
-
-    class Watching(Silent):
-        def progress(self, title):
-            return contextlib.nullcontext(lambda share, text: told.append((share, text)))
+    preset, watching, asked = load("hover/retrim"), Watching(), []
 
     def ppo(problem, net, key, settings, *, steps):
         asked.append((problem, tuple(jax.random.key_data(key).tolist()), steps))
@@ -236,10 +225,10 @@ def test_a_network_of_datt_is_of_its_vehicle_its_lag_its_steps_and_its_seed(tmp_
         return jax.tree.leaves(eqx.filter(net, eqx.is_array))
 
     def train(preset=preset, seeds=(0,), steps=2 * size):
-        return rivals.trained_datt(preset, seeds, Run("test", tmp_path), Watching(), steps=steps)
+        return rivals.trained_datt(preset, seeds, Run("test", tmp_path), watching, steps=steps)
 
     nets = train(seeds=(0, 3))
-    assert told == [(0.5, "reward 0.000"), (1.0, "reward 1.000")] * 2
+    assert [said for _, *said in watching.told] == [[0.5, "reward 0.000"], [1.0, "reward 1.000"]] * 2
     assert [steps for *_, steps in asked] == [2 * size] * 2
     assert asked[0][1] != asked[1][1]
     assert any(np.any(a != b) for a, b in zip(weights(nets[0]), weights(nets[3]), strict=True))
@@ -308,21 +297,12 @@ def test_an_interrupted_table_flies_nothing_more(tmp_path):
 
 
 def test_a_training_of_a_table_ends_soon_after_it_is_stopped(tmp_path):
-    run, told = Run("test", tmp_path), []
-
-    def advance(share, text):
-        if share:
-            told.append(share)
-            run.stop.set()
-
-    class Stopping(Silent):
-        def progress(self, title):
-            return contextlib.nullcontext(advance)
-
+    run = Run("test", tmp_path)
+    watching = Watching(lambda share: share and run.stop.set())
     preset = brief_preset(pretrain={"num_updates": 30})
-    assert train_all(preset, [0, 1], run, Stopping()).policies == {}
-    assert len(told) == 1
-    assert told[0] < 1.0
+    assert train_all(preset, [0, 1], run, watching).policies == {}
+    nothing, first = watching.shares
+    assert nothing == 0.0 < first < 1.0
 
 
 def test_every_section_is_written_when_it_is_added(tmp_path):

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from helpers import random_state
-from retrim import PlantError, load
+from retrim import ConfigError, PlantError, load
 from retrim.config import PRESETS, Scenario, Setup
 from retrim.control import AbstractController
 from retrim.experiments.asked import Where
@@ -289,6 +289,12 @@ def test_missing_extra_is_named_before_anything_is_trained(name, monkeypatch):
     monkeypatch.setitem(sys.modules, "pymavlink" if name == "mavlink" else name, None)
     with pytest.raises(PlantError, match=rf"plant '{name}' needs the package .*`uv pip install -e '\.\[{name}\]'`"):
         Where(plant=name, disturbance="none").scenario(load("hover/retrim"))
+
+
+def test_missing_ros_is_named_before_anything_is_trained(monkeypatch):
+    monkeypatch.setitem(sys.modules, "rospy", None)
+    with pytest.raises(ConfigError, match="ROS 1 needs rospy from the system: apt install python3-rospy"):
+        Where(plant="ros").scenario(load("hover/retrim"))
 
 
 def test_missing_firmware_is_named_before_anything_is_trained(monkeypatch):
