@@ -28,9 +28,11 @@ check: dev docs
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-# The documentation site, into site/; a link or name that does not resolve is an error.
+# The documentation site, into site/; a link or name that does not resolve is an error, as is an example or a page whose
+# Python does not run.
 docs: dev
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+	$(BIN)/pytest -m documentation
 
 # The wheel, installed into a clean environment outside the checkout, flies a short demo there.
 wheel: | $(UV)
@@ -59,9 +61,10 @@ test-page: dev
 test-links: dev
 	$(BIN)/pytest -n 0 -m "slow and not px4 and not betaflight" -k "namespaces or autopilots or test_vehicles"
 
-# A sweep by a Dask scheduler and three workers, one of which is killed, while the connection is cut for five seconds.
+# A sweep by a Dask scheduler and three workers, one of which is killed, while the connection is cut for five seconds; and
+# what eight simulated devices share, beside one.
 test-cluster: dev
-	$(BIN)/pytest -n 0 -m slow tests/experiments/test_cluster.py
+	$(BIN)/pytest -n 0 -m slow tests/experiments/test_cluster.py tests/learn/test_devices.py
 
 # Flights through PX4's own simulation, in a network namespace, since it listens on every address. RETRIM_PX4 names the
 # folder of an unpacked PX4, with bin/px4 and etc.

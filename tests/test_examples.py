@@ -12,6 +12,7 @@ EXAMPLES = sorted(FOLDER.glob("0*.py"))
 NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.?\d*(?:e[-+]?\d+)?|nan|inf)(?![\w])", re.IGNORECASE)
 
 
+@pytest.mark.documentation
 @pytest.mark.usefixtures("optax_promotion")
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
 def test_an_example_runs(path, capsys, monkeypatch, tmp_path):

@@ -112,7 +112,7 @@ def watch() -> None:
     shutil.rmtree(PLACE, ignore_errors=True)
     PLACE.mkdir(parents=True)
     environment = {**os.environ, "COVERAGE_FILE": str(PLACE / "reached")}
-    command = [sys.executable, "-m", "pytest", "--cov=retrim", "--cov-context=test", "--cov-report=",
+    command = [sys.executable, "-m", "pytest", "-m", "not slow", "--cov=retrim", "--cov-context=test", "--cov-report=",
                f"--junitxml={PLACE / 'times.xml'}"]  # fmt: skip
     if subprocess.run(command, cwd=ROOT, env=environment, check=False).returncode > 1:
         raise SystemExit("the suite could not be run")
@@ -172,7 +172,7 @@ def _fails(tree: Path, mutant: Mutant, tests: list[str], timeout: float) -> bool
         shutil.copy(ROOT / name, tree / name)
     (tree / mutant.name).write_text(mutant.source)
     environment = {**os.environ, "PYTHONPATH": str(tree / "src")}
-    options = ["-q", "-x", "-n", "0", "-p", "no:cacheprovider", "--timeout", "120"]
+    options = ["-q", "-x", "-n", "0", "-m", "not slow", "-p", "no:cacheprovider", "--timeout", "120"]
     command = [sys.executable, "-m", "pytest", *options, *tests]
     try:
         ran = subprocess.run(command, cwd=tree, env=environment, capture_output=True, timeout=timeout, check=False)

@@ -34,6 +34,7 @@ def ran(tmp_path_factory):
     return json.loads((folder / "pages.json").read_text())
 
 
+@pytest.mark.documentation
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_blocks_of_a_page_run(ran, page):
     assert ran[str(page)] is None, ran[str(page)]

@@ -44,7 +44,8 @@ window, base = RollingBuffer(preset.adapt.window), shared_base(setup.learner, st
 window.push(0.0, State.at(setup.flown.home()), Command.hover(float))
 workers = [PolicyWorker(setup.learner, state, jax.random.key(i)) for i in range(4)]
 base = learn_base(workers, [window.window()] * 4, base, jax.random.key(4))
-learn_together(workers[:3], [window.window()] * 3, base)  # another number of vehicles, other devices
+if {devices} > 1:
+    learn_together(workers[:3], [window.window()] * 3, base)  # another number of vehicles, other devices
 learnt = [jax.tree.leaves(flight.learnt)[0] for flight in flights]
 np.savez(
     "{out}",
@@ -76,6 +77,7 @@ def found(tmp_path_factory):
     return [dict(np.load(folder / f"{devices}.npz")) for devices in (1, 8)]
 
 
+@pytest.mark.slow
 def test_pretraining_is_that_of_one_device(found):
     one, eight = found
     assert len(one["losses"]) == 4
@@ -83,6 +85,7 @@ def test_pretraining_is_that_of_one_device(found):
     np.testing.assert_allclose(eight["weights"], one["weights"], rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_flights_of_a_batch_are_those_of_one_device(found):
     one, eight = found
     assert one["flown"].shape == (8, 51, 3)
@@ -90,6 +93,7 @@ def test_flights_of_a_batch_are_those_of_one_device(found):
     np.testing.assert_allclose(eight["commands"], one["commands"], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_what_a_fleet_learns_is_that_of_one_device(found):
     one, eight = found
     np.testing.assert_array_equal(eight["swaps"], one["swaps"])
@@ -97,6 +101,7 @@ def test_what_a_fleet_learns_is_that_of_one_device(found):
     np.testing.assert_allclose(eight["learnt"], one["learnt"], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_shared_base_is_that_of_one_device(found):
     one, eight = found
     np.testing.assert_allclose(eight["base"], one["base"], atol=1e-7)

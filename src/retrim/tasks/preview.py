@@ -43,19 +43,19 @@ class Preview(AbstractObservation[Float[Array, "history 4"]]):
         """Return the reference relative to the vehicle, in world axes, with attitude, velocity and commands."""
         scaled = jnp.concatenate([(last.c / STANDARD_GRAVITY - 1.0)[None], last.omega / self.omega_max])
         memory = jnp.concatenate([memory, scaled[None]])[1:]
-        soon = jax.vmap(self.reference)(t + jnp.array(POSITIONS, dtype=t.dtype))
-        later = jax.vmap(self.reference)(t + jnp.array(VELOCITIES, dtype=t.dtype))
-        heading = soon.heading[0]
-        moving = [self.reference(t + ahead) for ahead in self.accelerations]
+        # All instants at once: each evaluation of a reference is a program of its own to compile.
+        first, second = len(POSITIONS), len(POSITIONS) + len(VELOCITIES)
+        ahead = jax.vmap(self.reference)(t + jnp.array((*POSITIONS, *VELOCITIES, *self.accelerations), dtype=t.dtype))
+        heading = ahead.heading[0]
         seen = [
-            (soon.p - x.p[None]).reshape(-1),
-            (later.v - x.v[None]).reshape(-1) / VELOCITY_SCALE,
+            (ahead.p[:first] - x.p[None]).reshape(-1),
+            (ahead.v[first:second] - x.v[None]).reshape(-1) / VELOCITY_SCALE,
             x.R.reshape(9),
             x.v / VELOCITY_SCALE,
             jnp.stack([jnp.cos(heading), jnp.sin(heading)]),
             memory.reshape(-1),
-            *(here.a / ACCELERATION_SCALE for here in moving),
-            *(here.jerk / JERK_SCALE for here in moving),
+            (ahead.a[second:] / ACCELERATION_SCALE).reshape(-1),
+            (ahead.jerk[second:] / JERK_SCALE).reshape(-1),
         ]
         return jnp.concatenate(seen), memory
 

@@ -113,7 +113,9 @@ class L2Track(AbstractTrack):
 
     def reward(self, t: Float[Array, ""], x: State, u: Command) -> Float[Array, ""]:
         """Return -L_H(5 (p - p_ref)) - L_H(v - v_ref) - 0.1 L_H(u - u_ref) - 0.5 (1 - cos of the heading error)."""
-        here = self.reference(t)
+        return self._reward(self.reference(t), x, u)
+
+    def _reward(self, here: Point, x: State, u: Command) -> Float[Array, ""]:
         heading = jnp.stack([jnp.cos(here.heading), jnp.sin(here.heading)])
         astray = 1.0 - jnp.sum(heading * x.R[:2, 0])
         return -huber(5.0 * (x.p - here.p)) - huber(x.v - here.v) - 0.1 * huber(u.vector() - here.u) - 0.5 * astray
@@ -124,5 +126,6 @@ class SharpTrack(L2Track):
 
     def reward(self, t: Float[Array, ""], x: State, u: Command) -> Float[Array, ""]:
         """Return that of :class:`L2Track` - 3 (sqrt(|p - p_ref|^2 + (1 cm)^2) - 1 cm)."""
-        tip = jnp.sqrt(jnp.sum((x.p - self.reference(t).p) ** 2) + 0.01**2) - 0.01
-        return super().reward(t, x, u) - 3.0 * tip
+        here = self.reference(t)
+        tip = jnp.sqrt(jnp.sum((x.p - here.p) ** 2) + 0.01**2) - 0.01
+        return self._reward(here, x, u) - 3.0 * tip
