@@ -9,7 +9,7 @@ from commands import results
 from helpers import brief_preset
 from retrim import PlantError, Scenario
 from retrim.config.levers import CONTROL, OFF, ON
-from retrim.experiments import Run
+from retrim.experiments import Run, provenance
 from retrim.experiments.reporter import Silent
 from retrim.experiments.tables.document import Document
 
@@ -142,7 +142,7 @@ def test_the_ablation_trains_what_differs_and_has_a_line_for_each_lever(task, tm
     assert {seeds for _, seeds in done.trained} == {SEEDS}
     keys = [ablation.dump(ablation.replace(preset, adapt=ablation.Adapt())) for preset, _ in done.trained]
     assert len(set(keys)) == len(keys)
-    text = (tmp_path / "ablation.md").read_text()
+    text = (tmp_path / f"ablation_{task}.md").read_text()
     columns = [f"{r}, {name}" if r else name for r in references for name in place]
     assert f"| lever | {' | '.join(columns)} |" in text
     figures = [f"{0.1 * k + (0.5 if r == 'figure8' else 0.0):.4f}" for r in references for k in place.values()]
@@ -151,13 +151,46 @@ def test_the_ablation_trains_what_differs_and_has_a_line_for_each_lever(task, tm
     half = " | ".join(f"{figure} ± 0.0000, 2 of 4 crashed" for figure in figures)
     assert text.count(f"| {half} |") == 2
     assert text.count("\n| ") == len(every) + 2
-    found = results(tmp_path, "ablation.json")["rows"]
+    found = results(tmp_path, f"ablation_{task}.json")["rows"]
     assert [(row["lever"], row["reference"], row["disturbance"]) for row in found] == [
         (lever.label.strip("*"), reference, name) for lever in every for reference in references for name in place
     ]
     for preset, scenarios in ((study.preset, s) for study, s, *_ in done.flown):
         if preset.track is not None and preset.track.observation == "state":
             assert preset.track.reference == scenarios[0].reference
+
+
+def test_an_ablation_goes_on_where_it_was_killed(tmp_path, imagine, monkeypatch):
+    """Levers that were flown whole are not flown again; other seeds, starts or lengths are."""
+    monkeypatch.setattr(provenance, "commit", lambda: "abc")
+    every = len([*CONTROL, *OFF["hover"], *CONTROL, *ON["hover"]])
+    done = imagine(ablation, lambda spec: 0.1)
+
+    def fly(folder=tmp_path / "cut", until=None, **asked):
+        run = Run("test", folder)
+
+        def watch(*words, **more):
+            flown = done.fly(*words, **more)
+            if len(done.flown) == until:
+                run.stop.set()
+            return flown
+
+        done.flown.clear()
+        monkeypatch.setattr(ablation, "fly_all", watch)
+        asked = {"seeds": SEEDS, "seconds": SECONDS, "starts": STARTS} | asked
+        ablation.ablation(run, Silent(), **asked)
+        return len(done.flown), results(folder, "ablation_hover.json")["rows"]
+
+    flown, part = fly(until=4)
+    assert flown == 4
+    flown, again = fly()
+    assert flown == every - 3  # the fourth was cut
+    assert part == again[: len(part)]
+    assert again == fly(tmp_path / "whole")[1]
+    assert "An earlier run had made 3 of the sections" in (tmp_path / "cut" / "ablation_hover.md").read_text()
+    assert fly() == (0, again)
+    for other in ({"seeds": (5,)}, {"seconds": SECONDS + 1.0}, {"starts": STARTS + 1}):
+        assert fly(**other)[0] == every
 
 
 def test_a_section_of_levels_flies_policies_and_rivals_and_orders_them_as_asked(tmp_path, imagine, drawn, monkeypatch):

@@ -13,9 +13,11 @@ from ...config.scenario import Scenario
 from ..flights import Flight
 from ..limits import check_flights, check_seeds
 from ..metrics import cell
+from ..provenance import section_key
 from ..reporter import Reporter
 from ..run import Run
 from .document import Document, TableSection
+from .kept import keep, kept
 from .study import Study, fly_all, train_all
 
 Task = Literal["hover", "track"]
@@ -39,7 +41,8 @@ def ablation(
     """Which lever does what: each off our preset, each on the paper's, beside control without learning.
 
     Args:
-        run: Folder of ablation.md and ablation.json.
+        run: Folder of ablation_hover.md or ablation_track.md, and of the JSON beside it. The same command goes on where
+            it was killed.
         reporter: Receives progress and the sections.
         task: hover or track.
         seeds: Training seeds; each also seeds the starts, the gusts and the learners of its flights.
@@ -48,29 +51,29 @@ def ablation(
     """
     check_seeds(seeds)
     check_flights(starts, seconds)
-    document = Document(run, "ablation", f"Ablation: {task}", INTRO, seeds, reporter)
+    document = Document(run, f"ablation_{task}", f"Ablation: {task}", INTRO, seeds, reporter)
     studies = dict[str, Study]()
     for name, levers in ((f"{task}/retrim", (*CONTROL, *OFF[task])), (f"{task}/paper", (*CONTROL, *ON[task]))):
         lines, found = list[tuple[str, ...]](), list[dict[str, Any]]()
         for lever in levers:
             if run.interrupted:
                 break
-            reporter.say(f"{name}: {lever.label.strip('*')}")
             preset = changed(load(name), **lever.changes)
-            cells = []
-            for reference in REFERENCES[task]:
-                followed = _follows(preset, reference)
-                study = _study(followed, studies, seeds, run, reporter)
-                scenarios = [Scenario(each, reference=reference) for each in DISTURBANCES[task]]
-                methods = (lever.method,)
-                flights = fly_all(study, scenarios, run, reporter, methods=methods, starts=starts, seconds=seconds)
-                for scenario in scenarios:
-                    group = [flight for flight in flights.flown if flight.spec.scenario == scenario]
-                    if group:
-                        found.append(_row(group, name, lever))
-                        cells.append(cell(found[-1], digits=4))
+            key = section_key(
+                table="ablation", preset=dump(preset), lever=lever.label, method=lever.method, seeds=list(seeds),
+                seconds=seconds, starts=starts,
+            )  # fmt: skip
+            if (made := kept(run, key)) is not None:
+                reporter.say(f"{name}: {lever.label.strip('*')}, as an earlier run of this folder has made it")
+                document.earlier += 1
+            else:
+                reporter.say(f"{name}: {lever.label.strip('*')}")
+                made = _flown(preset, lever, task, studies, document, starts=starts, seconds=seconds)
+                if not run.interrupted:
+                    keep(run, key, *made)
             if not run.interrupted:
-                lines.append((lever.label, *cells))
+                lines += made[0].rows
+            found += made[1]
         columns = tuple(
             each if reference is None else f"{reference}, {each}"
             for reference in REFERENCES[task]
@@ -78,6 +81,32 @@ def ablation(
         )
         document.add(TableSection(("lever", *columns), tuple(lines), f"Preset {name}"), found)
     document.write()
+
+
+def _flown(
+    preset: Preset,
+    lever: Lever,
+    task: Task,
+    studies: dict[str, Study],
+    document: Document,
+    *,
+    starts: int,
+    seconds: float,
+) -> tuple[TableSection, list[dict[str, Any]]]:
+    """Fly one lever under all disturbances; return its line of the table, and the rows behind it."""
+    run, reporter = document.run, document.reporter
+    cells, found = list[str](), list[dict[str, Any]]()
+    for reference in REFERENCES[task]:
+        study = _study(_follows(preset, reference), studies, document.seeds, run, reporter)
+        scenarios = [Scenario(each, reference=reference) for each in DISTURBANCES[task]]
+        methods = (lever.method,)
+        flights = fly_all(study, scenarios, run, reporter, methods=methods, starts=starts, seconds=seconds)
+        for scenario in scenarios:
+            group = [flight for flight in flights.flown if flight.spec.scenario == scenario]
+            if group:
+                found.append(_row(group, preset.name, lever))
+                cells.append(cell(found[-1], digits=4))
+    return TableSection((), ((lever.label, *cells),)), found
 
 
 def _follows(preset: Preset, reference: str | None) -> Preset:
