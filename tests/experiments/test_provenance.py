@@ -9,6 +9,7 @@ import threading
 
 import pytest
 
+import retrim
 from retrim.errors import ConfigError
 from retrim.experiments import Run, provenance
 from retrim.experiments.interrupts import interrupts_only_set
@@ -104,3 +105,10 @@ def test_a_commit_is_that_of_the_checkout_and_tells_local_changes(monkeypatch):
     assert not provenance.is_committed()
     monkeypatch.setattr(provenance, "commit", lambda: "abc")
     assert provenance.is_committed()
+
+
+def test_a_page_says_what_it_was_made_by(monkeypatch):
+    monkeypatch.setattr(provenance, "commit", lambda: "abc-dirty")
+    assert provenance.describe_code() == "Commit abc-dirty"
+    monkeypatch.setattr(provenance, "commit", lambda: "unknown")
+    assert provenance.describe_code() == f"retrim {retrim.__version__}, installed"

@@ -17,6 +17,8 @@ import jax
 PACKAGES = ("retrim", "jax", "jaxlib", "equinox", "optax", "numpy")
 EXTRAS = ("rotorpy", "mujoco", "crazyflow", "foundation-policy")
 """Packages that fly in some flights, where they are installed."""
+UNKNOWN = "unknown"
+"""In the place of a commit, where the package is no checkout."""
 
 
 @functools.cache
@@ -31,10 +33,15 @@ def commit() -> str:
 
     try:
         if Path(git("rev-parse", "--show-toplevel")) / "src" / "retrim" != here.parent:
-            return "unknown"
+            return UNKNOWN
         return git("rev-parse", "--short=12", "HEAD") + ("-dirty" if git("status", "--porcelain") else "")
     except (OSError, subprocess.CalledProcessError):
-        return "unknown"
+        return UNKNOWN
+
+
+def describe_code() -> str:
+    """Return the commit in words; of an installed package, which has none, its version."""
+    return f"Commit {commit()}" if commit() != UNKNOWN else f"retrim {version('retrim')}, installed"
 
 
 def is_committed() -> bool:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ..provenance import commit, describe_hardware
+from ..provenance import describe_code, describe_hardware
 from ..reporter import Reporter
 from ..run import Run
 
@@ -67,7 +67,7 @@ class Document:
         remark = [self.run.remark, ""] if self.run.remark else []
         head = [f"# {self.title}", "", self.intro, "", *remark]
         trained = f"; training seeds {seeds}" if seeds else ""
-        head += [f"Commit {commit()}; {describe_hardware()}{trained}.", ""]
+        head += [f"{describe_code()}; {describe_hardware()}{trained}.", ""]
         body = [line for section in self.sections for line in section.markdown()]
         foot = self.run.watch.sentence() + (" Interrupted: incomplete." if self.run.interrupted else "")
         if self.earlier:
