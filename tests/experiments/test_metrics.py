@@ -9,7 +9,7 @@ import pytest
 from made_up import DT, flight, log
 from retrim import Scenario
 from retrim.experiments import FlightSpec, rows
-from retrim.experiments.metrics import cell, interval
+from retrim.experiments.metrics import cell, interval, metres
 from retrim.runtime.flight import States
 
 
@@ -148,3 +148,10 @@ def test_an_interval_does_not_forget_that_flights_of_a_seed_are_alike():
     assert high < wide_high
     assert interval([{"seed": 0, "error": None}]) is None
     assert interval([{"seed": 0, "error": 0.5}]) == [0.5, 0.5]
+
+
+def test_what_is_below_a_millimetre_is_shown_with_a_digit_more():
+    (row,) = rows([flight(0.0004), flight(0.0002)])
+    assert cell(row) == "0.0003 ± 0.0001"
+    assert cell(row, digits=2) == "0.00 ± 0.00"
+    assert [metres(value) for value in (0.00096, 0.001, 0.0123, np.inf)] == ["0.0010", "0.001", "0.012", "inf"]

@@ -165,11 +165,26 @@ def _column(records: Sequence[Mapping[str, Any]], name: str) -> np.ndarray:
     return np.array([np.inf if each[name] is None else each[name] for each in records])
 
 
-def cell(row: dict[str, Any], digits: int = 3) -> str:
-    """Return mean +- standard deviation [m], with the flights that were terminated, or whose job failed."""
+def metres(value: float) -> str:
+    """Return a length or an error [m] as text: with three digits behind the point, and four below a millimetre."""
+    return f"{value:.{_digits(value)}f}"
+
+
+def _digits(value: float) -> int:
+    return 3 if value >= 1e-3 else 4
+
+
+def cell(row: dict[str, Any], digits: int | None = None) -> str:
+    """Return mean +- standard deviation [m], with the flights that were terminated, or whose job failed.
+
+    Args:
+        row: As :func:`summary` makes it.
+        digits: Behind the point; as in :func:`metres` by default.
+    """
     failed = f", {len(row['failures'])} of {row['n']} failed" if row.get("failures") else ""
     if row["mean"] is None:
         return f"crashed, {row['crashes']} of {row['n']}" + failed if row["crashes"] else failed.removeprefix(", ")
+    digits = digits or _digits(row["mean"])
     text = f"{row['mean']:.{digits}f}" + (f" ± {row['std']:.{digits}f}" if row["std"] is not None else "")
     return text + (f", {row['crashes']} of {row['n']} crashed" if row["crashes"] else "") + failed
 

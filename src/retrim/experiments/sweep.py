@@ -25,7 +25,7 @@ from .fleet import Fleet
 from .flights import Flight, FlightSpec
 from .gathering import told_by
 from .limits import check_seeds
-from .metrics import Rows, cell, failed_record, record, summary
+from .metrics import Rows, cell, failed_record, metres, record, summary
 from .reporter import Reporter
 from .run import Run
 from .tables.document import Document, TableSection
@@ -208,7 +208,7 @@ def _report(sweep: Sweep, kept: Sequence[dict[str, Any]], run: Run, reporter: Re
         row = summary(flights, GROUP)
         found.append(row)
         none = "crashed" if row["crashes"] else "-"
-        figures = (none if row[name] is None else f"{row[name]:.3f}" for name in ("median", "max"))
+        figures = (none if row[name] is None else metres(row[name]) for name in ("median", "max"))
         cells.append((*(str(flights[0][name]) for name in varied), cell(row), *figures))
     intro = "Made by `retrim sweep`. Error [m] over the last seconds of each flight, over seeds and starts."
     document = Document(run, "sweep", "Sweep", intro, sweep.seeds, reporter, {"sweep": dataclasses.asdict(sweep)})

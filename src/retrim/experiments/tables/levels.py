@@ -13,7 +13,7 @@ from ...config.presets import Preset
 from ...config.scenario import Scenario
 from ...config.setup import Setup
 from ..figures import picture
-from ..metrics import cell, rows
+from ..metrics import cell, metres, rows
 from ..provenance import section_key
 from ..reporter import Reporter
 from ..rivals import DATT_STEPS, RIVALS, check_rival, check_steps
@@ -195,4 +195,4 @@ def _in_step(row: dict[str, Any] | None) -> str:
     """Error but for the best constant shift in time, and distance from the nearest point of the reference [m]."""
     if row is None or row.get("unshifted_m") is None or "cross_track_m" not in row:
         return "-"
-    return f"{row['unshifted_m']:.3f}; {row['cross_track_m']:.3f}"
+    return f"{metres(row['unshifted_m'])}; {metres(row['cross_track_m'])}"
