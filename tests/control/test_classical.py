@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -32,8 +33,8 @@ def made(kind, task):
     return Geometric(task, gains(12.0 if kind == "geometric-i" else 0.0), PREDICTION, jnp.array(6.0))
 
 
-def flown(controller, x0, push, seconds=8.0, start=0.0):
-    """States by tick, in the lagged model with a command delay of one tick, pushed from ``start`` on [s]."""
+@eqx.filter_jit
+def _flown(controller, x0, push, start, ticks):
     model = Lagged(PointMass(DT), jnp.array(TAU))
 
     def tick(carry, k):
@@ -44,7 +45,12 @@ def flown(controller, x0, push, seconds=8.0, start=0.0):
         return (s, memory, u), model.state(s)
 
     first = (model.init(x0), controller.init(x0), Command.hover(x0.p.dtype))
-    return jax.jit(lambda: lax.scan(tick, first, jnp.arange(round(seconds / DT)))[1])()
+    return lax.scan(tick, first, jnp.arange(ticks))[1]
+
+
+def flown(controller, x0, push, seconds=8.0, start=0.0):
+    """States by tick, in the lagged model with a command delay of one tick, pushed from ``start`` on [s]."""
+    return _flown(controller, x0, push, jnp.array(start), round(seconds / DT))
 
 
 @pytest.mark.parametrize("kind", ["geometric", "geometric-i", "indi"])

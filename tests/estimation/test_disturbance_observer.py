@@ -1,5 +1,6 @@
 """The disturbance observer: exact without noise, told nothing of the noise that slows it down."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,6 +20,12 @@ def observed(observer, key, *, ticks=200, noise=0.0, late=0, turning=1.0, d=D, t
     It turns ``turning`` times as fast as it is told to, its thrust follows by ``thrust_tau`` [s], and its velocity is
     measured with ``noise`` [m/s].
     """
+    thrust_tau = None if thrust_tau is None else jnp.array(thrust_tau)
+    return _observed(observer, key, ticks, jnp.array(noise), late, jnp.array(turning), d, thrust_tau)
+
+
+@eqx.filter_jit
+def _observed(observer, key, ticks, noise, late, turning, d, thrust_tau):
     model = PointMass(DT)
     keys = random.split(key, ticks)
 
@@ -32,7 +39,7 @@ def observed(observer, key, *, ticks=200, noise=0.0, late=0, turning=1.0, d=D, t
         s = observer.issued(s, u)
         queue = jax.tree.map(lambda old, new: jnp.concatenate([old[1:], new[None]]), queue, u)
         acting = jax.tree.map(lambda leaf: leaf[0], queue)
-        c, thrust = (acting.c, thrust) if thrust_tau is None else lagged(thrust, acting.c, DT, jnp.array(thrust_tau))
+        c, thrust = (acting.c, thrust) if thrust_tau is None else lagged(thrust, acting.c, DT, thrust_tau)
         x = model.step(x, Command(c, turning * acting.omega), d)
         seen = State(x.p, x.R, x.v + noise * random.normal(k_noise, (3,)))
         s = observer(s, seen)
@@ -109,13 +116,14 @@ def test_it_follows_a_wandering_disturbance_about_as_well_as_the_best_constant_f
     walk = jnp.cumsum(4.0 * DT**0.5 * random.normal(random.fold_in(key, 3), (1500, 3)), axis=0)
     seen = jnp.cumsum(DT * walk, axis=0) + 0.02 * random.normal(random.fold_in(key, 4), walk.shape)
 
+    @eqx.filter_jit
     def error(observer):
         def tick(s, v):
             s = observer.issued(observer(s, State(jnp.zeros(3), jnp.eye(3), v)), Command.hover(jnp.float64))
             return s, s.d_hat
 
         _, found = jax.lax.scan(tick, observer.init(State.at(jnp.zeros(3))), seen)
-        return float(jnp.sqrt(jnp.mean((found - walk)[200:] ** 2)))
+        return jnp.sqrt(jnp.mean((found - walk)[200:] ** 2))
 
     constant = min(error(make(tau=tau, wander=np.inf, limit=99.0)) for tau in (0.02, 0.05, 0.1, 0.2, 0.4))
     assert error(make(tau=1e-3, limit=99.0)) < 1.02 * constant

@@ -19,6 +19,16 @@ OPTIMISER = optax.adam(1e-2)
 pytestmark = pytest.mark.usefixtures("optax_promotion")
 
 
+@eqx.filter_jit
+def _fit(state, rows, weight):
+    return fit_ensemble(state, rows, optimiser=OPTIMISER, steps=100, spectral_weight=weight)
+
+
+def fit(state, rows, spectral_weight=1e-4):
+    """A hundred steps, as one program for all tests."""
+    return _fit(state, rows, jnp.array(spectral_weight))
+
+
 def ensemble(key, members=3, hidden=(128, 128)):
     fresh = eqx.filter_jit(EnsembleResidual.of)
     return fresh(jnp.array(GOAL), small().omega_max, key=key, members=members, hidden=hidden)
@@ -33,7 +43,7 @@ def test_a_filling_window_counts_only_what_was_flown(key):
     spoilt = eqx.tree_at(lambda w: (w.x.v, w.valid), window, (window.x.v.at[:10].set(100.0), jnp.arange(40) >= 11))
     state = EnsembleState.of(ensemble(key), OPTIMISER)
     rows = residual_targets(spoilt, PointMass(0.02))
-    fitted, errors = fit_ensemble(state, rows, optimiser=OPTIMISER, steps=100, spectral_weight=1e-4)
+    fitted, errors = fit(state, rows)
     assert float(errors[-1]) < 1e-2
     predicted = jax.vmap(fitted.residual)(rows.x, rows.u)[np.asarray(rows.valid)]
     np.testing.assert_allclose(predicted, np.broadcast_to([1.0, 0.0, 0.0], predicted.shape), atol=0.3)
@@ -42,9 +52,8 @@ def test_a_filling_window_counts_only_what_was_flown(key):
 def fitted_on(field, key, fits=3):
     state = EnsembleState.of(ensemble(key), OPTIMISER)
     rows = residual_targets(random_field_flight(field, key), PointMass(0.02))
-    fit = jax.jit(lambda s: fit_ensemble(s, rows, optimiser=OPTIMISER, steps=100, spectral_weight=1e-4))
     for _ in range(fits):  # warm starts
-        state, errors = fit(state)
+        state, errors = fit(state, rows)
     return state, rows, errors
 
 
@@ -64,7 +73,7 @@ def test_recovers_a_field_linear_in_velocity(key):
 
 def test_warm_start_continues(key):
     once, rows, first = fitted_on(linear_drag, key, fits=1)
-    _, second = fit_ensemble(once, rows, optimiser=OPTIMISER, steps=100, spectral_weight=1e-4)
+    _, second = fit(once, rows)
     assert float(second[0]) < 3.0 * float(first[-1]) < 0.1 * float(first[0])
 
 
@@ -103,7 +112,8 @@ def test_the_penalty_shrinks_the_spectral_norm(key):
 
     def norm(spectral_weight):
         state = EnsembleState.of(ensemble(key, members=1), OPTIMISER)
-        state, _ = fit_ensemble(state, rows, optimiser=OPTIMISER, steps=200, spectral_weight=spectral_weight)
+        for _ in range(2):
+            state, _ = fit(state, rows, spectral_weight)
         return np.linalg.norm(state.residual.layers[0][1].weight, 2)
 
     assert norm(1.0) < 0.7 * norm(0.0)
@@ -137,10 +147,10 @@ def test_a_fresh_model_predicts_zero_and_is_sure_of_it(model, key):
 def test_a_fit_goes_on_where_the_last_one_ended(model, key):
     """Two fits of 30 steps are one of 60: weights, Adam's moments and the vectors of the power iteration go on."""
     rows = residual_targets(random_field_flight(linear_drag, key), PointMass(0.02))
-    fit = eqx.filter_jit(lambda model, state: model.fit(state, rows))
+    of_model = eqx.filter_jit(lambda model, state: model.fit(state, rows))
     fresh = model.init(key)
-    once, first = fit(model, fresh)
-    twice, second = fit(model, once)
+    once, first = of_model(model, fresh)
+    twice, second = of_model(model, once)
     assert float(second) < float(first)
     (adam, _), (adam_fresh, _) = twice.optimiser, fresh.optimiser
     assert int(adam_fresh.count) == 0
@@ -148,7 +158,7 @@ def test_a_fit_goes_on_where_the_last_one_ended(model, key):
     for v, v_fresh in zip(jax.tree.leaves(twice.vectors), jax.tree.leaves(fresh.vectors), strict=True):
         assert float(jnp.abs(v - v_fresh).max()) > 1e-3
         assert float(jnp.linalg.norm(v)) == pytest.approx(1.0)
-    at_once, _ = fit(replaced(model, steps=60), fresh)
+    at_once, _ = of_model(replaced(model, steps=60), fresh)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-9), twice, at_once)
 
 
@@ -187,8 +197,10 @@ def test_the_spectral_weight_reaches_every_layer_of_every_member(key):
     state = replaced(state, vectors=exact)
     rows = residual_targets(random_field_flight(linear_drag, key, n=20), PointMass(0.02))
     rows = replaced(rows, valid=jnp.zeros_like(rows.valid))
-    after, _ = fit_ensemble(state, rows, optimiser=descent, steps=1, spectral_weight=0.5)
-    still, _ = fit_ensemble(state, rows, optimiser=descent, steps=1, spectral_weight=0.0)
+    one_step = eqx.filter_jit(
+        lambda weight: fit_ensemble(state, rows, optimiser=descent, steps=1, spectral_weight=weight)
+    )
+    (after, _), (still, _) = (one_step(jnp.array(weight)) for weight in (0.5, 0.0))
     for member, moved, unmoved in zip(residual.layers, after.residual.layers, still.residual.layers, strict=True):
         for layer, new, same in zip(member, moved, unmoved, strict=True):
             U, S, Vt = np.linalg.svd(np.asarray(layer.weight))
