@@ -27,10 +27,11 @@ def command_of(make: Callable[..., None], called: str = "reproduce") -> Callable
     def command(*, out: Path | None = None, on: str | None = None, **chosen: Any) -> Ordered:
         def ordered(stop: threading.Event) -> int:
             (asked, remark), reporter = looked(make, chosen), RichReporter()
+            named = [asked["task"]] if "task" in asked else []  # a page for each task
             with joined(on, reporter) as executor:
                 run = started(Run(called, out, stop=stop, remark=remark, executor=executor))
                 make(run, reporter, **asked)
-            show_paths([run.folder / f"{name}.md"])
+            show_paths([run.folder / f"{'_'.join([name, *named])}.md"])
             return run.exit_code
 
         return ordered
