@@ -187,7 +187,7 @@ def test_an_ablation_goes_on_where_it_was_killed(tmp_path, imagine, monkeypatch)
     assert flown == every - 3  # the fourth was cut
     assert part == again[: len(part)]
     assert again == fly(tmp_path / "whole")[1]
-    assert "An earlier run had made 3 of the sections" in (tmp_path / "cut" / "ablation_hover.md").read_text()
+    assert "An earlier run had made 3 of the parts" in (tmp_path / "cut" / "ablation_hover.md").read_text()
     assert fly() == (0, again)
     for other in ({"seeds": (5,)}, {"seconds": SECONDS + 1.0}, {"starts": STARTS + 1}):
         assert fly(**other)[0] == every

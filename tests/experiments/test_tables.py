@@ -104,7 +104,7 @@ def test_a_run_goes_on_where_it_was_killed(tmp_path, monkeypatch):
     again = table(sections)
     assert flown == ["1", "2"]
     assert whole == again
-    assert "An earlier run had made 2 of the sections" in (tmp_path / "table.md").read_text()
+    assert "An earlier run had made 2 of the parts" in (tmp_path / "table.md").read_text()
     table(sections, starts=2)
     assert flown == ["1", "2"] * 2
     monkeypatch.setattr(provenance, "commit", lambda: "abc-dirty")
@@ -313,6 +313,7 @@ def test_every_section_is_written_when_it_is_added(tmp_path):
     found = results(tmp_path, "table.json")
     assert (found["rows"], found["seeds"], found["more"]) == ([{"x": 1}, {"x": 2}], [0, 4], 1)
     assert (tmp_path / "table.md").read_text().count("| a | b |") == 1
+    assert document.run.pages == [tmp_path / "table.md"]
 
 
 def test_errors_are_read_around_reversals_and_updates(tmp_path):

@@ -19,7 +19,7 @@ def command_of(make: Callable[..., None], called: str = "reproduce") -> Callable
     """Return a command with the options of a table, and ``out``.
 
     Args:
-        make: It makes a document of its own name from a run and a reporter.
+        make: It makes a document from a run and a reporter.
         called: Name of the command, for the folder of its runs.
     """
     name, options = make.__name__, options_of(make)
@@ -27,11 +27,10 @@ def command_of(make: Callable[..., None], called: str = "reproduce") -> Callable
     def command(*, out: Path | None = None, on: str | None = None, **chosen: Any) -> Ordered:
         def ordered(stop: threading.Event) -> int:
             (asked, remark), reporter = looked(make, chosen), RichReporter()
-            named = [asked["task"]] if "task" in asked else []  # a page for each task
             with joined(on, reporter) as executor:
                 run = started(Run(called, out, stop=stop, remark=remark, executor=executor))
                 make(run, reporter, **asked)
-            show_paths([run.folder / f"{'_'.join([name, *named])}.md"])
+            show_paths(run.pages)
             return run.exit_code
 
         return ordered

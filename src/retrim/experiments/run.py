@@ -51,6 +51,7 @@ class Run:
         self.remark = remark
         self.trained = trained or self.folder
         self.executor, self.failed = executor, False
+        self.pages: list[Path] = []  # that its documents have written
         self.watch = Stopwatch()
         self.replaces = out is not None and any(self.folder.glob("*.json"))
         self.stop = stop or threading.Event()

@@ -43,7 +43,7 @@ class Preview(AbstractObservation[Float[Array, "history 4"]]):
         """Return the reference relative to the vehicle, in world axes, with attitude, velocity and commands."""
         scaled = jnp.concatenate([(last.c / STANDARD_GRAVITY - 1.0)[None], last.omega / self.omega_max])
         memory = jnp.concatenate([memory, scaled[None]])[1:]
-        # All instants at once: each evaluation of a reference is a program of its own to compile.
+        # All instants at once: each evaluation of a reference would be compiled anew.
         first, second = len(POSITIONS), len(POSITIONS) + len(VELOCITIES)
         ahead = jax.vmap(self.reference)(t + jnp.array((*POSITIONS, *VELOCITIES, *self.accelerations), dtype=t.dtype))
         heading = ahead.heading[0]

@@ -51,7 +51,7 @@ class Document:
     sections: list[TableSection] = field(default_factory=list)
     """What was added."""
     earlier: int = 0
-    """How many of them an earlier run of the folder had made."""
+    """How many parts, sections or lines of them, an earlier run of the folder had made."""
     _rows: list[dict[str, Any]] = field(default_factory=list)
 
     def add(self, section: TableSection, rows: Sequence[dict[str, Any]] = ()) -> None:
@@ -71,6 +71,9 @@ class Document:
         body = [line for section in self.sections for line in section.markdown()]
         foot = self.run.watch.sentence() + (" Interrupted: incomplete." if self.run.interrupted else "")
         if self.earlier:
-            foot += f" An earlier run had made {self.earlier} of the sections; its time is not counted."
+            foot += f" An earlier run had made {self.earlier} of the parts; its time is not counted."
         self.run.write_results(self._rows, seeds=self.seeds, name=self.data or self.name, **self.more)
-        return self.run.write_text(f"{self.name}.md", "\n".join([*head, *body, foot, ""]))
+        page = self.run.write_text(f"{self.name}.md", "\n".join([*head, *body, foot, ""]))
+        if page not in self.run.pages:
+            self.run.pages.append(page)
+        return page

@@ -5,7 +5,7 @@ from dataclasses import replace
 from ...config.plants import PLANTS
 from ...config.scenario import Scenario
 from ...errors import PlantError
-from ..metrics import cell, rows
+from ..metrics import cell, metres, rows
 from ..reporter import Reporter
 from ..run import Run
 from .document import Document, TableSection
@@ -104,6 +104,6 @@ def plants(
             cells = ["-" if row is None else cell(row) for row in ours]
             peak = ours[-1] and ours[-1]["peak_after_5s"]
             n, crashes = (sum(row[key] for row in ours if row) for key in ("n", "crashes"))
-            lines.append((name, *cells, "-" if peak is None else f"{peak:.3f}", f"{crashes} of {n}"))
+            lines.append((name, *cells, "-" if peak is None else metres(peak), f"{crashes} of {n}"))
         document.add(TableSection(COLUMNS, tuple(lines), title), found)
     document.write()

@@ -11,7 +11,7 @@ from ...config.setup import Setup
 from ...errors import ConfigError
 from ..figures import picture
 from ..flights import Flight
-from ..metrics import rows
+from ..metrics import metres, rows
 from ..reporter import Reporter
 from ..run import Run
 from .document import Document, TableSection
@@ -85,7 +85,7 @@ def reversing(
 
 
 def _peak(row: dict[str, Any]) -> str:
-    return "-" if row["peak_after_5s"] is None else f"{row['peak_after_5s']:.3f}"
+    return "-" if row["peak_after_5s"] is None else metres(row["peak_after_5s"])
 
 
 def _moments(adapt: Adapt, seconds: float) -> tuple[np.ndarray, list[int]]:
