@@ -102,7 +102,7 @@ def plants(
         for name in disturbances:
             ours = [by.get((name, method)) for method in METHODS]
             cells = ["-" if row is None else cell(row) for row in ours]
-            peak = ours[-1] and ours[-1]["peak_after_5s"]
+            peak = None if ours[-1] is None else ours[-1]["peak_after_5s"]
             n, crashes = (sum(row[key] for row in ours if row) for key in ("n", "crashes"))
             lines.append((name, *cells, "-" if peak is None else metres(peak), f"{crashes} of {n}"))
         document.add(TableSection(COLUMNS, tuple(lines), title), found)
