@@ -127,7 +127,7 @@ def test_the_ablation_trains_what_differs_and_has_a_line_for_each_lever(task, tm
     place = {name: k for k, name in enumerate(ablation.DISTURBANCES[task])}
 
     def error(spec):
-        ours = 0.1 * place[spec.scenario.disturbance] + (0.5 if spec.scenario.reference == "figure8" else 0.0)
+        ours = 0.1 + 0.1 * place[spec.scenario.disturbance] + (0.5 if spec.scenario.reference == "figure8" else 0.0)
         return None if spec.method == "base-i" and spec.start == 1 else ours
 
     done = imagine(ablation, error)
@@ -145,7 +145,7 @@ def test_the_ablation_trains_what_differs_and_has_a_line_for_each_lever(task, tm
     text = (tmp_path / f"ablation_{task}.md").read_text()
     columns = [f"{r}, {name}" if r else name for r in references for name in place]
     assert f"| lever | {' | '.join(columns)} |" in text
-    figures = [f"{0.1 * k + (0.5 if r == 'figure8' else 0.0):.4f}" for r in references for k in place.values()]
+    figures = [f"{0.1 + 0.1 * k + (0.5 if r == 'figure8' else 0.0):.4f}" for r in references for k in place.values()]
     shown = " | ".join(f"{figure} ± 0.0000" for figure in figures)
     assert text.count(f"| {shown} |") == len(every) - 2
     half = " | ".join(f"{figure} ± 0.0000, 2 of 4 crashed" for figure in figures)

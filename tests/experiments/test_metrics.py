@@ -153,5 +153,15 @@ def test_an_interval_does_not_forget_that_flights_of_a_seed_are_alike():
 def test_what_is_below_a_millimetre_is_shown_with_a_digit_more():
     (row,) = rows([flight(0.0004), flight(0.0002)])
     assert cell(row) == "0.0003 ± 0.0001"
-    assert cell(row, digits=2) == "0.00 ± 0.00"
+    assert cell(row, digits=5) == "0.00030 ± 0.00014"
     assert [metres(value) for value in (0.00096, 0.001, 0.0123, np.inf)] == ["0.0010", "0.001", "0.012", "inf"]
+
+
+def test_nothing_is_shown_as_zero():
+    (row,) = rows([flight(0.00001), flight(0.00002)])
+    assert cell(row) == "< 0.0001"
+    assert [metres(value) for value in (0.0, 4.9e-5, 5.1e-5)] == ["< 0.0001", "< 0.0001", "0.0001"]
+    (row,) = rows([flight(0.00001), flight(0.0, terminated=True)])
+    assert cell(row) == "< 0.0001, 1 of 2 crashed"
+    (row,) = rows([flight(0.004)])
+    assert cell(row, digits=2) == "< 0.01"

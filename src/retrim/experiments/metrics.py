@@ -166,12 +166,17 @@ def _column(records: Sequence[Mapping[str, Any]], name: str) -> np.ndarray:
 
 
 def metres(value: float) -> str:
-    """Return a length or an error [m] as text: with three digits behind the point, and four below a millimetre."""
-    return f"{value:.{_digits(value)}f}"
+    """Return an error [m] as text, with three digits behind the point, four below a millimetre, and never as zero."""
+    return _shown(value, _digits(value))
 
 
 def _digits(value: float) -> int:
     return 3 if value >= 1e-3 else 4
+
+
+def _shown(value: float, digits: int) -> str:
+    least = 10.0**-digits
+    return f"{value:.{digits}f}" if value >= 0.5 * least else f"< {least:.{digits}f}"
 
 
 def cell(row: dict[str, Any], digits: int | None = None) -> str:
@@ -185,7 +190,9 @@ def cell(row: dict[str, Any], digits: int | None = None) -> str:
     if row["mean"] is None:
         return f"crashed, {row['crashes']} of {row['n']}" + failed if row["crashes"] else failed.removeprefix(", ")
     digits = digits or _digits(row["mean"])
-    text = f"{row['mean']:.{digits}f}" + (f" ± {row['std']:.{digits}f}" if row["std"] is not None else "")
+    text = _shown(row["mean"], digits)
+    if row["std"] is not None and not text.startswith("<"):
+        text += f" ± {row['std']:.{digits}f}"
     return text + (f", {row['crashes']} of {row['n']} crashed" if row["crashes"] else "") + failed
 
 
