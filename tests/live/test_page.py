@@ -26,6 +26,7 @@ SMALL = (
     "fallback",
     "knobs",
     "wish",
+    "followed",
     "ended",
     "world",
     "learner.residual",
@@ -63,7 +64,8 @@ def flight(tmp_path):
     pytest.importorskip("viser")
     bus = SharedMemoryBus.create(dict.fromkeys(SMALL, 65536))
     port = free_port("127.0.0.1", 18080)
-    spec = PageSpec("127.0.0.1", port, "hover", HOME[None].repeat(2, 0), ("full", "lora"), 0.06, 0.19)
+    paths = {"circle": HOME[None] + np.eye(3), "figure8": HOME[None] - np.eye(3)}
+    spec = PageSpec("127.0.0.1", port, "hover", HOME[None].repeat(2, 0), ("full", "lora"), 0.06, 0.19, paths)
     process = launch("retrim.live.page:show", PagePlan(bus.folder, spec, os.getpid()), tmp_path / "page.log")
     try:
         yield bus, f"http://127.0.0.1:{port}"
@@ -119,8 +121,13 @@ def test_a_knob_in_a_browser_is_a_message_on_the_bus(flight):
         assert Knobs.unpack(bus.latest("knobs").data).kick[0] > 0
         page.get_by_role("button", name="Calm").click()
         hover(bus, 20.0, lambda: Knobs.unpack(bus.latest("knobs").data).push[0] == 0.0)
-        page.get_by_role("button", name="Land").click()
+        page.get_by_role("combobox", name="reference").click()
+        page.get_by_role("option", name="figure8").click()
         hover(bus, 20.0, lambda: bus.latest("wish") is not None)
+        assert unpack_note(bus.latest("wish").data, "wish") == {"reference": "figure8"}
+        bus.publish("followed", pack_note("followed", name="figure8"))
+        page.get_by_role("button", name="Land").click()
+        hover(bus, 20.0, lambda: "land" in unpack_note(bus.latest("wish").data, "wish"))
         assert unpack_note(bus.latest("wish").data, "wish")["land"]
         shot = page.screenshot()
         browser.close()

@@ -118,7 +118,7 @@ def _fly(request: LiveRequest, run: Run) -> int:
     if done is None:
         return INTERRUPTED
     show_table(TableSection(("figure", "unit", "value"), figures(done.rows), f"live, {done.flight.log.t[-1]:.1f} s"))
-    drawn = picture([done.flight], request.setup, request.scenario, run.folder, stem="live")
+    drawn = picture([done.flight], done.request.setup, request.scenario, run.folder, stem="live")
     show_paths([*drawn[:1], *done.paths])
     return run.exit_code or int(not done.landed)
 

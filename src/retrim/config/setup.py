@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import jax
 import jax.numpy as jnp
 import optax
 from jax import random
@@ -27,6 +28,7 @@ from ..physics.vehicle import Vehicle
 from ..runtime.adaptive import AdaptivePilot, Scheduled
 from ..runtime.lockstep import LockstepLearner
 from ..runtime.pilot import Pilot
+from ..tasks.abstract_reference import AbstractReference
 from ..tasks.keypoints import Keypoints
 from ..tasks.motions import MOTIONS
 from ..tasks.reference import Reference
@@ -102,6 +104,28 @@ class Setup:
                 error if isinstance(error, ConfigError) else ConfigError(f"preset {preset.name!r}: {error}")
             ) from error
         return cls(preset, vehicle, env, flown, learner, pretraining_optimiser(preset.pretrain))
+
+    def on(self, reference: AbstractReference) -> "Setup":
+        """Return the same set-up whose flight, and the learner beside it, follow another reference.
+
+        Args:
+            reference: Of the sizes of the one that is followed, or programs are compiled again.
+        """
+
+        def other(part: Any) -> Any:
+            return reference if isinstance(part, Reference) else part
+
+        flown, learner = (
+            jax.tree.map(other, part, is_leaf=lambda part: isinstance(part, Reference))
+            for part in (self.flown, self.learner)
+        )
+        return dataclasses.replace(self, flown=flown, learner=learner)
+
+    @property
+    def followed(self) -> Reference | None:
+        """What the flight follows; None if the task has no reference, or one that is no table."""
+        followed = getattr(self.flown, "reference", None)
+        return followed if isinstance(followed, Reference) else None
 
     def new_policy(self, key: Key[Array, ""]) -> Policy:
         """Return an untrained policy; the key is consumed."""
@@ -218,5 +242,4 @@ class Setup:
         Args:
             vehicle: Vehicle that flies; by default that of training.
         """
-        followed = getattr(self.flown, "reference", None)
-        return followed.infeasibility(vehicle or self.vehicle) if isinstance(followed, Reference) else None
+        return None if self.followed is None else self.followed.infeasibility(vehicle or self.vehicle)

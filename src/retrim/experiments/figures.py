@@ -17,6 +17,7 @@ from ..physics.state import State
 from ..tasks.keypoints import Keypoints
 from ..tasks.reference import Reference
 from ..tasks.track import AbstractTrack
+from ..tasks.transition import Spliced
 from ..viz import plots
 from .flights import Flight
 from .recovery import FEW, timeline
@@ -61,6 +62,9 @@ def picture(
         beside = partial(plots.camera, groups=seen, wanted=_image_track(observation, home).pixel[0])
     elif isinstance(task, AbstractTrack) and isinstance(task.reference, Reference):
         beside = partial(plots.laps, groups=groups, lap=np.asarray(task.reference.rows)[:, :3])
+    elif isinstance(task, AbstractTrack) and isinstance(task.reference, Spliced):
+        last = shown[0].log.t >= shown[0].log.t[-1] - plots.LAPS_S
+        beside = partial(plots.laps, groups=groups, lap=np.asarray(shown[0].target)[last])
     else:
         x, y, z = (float(value) for value in task.home())
         beside = partial(plots.paths, groups=groups, goal=(x, y, z))

@@ -15,6 +15,7 @@ from ..control.policy import Policy
 from ..learn.bptt import PolicyState
 from ..learn.residuals.model import FittedResidual
 from ..onboard.pilot import ControllerSource
+from ..onboard.topics import REFERENCE
 from ..physics.dynamics import f_a
 from ..physics.state import Command, State
 from ..transport import wire
@@ -38,6 +39,9 @@ def adaptive_source(setup: Setup, state: LearnerState) -> ControllerSource:
     """
     policy = state.policy.policy.merged()
     parts = eqx.partition((policy, state.residual), eqx.is_array)
+    given = {"policy": parts[0][0], "residual": parts[0][1]}
+    if setup.followed is not None:
+        given[REFERENCE] = setup.followed
 
     def whole(parameters: dict[str, Any]) -> tuple[Policy, Any]:
         found: tuple[Policy, Any] = eqx.combine((parameters["policy"], parameters["residual"]), parts[1])
@@ -45,13 +49,13 @@ def adaptive_source(setup: Setup, state: LearnerState) -> ControllerSource:
 
     def controller(parameters: dict[str, Any]) -> AbstractController[Any]:
         policy, residual = whole(parameters)
-        return setup.controller(LearnerState(PolicyState(policy, ()), residual))
+        return _on(setup, parameters).controller(LearnerState(PolicyState(policy, ()), residual))
 
     def predicted(parameters: dict[str, Any], inputs: tuple[State, Command]) -> Any:
         model = FittedResidual(setup.learner.residual_model, whole(parameters)[1])
         return f_a(*inputs, model(*inputs)).v
 
-    return _source(setup, controller, predicted, {"policy": parts[0][0], "residual": parts[0][1]})
+    return _source(setup, controller, predicted, given)
 
 
 def plain_source(setup: Setup, controller: AbstractController[Any]) -> ControllerSource:
@@ -89,16 +93,21 @@ def _source(setup: Setup, controller: Any, predicted: Any, parameters: dict[str,
         "init": numpy_program(init, parameters, x),
         "decide": numpy_program(decide, parameters, (memory, t, t, x)),
         "accepted": numpy_program(accepted, parameters, (memory, u)),
-        "target": numpy_program(lambda _, t: setup.flown.target(t), (), t),
+        "target": numpy_program(lambda parameters, t: _on(setup, parameters).flown.target(t), parameters, t),
         "predicted": numpy_program(predicted, parameters, (x, u)),
     }
-    named = {half: {n: plain(a) for n, a in wire.names(tree).items()} for half, tree in parameters.items()}
+    # in the order in which JAX takes them
+    named = {half: {n: plain(a) for n, a in wire.names(parameters[half]).items()} for half in sorted(parameters)}
     digest = hashlib.sha256()
     for program in programs.values():
         digest.update(program.text.encode())
     for half, arrays in named.items():
         digest.update(f"{half} {[(n, a.shape, a.dtype.name) for n, a in arrays.items()]}".encode())
     return ControllerSource(**programs, parameters=named, base=digest.hexdigest()[:16], dtype=np.dtype(x.p.dtype))
+
+
+def _on(setup: Setup, parameters: dict[str, Any]) -> Setup:
+    return setup.on(parameters[REFERENCE]) if REFERENCE in parameters else setup
 
 
 def _arrays(memory: Any) -> Any:

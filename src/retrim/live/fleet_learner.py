@@ -57,7 +57,7 @@ class FleetLearner:
         loop.catch_up()
         policy = loop.state.policy.policy
         base = fingerprint(policy.base) if isinstance(policy, LoraPolicy) else ""
-        self._members[name] = _Member(loop, (plan.layer, id(loop.setup), base), wanted)
+        self._members[name] = _Member(loop, base, wanted)
 
     def drop(self, name: str) -> None:
         """Learn no more for it."""
@@ -136,9 +136,14 @@ class _Member(NamedTuple):
     """One vehicle and layer."""
 
     loop: LearnerLoop
-    kind: tuple[str, int, str]
-    """What is one program: the layer, the learner, and the base of what is learnt as a delta."""
+    base: str
+    """Of what is learnt as a delta."""
     wanted: Callable[[], bool]
+
+    @property
+    def kind(self) -> tuple[str, int, str]:
+        """What is one program: the layer, the learner, whose reference may change in flight, and the base."""
+        return self.loop.plan.layer, id(self.loop.setup), self.base
 
 
 def _low_rank(workers: Sequence[Worker]) -> list[PolicyWorker]:

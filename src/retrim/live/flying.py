@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager, ExitStack, closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,6 +18,7 @@ from ..io.logs.recording import Recording, can_record, write_mcap, write_npz
 from ..onboard.guard import Mode
 from ..onboard.messages import ACCOUNTS, COMMAND, MEASURED, TRUE
 from ..runtime.events import Event
+from ..tasks.transition import spliced
 from .events import LiveEvents
 from .report import complaints, flight_of, histograms, learnt_in, results
 from .session import LEARNING, LiveRequest, live_spec
@@ -37,6 +39,8 @@ class LiveFlight(NamedTuple):
     """Those of ``results.json``."""
     paths: list[Path]
     """Files that it left, those that a person looks at first."""
+    request: LiveRequest
+    """The request, on all that was followed."""
     landed: bool
     """Whether the vehicle came down by this flight's own doing: it was not lost, and did not crash."""
 
@@ -75,6 +79,8 @@ def fly_live(
             with closing(Wishes(request, supervisor)) as wishes:
                 status = watched(supervisor, request.seconds, events, show, run.stop, wishes)
             learnt = learnt_in(supervisor.bus, status, supervisor.start) if request.method in LEARNING else None
+        if len(pieces := wishes.following.pieces) > 1:  # errors and pictures are of all that was followed
+            request = replace(request, setup=request.setup.on(spliced(pieces)))
         done = _written(request, run, status, events, learnt, supervisor.refused)
     reporter.say(f"flight over: {status.ended}")
     return done
@@ -101,7 +107,7 @@ def _written(
     for start in run.folder.glob("start*.safetensors"):  # what learners went on from; it is in what they learnt
         start.unlink()
     paths = [*recorded, run.folder / "results.json", run.folder / "flight.csv", *complaints(run.folder)]
-    return LiveFlight(flight, found, paths, status.ended == "landed")
+    return LiveFlight(flight, found, paths, request, status.ended == "landed")
 
 
 def _recorded(request: LiveRequest, rows: np.ndarray, events: LiveEvents) -> list[Path]:

@@ -25,6 +25,7 @@ from ..io.trained import load_learnt
 from ..learn.window import Window
 from ..onboard.messages import COMMAND, MEASURED, FlightRows, Parameters, last_note, pack_note
 from ..onboard.realtime import Lifeline
+from ..onboard.topics import REFERENCE
 from ..physics.state import Command, State
 from ..transport import wire
 from ..transport.bus import Bus
@@ -128,6 +129,7 @@ class LearnerLoop:
     def due(self) -> Window | None:
         """Take what is new; return the window to learn from if it is time, else None."""
         self._look()
+        self._follow()
         if self.plan.layer == "policy":
             self._take_residual()
             self._judge()
@@ -162,6 +164,17 @@ class LearnerLoop:
             state, u = state_of(row[MEASURED], dtype), jnp.asarray(row[COMMAND], dtype)
             self._buffer.push(float(row[1]), state, Command.of(u), float(row[2]))
             self._last_tick, self._new_ticks = int(row[0]), self._new_ticks + 1
+
+    def _follow(self) -> None:
+        """Learn on the reference that is followed, if another one is followed now."""
+        followed = self.setup.followed
+        if followed is None or (message := self._fresh(f"parameters.{REFERENCE}")) is None:
+            return
+        with contextlib.suppress(MessageError):
+            found = Parameters.unpack(message, wire.names(followed), half=REFERENCE, base=self.plan.base, after=0)
+            leaves = jax.device_put(list(found.arrays.values()))
+            self.setup = self.setup.on(jax.tree.unflatten(jax.tree.structure(followed), leaves))
+            self.worker.learner = self.setup.learner
 
     def _publish(self, update: Update) -> None:
         layer = self.plan.layer

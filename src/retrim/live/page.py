@@ -101,7 +101,18 @@ class _Page:
         self._bus, self._lock = bus, threading.Lock()
         self._wishes = last_note(self._bus, "wish")  # of a page before this one
         self._scene = Scene(server, spec.path, spec.arm, RATE)
-        self._panel = Panel(server, self._turn, self._wish, self._knobs(), self._wishes, spec.methods, spec.mass, RATE)
+        self._paths, self._followed = spec.paths, ""
+        self._panel = Panel(
+            server,
+            self._turn,
+            self._wish,
+            self._knobs(),
+            self._wishes,
+            spec.methods,
+            tuple(spec.paths),
+            spec.mass,
+            RATE,
+        )
         self._scene.on_pull(self._panel.pull)
         self._tick = -1
 
@@ -115,6 +126,9 @@ class _Page:
             self._scene.move(sample.truth[:3], sample.truth[3:12].reshape(3, 3), target, felt, estimate)
             policies = int(status.get("newest", {}).get("policy", 0))
             self._panel.note(sample.t, float(np.linalg.norm(sample.truth[:3] - target)), policies)
+        if text and (followed := last_note(self._bus, "followed").get("name", "")) != self._followed:
+            self._followed = followed
+            self._scene.follow(self._paths[followed])
         if text and status:
             if self._bus.latest("fallback") is not None:
                 status["mode"], status["reason"] = "watchdog", "the process that flew is gone or hangs"

@@ -24,6 +24,7 @@ class Panel:
         knobs: Knobs,
         wishes: dict[str, Any],
         methods: tuple[str, ...],
+        references: tuple[str, ...],
         mass: float,
         rate: float,
     ) -> None:
@@ -32,10 +33,11 @@ class Panel:
         Args:
             server: The viser server.
             turn: Called with a function from how the knobs stand to how they shall stand.
-            wish: Called with ``method`` and ``paused``, or with ``land``.
+            wish: Called with ``method`` and ``paused``, with ``reference``, or with ``land``.
             knobs: How the knobs stand.
             wishes: What was wished before.
             methods: Ways of learning to choose from, the present one first; none if nothing learns.
+            references: What may be followed, the first one at the beginning; none if there is no choice.
             mass: Of the vehicle [kg].
             rate: How often the panel is refreshed [Hz].
         """
@@ -75,6 +77,10 @@ class Panel:
                     choice.on_update(lambda _: wish(method=method.value, paused=paused.value))
             else:
                 self._gui.add_markdown("This flight does not learn.")
+        if len(references) > 1:
+            asked = str(wishes.get("reference", references[0]))
+            chosen = self._gui.add_dropdown("reference", references, initial_value=asked)
+            chosen.on_update(lambda _: wish(reference=chosen.value))
         self._gui.add_button("Land", color="red").on_click(lambda _: wish(land=True))
 
     def pull(self, a: np.ndarray) -> None:

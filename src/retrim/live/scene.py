@@ -34,8 +34,7 @@ class Scene:
         ground = 2.0 * np.ceil(3.0 + size)
         self._scene.add_grid("/ground", width=ground, height=ground, position=(middle[0], middle[1], 0.0))
         if size > 0.01:
-            pairs = np.stack([path[:-1], path[1:]], axis=1)
-            self._scene.add_line_segments("/reference", pairs, GREY, thickness=0.006)
+            self.follow(path)
         self._target = self._scene.add_icosphere("/target", 0.03, GREEN, opacity=0.6, cast_shadow=False)
         self._vehicle = self._scene.add_frame("/vehicle", show_axes=False)
         _quadrotor(self._scene, max(arm, 0.08))
@@ -61,6 +60,11 @@ class Scene:
             pull(np.zeros(3) if over else ROPE * (hand - grip))
 
         self._grip.on_drag("left")(dragged)
+
+    def follow(self, path: np.ndarray) -> None:
+        """Show the reference that is followed: the places that it passes, world [m], (n, 3)."""
+        pairs = np.stack([path[:-1], path[1:]], axis=1)
+        self._scene.add_line_segments("/reference", pairs, GREY, thickness=0.006)
 
     def move(
         self, p: np.ndarray, R: np.ndarray, target: np.ndarray, disturbance: np.ndarray, estimate: np.ndarray

@@ -27,6 +27,7 @@ from ..physics.state import State
 from ..plants.plant import as_numpy
 from ..runtime.pilot import ControllerPilot
 from ..transport.remote import Address
+from .choices import choices, paths
 from .controllers import adaptive_source, plain_source
 from .page import free_port
 from .spec import MAINS, VEHICLE, LiveSpec, PageSpec
@@ -84,6 +85,12 @@ class LiveRequest:
     """How old the flight may be that the policy was learnt from [s]."""
     record: Path | None = None
     """File of a recording for other viewers."""
+
+    @property
+    def followed(self) -> str:
+        """Name of the reference that is followed at the beginning; empty if there is none."""
+        track = self.setup.preset.track
+        return self.scenario.reference or ("" if track is None else track.reference)
 
     @property
     def flight(self) -> FlightSpec:
@@ -198,8 +205,10 @@ def _page(request: LiveRequest) -> PageSpec:
     others = tuple(method for method in LEARNING if method != request.method)
     methods = (request.method, *others) if request.method in LEARNING else ()
     arm = float(np.hypot(*np.asarray(vehicle.arm)))
-    name = request.setup.preset.name
-    return PageSpec(host, free_port(host, port), name, _places(request, PATH_S), methods, arm, float(vehicle.mass))
+    name, mass = request.setup.preset.name, float(vehicle.mass)
+    offered = choices(request.setup, request.followed) if methods else ()
+    places = _places(request, PATH_S)
+    return PageSpec(host, free_port(host, port), name, places, methods, arm, mass, paths(offered, PATH_S))
 
 
 def _limits(request: LiveRequest) -> Limits:

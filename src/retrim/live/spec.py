@@ -44,6 +44,9 @@ class PageSpec:
     """From the centre of the vehicle to a rotor [m]."""
     mass: float
     """Of the vehicle [kg]."""
+    paths: Mapping[str, np.ndarray] = field(default_factory=dict)
+    """References to choose from by name, the present one first, and places that each passes, world [m], (n, 3); none
+    if nothing is to be chosen."""
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,11 @@
 """The topics of a live flight, and the longest message of each."""
 
 from ..onboard.messages import COLUMNS
-from ..onboard.topics import LAYERS, SLOTS, slot
+from ..onboard.topics import LAYERS, REFERENCE, SLOTS, slot
 from .spec import LiveSpec
 
 SMALL = ("sample", "setpoint", "fallback", "order", "ended", "world", "knobs", "wish", "learning", "ground",
-         "airborne")  # fmt: skip
+         "airborne", "followed")  # fmt: skip
 ROLES = ("control", "plant", "watchdog", "recorder", "page", "bridge", *LAYERS)
 
 
@@ -19,7 +19,7 @@ def topics(spec: LiveSpec) -> dict[str, int]:
         dict.fromkeys(SMALL, 4096)
         | {"status": 65536, "flight": rows, "fallback.flight": rows}
         | {f"ready.{role}": 8192 for role in ROLES}
-        | {f"parameters.{name}": size + 100_000 for name, size in half.items()}
+        | {f"parameters.{name}": size + 100_000 for name, size in ({REFERENCE: 0} | half).items()}
         | {"mission": learnt}
         | {slot(layer, i): learnt for layer in LAYERS for i in range(SLOTS)}
         | {f"{what}.{layer}": 8192 for what in ("said", "learner") for layer in LAYERS}

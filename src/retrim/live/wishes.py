@@ -1,4 +1,4 @@
-"""What a person asks for in flight: land, pause, learn in another way, fly what took off."""
+"""What a person asks for in flight: land, pause, learn in another way, fly what took off, follow something else."""
 
 import contextlib
 import time
@@ -10,6 +10,7 @@ from ..errors import MessageError, RetrimError
 from ..io.trained import load_learnt, save_learnt
 from ..onboard.messages import unpack_note
 from ..runtime.events import Event
+from .following import Following
 from .knobs import Knobs
 from .report import learnt_in
 from .session import LEARNING, LiveRequest, learner_state
@@ -30,6 +31,7 @@ class Wishes:
         self._versions = {"wish": 0, "knobs": 0}
         self._turned: tuple[float, Knobs] | None = None
         self._work = ThreadPoolExecutor(1)
+        self.following = Following(request, supervisor, self._work)
         self._coming: tuple[str, Future[Path]] | None = None
 
     def obey(self, status: Status) -> list[Event]:
@@ -40,8 +42,10 @@ class Wishes:
                 asked = unpack_note(wish, "wish")
             except MessageError:
                 return new
+            if "reference" in asked:
+                new += self.following.ask(str(asked["reference"]), status.t)
             new += self._ask(asked, status)
-        return new + self._arrived(status.t)
+        return new + self._arrived(status.t) + self.following.obey(status)
 
     def close(self) -> None:
         """Drop what is still being worked on."""

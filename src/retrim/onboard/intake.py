@@ -8,8 +8,10 @@ from ..transport.bus import Bus
 from .messages import Parameters, StaleError
 from .pilot import LivePilot
 from .rollback import FlownError
+from .topics import REFERENCE
 
 AHEAD = 1.0  # [s] that parameters may seem to come from the time to come
+IN_TIME = 0.7  # [s] in which a reference must be taken, before it leaves the one that is followed
 REMEMBERED = 50  # swaps in a report, which comes ten times a second
 
 
@@ -57,9 +59,9 @@ class Intake:
 
     def poll(self, t: float) -> None:
         """Take what has come by time ``t`` of the flight [s], if it may be flown."""
-        if not self._open:
-            return
         for half in self._known:
+            if half != REFERENCE and not self._open:
+                continue
             message = self._bus.latest(f"parameters.{half}", self._known[half])
             if message is None:
                 continue
@@ -75,6 +77,8 @@ class Intake:
             else:
                 if found.computed_from > t + AHEAD:
                     self.refuse(f"{half} of a time to come")
+                elif half == REFERENCE and t > found.computed_from + IN_TIME:
+                    self.refuse("late reference")
                 else:
                     self._take(found, t)
 
@@ -102,6 +106,9 @@ class Intake:
             self.refuse("trained from a policy that was taken back")
             return
         self.pilot.swap(found)
+        if found.half == REFERENCE:
+            self._flown = FlownError(self._dt)  # an error on another reference says nothing of the policies before it
+            return
         self.swaps.append([t, found.half, found.version, t - found.computed_from])
         if found.half == "policy":
             self._computed_from[found.version] = found.computed_from

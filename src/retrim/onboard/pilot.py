@@ -8,6 +8,7 @@ import numpy as np
 
 from .messages import STATE, Parameters
 from .program import Arrays, NumpyProgram, ProgramSource
+from .topics import REFERENCE
 
 BLEND = 5  # ticks over which a jump of the command at a swap dies away
 
@@ -23,11 +24,12 @@ class ControllerSource:
     accepted: ProgramSource
     """(parameters, [memory, command]) -> memory, after the plant took another command than was issued"""
     target: ProgramSource
-    """((), time) -> where the vehicle should be"""
+    """(parameters, time) -> where the vehicle should be"""
     predicted: ProgramSource
     """(parameters, [state, command]) -> acceleration by the corrected model"""
     parameters: Mapping[str, Mapping[str, Any]]
-    """Parameters at the start, by half (``policy``, ``residual``) and name, in the order of the programs."""
+    """Parameters at the start, by half (``policy``, ``residual``, ``reference``) and name, in the order of the
+    programs."""
     base: str
     """Hash of the programs and of the shapes of their parameters."""
     dtype: np.dtype[Any]
@@ -42,7 +44,6 @@ class LivePilot:
         self._init, self._decide = NumpyProgram(source.init), NumpyProgram(source.decide)
         self._accepted, self._target = NumpyProgram(source.accepted), NumpyProgram(source.target)
         self._predicted = NumpyProgram(source.predicted)
-        self._where = self._target.prepare(())
         self._parameters = {half: list(arrays.values()) for half, arrays in source.parameters.items()}
         self.versions = dict.fromkeys(source.parameters, 0)
         self._policies: dict[int, Arrays] = {0: self._parameters["policy"]}  # the last proven one, and all after it
@@ -59,7 +60,7 @@ class LivePilot:
 
     def target(self, t: float) -> np.ndarray:
         """Return where the vehicle should be at time ``t`` of the flight [s], world [m]."""
-        return np.asarray(self._target.step(self._where, [self._scalar(t)])[0], dtype=float)
+        return np.asarray(self._target.step(self._prepared[4], [self._scalar(t)])[0], dtype=float)
 
     def act(self, t: float, age: float, x: np.ndarray) -> np.ndarray:
         """Return the command [c, omega] for a new measurement.
@@ -103,17 +104,21 @@ class LivePilot:
         self._change()
 
     def restart(self) -> None:
-        """Fly with the parameters of take-off from the next tick on."""
+        """Fly with what had been learnt at take-off from the next tick on."""
         self._parked = self._parameters, self.versions, self._policies
-        self._parameters = {half: list(arrays.values()) for half, arrays in self._source.parameters.items()}
-        self.versions = dict.fromkeys(self._source.parameters, 0)
+        followed = {half: leaves for half, leaves in self._parameters.items() if half == REFERENCE}
+        first = {half: list(arrays.values()) for half, arrays in self._source.parameters.items()}
+        self._parameters = first | followed
+        self.versions = {half: self.versions[half] if half == REFERENCE else 0 for half in first}
         self._policies = {0: self._parameters["policy"]}
         self._change()
 
     def resume(self) -> None:
-        """Fly again with what flew before :meth:`restart`."""
+        """Fly again with what had been learnt before :meth:`restart`."""
         if self._parked is not None:
-            (self._parameters, self.versions, self._policies), self._parked = self._parked, None
+            (parameters, versions, self._policies), self._parked = self._parked, None
+            self._parameters |= {half: leaves for half, leaves in parameters.items() if half != REFERENCE}
+            self.versions |= {half: version for half, version in versions.items() if half != REFERENCE}
             self._change()
 
     def expected(self, half: str) -> Mapping[str, Any]:
@@ -139,7 +144,7 @@ class LivePilot:
         self._prepared, self._swapped = self._prepare(), True
 
     def _prepare(self) -> tuple[Arrays, ...]:
-        programs = (self._init, self._decide, self._accepted, self._predicted)
+        programs = (self._init, self._decide, self._accepted, self._predicted, self._target)
         return tuple(program.prepare(self._flat()) for program in programs)
 
     def _flat(self) -> Arrays:

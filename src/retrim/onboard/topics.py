@@ -10,7 +10,9 @@ def slot(layer: str, version: int) -> str:
     return f"update.{layer}.{version % SLOTS}"
 
 
-OUT = ("mission", "flight", "status", "ended", "learning")
+REFERENCE = "reference"
+"""Half of the parameters of a controller that says what it follows; no learner changes it."""
+OUT = ("mission", "flight", "status", "ended", "learning", f"parameters.{REFERENCE}")
 """Topics from the flight to the learners."""
 INTO = (
     "ground",

@@ -22,3 +22,6 @@ from .track import L2Track as L2Track
 from .track import SharpTrack as SharpTrack
 from .track import Track as Track
 from .trajectory_csv import from_csv as from_csv
+from .transition import Spliced as Spliced
+from .transition import spliced as spliced
+from .transition import transition_between as transition_between

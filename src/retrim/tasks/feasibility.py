@@ -27,7 +27,7 @@ def unflyable(rows: np.ndarray, every: float, lap: tuple[float, float], vehicle:
         *_not_at_rest(rows, lap),
         *_jumps(rows, every),
         *_open_lap(rows, every, lap),
-        *_beyond_limits(rows, every, vehicle),
+        *beyond_limits(rows, every, vehicle),
         *_below_ground(rows, every),
     ]
 
@@ -73,7 +73,8 @@ def _open_lap(rows: np.ndarray, every: float, lap: tuple[float, float]) -> list[
     return [f"its velocity jumps by {leap:.2f} m/s from lap to lap"] if leap > slack else []
 
 
-def _beyond_limits(rows: np.ndarray, every: float, vehicle: Vehicle) -> list[str]:
+def beyond_limits(rows: np.ndarray, every: float, vehicle: Vehicle) -> list[str]:
+    """Return what of a table is beyond the thrust and the rates of a vehicle; see :func:`unflyable`."""
     found = list[str]()
     accelerations, alone = _standing_alone(rows, every)
     lift = np.where(alone, np.inf, accelerations[:, 2] + STANDARD_GRAVITY)

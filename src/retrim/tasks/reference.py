@@ -35,6 +35,8 @@ class Reference(AbstractReference):
     """Start and end of the lap that repeats [s]; the same twice: the last row is held."""
     joins: Float[Array, "m 2"]
     """Spans of time in which a roll-out may start [s]; each is equally likely."""
+    since: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros(()))
+    """Time of the first row [s]."""
 
     @classmethod
     def of(cls, path: Path3, *, seconds: float, lap: float | None = None, points: int = POINTS) -> "Reference":
@@ -68,7 +70,7 @@ class Reference(AbstractReference):
         length = end - start
         folded = start + (t - start) % jnp.where(length > 0, length, 1.0)
         t = jnp.where(t < end, t, jnp.where(length > 0, folded, end))
-        where = jnp.clip(t / self.every, 0.0, self.rows.shape[0] - 1.0)
+        where = jnp.clip((t - self.since) / self.every, 0.0, self.rows.shape[0] - 1.0)
         i = jnp.clip(jnp.floor(where), 0, self.rows.shape[0] - 2).astype(jnp.int32)
         part = (where - i.astype(where.dtype)).astype(self.rows.dtype)
         before, after = lax.dynamic_slice_in_dim(self.rows, i, 2)  # one gather under vmap
@@ -85,7 +87,7 @@ class Reference(AbstractReference):
         Args:
             p: Position, world [m].
         """
-        times = self.every * jnp.arange(self.rows.shape[0] - 1, dtype=self.every.dtype)
+        times = self.since + self.every * jnp.arange(self.rows.shape[0] - 1, dtype=self.every.dtype)
         on_lap = (times >= self.lap[0] - self.every) | (self.lap[0] == self.lap[1])
         begin, along = self.rows[:-1, :3], jnp.diff(self.rows[:, :3], axis=0)
         length = jnp.sum(along * along, axis=1)
@@ -107,7 +109,7 @@ class Reference(AbstractReference):
         Args:
             vehicle: Vehicle that is to fly it.
         """
-        lap = (float(self.lap[0]), float(self.lap[1]))
+        lap = (float(self.lap[0] - self.since), float(self.lap[1] - self.since))
         return "; ".join(unflyable(np.asarray(self.rows, dtype=float), float(self.every), lap, vehicle)) or None
 
 
@@ -133,7 +135,7 @@ def joined(references: Sequence[AbstractReference], *, seconds: float = 20.0, ev
         rows.append(_sampled(reference, times))
     joins = [(k * seconds, (k + 1) * seconds - 5.0) for k in range(len(references))]
     end = len(references) * seconds
-    return Reference(jnp.concatenate(rows), jnp.array(every), jnp.array([end, end]), jnp.array(joins))
+    return Reference(jnp.concatenate(rows), jnp.asarray(every, float), jnp.array([end, end]), jnp.array(joins))
 
 
 @eqx.filter_jit

@@ -19,6 +19,7 @@ T = TypeVar("T")
 # Okabe and Ito's colours, distinguishable with any colour vision.
 BASE, ADAPTED, UPDATE, PUSH, INK = "#D55E00", "#0072B2", "#009E73", "#E69F00", "#333333"
 GROUPS = (BASE, ADAPTED, "#CC79A7", "#56B4E9")
+LAPS_S = 10.0  # [s] at the end of a flight that its path from above shows
 ASPECT = 720 / 1280  # of a camera's image, whose axes both run from -1 to 1
 
 
@@ -166,10 +167,10 @@ def laps(axes: Axes, groups: Sequence[Group[Track]], lap: np.ndarray) -> None:
     axes.plot(lap[:, 0], lap[:, 1], color="#BBBBBB", linewidth=5, label="reference", zorder=1)
     for tracks, color, name in _coloured(groups):
         for i, track in enumerate(track for track in tracks if not track.crashed):
-            last = track.t >= track.t[-1] - 10.0
+            last = track.t >= track.t[-1] - LAPS_S
             axes.plot(
                 track.p[last, 0], track.p[last, 1], color=color, alpha=0.8, linewidth=0.9, zorder=2,
-                label=None if i else f"{name}, last 10 s",
+                label=None if i else f"{name}, last {LAPS_S:g} s",
             )  # fmt: skip
     axes.set(xlabel="x [m]", ylabel="y [m]", title="the last laps from above")
     axes.set_aspect("equal", adjustable="datalim")

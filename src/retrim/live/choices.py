@@ -1,0 +1,41 @@
+"""References that a person may choose in flight."""
+
+from collections.abc import Mapping, Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..config.references import make_reference
+from ..config.setup import Setup
+from ..tasks.abstract_reference import AbstractReference
+from ..tasks.reference import Reference
+from ..tasks.shapes import REFERENCES
+
+
+def choices(setup: Setup, present: str) -> tuple[str, ...]:
+    """Return the references that a person may choose in flight, the present one first; none if it is no choice.
+
+    A policy that does not see its reference cannot follow another one.
+
+    Args:
+        setup: What flies.
+        present: Name of what it follows.
+    """
+    seen = jax.tree.leaves(setup.flown.observation_in_flight, is_leaf=lambda part: isinstance(part, Reference))
+    if not any(isinstance(part, Reference) for part in seen):
+        return ()
+    return (present, *(name for name in REFERENCES if name != present))
+
+
+def paths(names: Sequence[str], seconds: float) -> Mapping[str, np.ndarray]:
+    """Return the places that references pass in so many seconds, world [m], (n, 3), by name."""
+    times = jnp.arange(0.0, seconds, 0.05)
+    return {name: np.asarray(_places(make_reference(name), times), dtype=float) for name in names}
+
+
+@eqx.filter_jit
+def _places(reference: AbstractReference, times: Float[Array, " n"]) -> Float[Array, "n 3"]:
+    return jax.vmap(lambda t: reference(t).p)(times)

@@ -1,0 +1,113 @@
+"""What a flight follows, one reference after another: a person chooses, the vehicle goes over smoothly."""
+
+import time
+from concurrent.futures import Executor, Future
+
+import numpy as np
+
+from ..config.references import make_reference
+from ..errors import ConfigError, RetrimError
+from ..onboard.messages import Parameters, pack_note
+from ..onboard.topics import REFERENCE
+from ..runtime.events import Event
+from ..tasks.reference import Reference
+from ..tasks.transition import BEFORE, transition_between
+from ..transport import wire
+from .choices import choices
+from .session import LiveRequest
+from .status import Status
+from .supervisor import Supervisor
+
+LEAD = 0.8 * BEFORE  # [s] from a table that is sent to the transition in it
+ATTEMPTS = 3
+TOLD = "followed"
+"""Topic of the name of what is followed."""
+
+
+class Following:
+    """Goes over to another reference when it is asked for; tables are made beside the flight."""
+
+    def __init__(self, request: LiveRequest, supervisor: Supervisor, work: Executor) -> None:
+        """Build it for a flight.
+
+        Args:
+            request: Of the flight.
+            supervisor: Of its processes.
+            work: What makes tables.
+        """
+        self._setup, self._supervisor, self._work = request.setup, supervisor, work
+        self._vehicle = request.scenario.make_vehicle(request.setup.preset.vehicle)
+        present = request.followed
+        self._choices = choices(request.setup, present) if REFERENCE in supervisor.spec.controller.parameters else ()
+        self.name, self.pieces = present, list[tuple[float, Reference]]()
+        if request.setup.followed is not None:
+            self.pieces = [(0.0, request.setup.followed)]
+        self._version, self._attempts, self._asked = 0, 0, present
+        self._coming: tuple[str, Future[tuple[float, Reference]]] | None = None
+        self._sent: tuple[str, float, Reference] | None = None
+
+    def ask(self, name: str, t: float) -> list[Event]:
+        """Begin to go over to another reference; return that as an event.
+
+        Args:
+            name: One of the choices.
+            t: Time of the flight [s].
+        """
+        busy = self._coming is not None or self._sent is not None
+        if name in (self.name, self._asked) or name not in self._choices or busy:
+            return []
+        self._asked, self._attempts = name, 0
+        self._make(name)
+        return [Event(t, "asked", f"reference {name}")]
+
+    def obey(self, status: Status) -> list[Event]:
+        """Send a table that has been made, and take note of one that is followed."""
+        new = list[Event]()
+        if self._coming is not None and self._coming[1].done():
+            (name, made), self._coming = self._coming, None
+            try:
+                at, table = made.result()
+            except RetrimError as error:
+                return [Event(status.t, "asked", f"reference {name} cannot be followed: {error}")]
+            self._send(name, at, table)
+        if self._sent is not None:
+            name, at, table = self._sent
+            if status.control.get("versions", {}).get(REFERENCE, 0) >= self._version:
+                self.name, self._sent = name, None
+                self.pieces.append((at, table))
+                self._asked = name
+                self._supervisor.bus.publish(TOLD, pack_note(TOLD, name=name))
+                new = [Event(at, "reference", f"it goes over to {name}")]
+            elif status.t > at:  # it came too late to be taken
+                self._sent = None
+                if self._attempts < ATTEMPTS:
+                    self._make(name)
+                else:
+                    new = [Event(status.t, "asked", f"reference {name} cannot be followed: it was not taken")]
+        return new
+
+    def _make(self, name: str) -> None:
+        self._attempts += 1
+        self._coming = name, self._work.submit(self._table, name)
+
+    def _table(self, name: str) -> tuple[float, Reference]:
+        """Return when the transition begins, and the table; compiled before the time is taken."""
+        old, new = self.pieces[-1][1], make_reference(name)
+        transition_between(old, new, 0.0, self._vehicle)
+        assert self._supervisor.epoch is not None
+        at = time.monotonic() - self._supervisor.epoch + LEAD
+        table = transition_between(old, new, at, self._vehicle)
+        limits, places = self._supervisor.spec.limits, np.asarray(table.rows[:, :3], dtype=float)
+        outside = (places < limits.low) | (places > limits.high)
+        if outside.any():
+            place = places[int(np.argmax(outside.any(1)))].round(2).tolist()
+            raise ConfigError(f"it passes {place} m, outside the fence; a wider one is had with --fence")
+        return at, table
+
+    def _send(self, name: str, at: float, table: Reference) -> None:
+        self._version += 1
+        arrays = {key: np.asarray(leaf) for key, leaf in wire.names(table).items()}
+        base = self._supervisor.spec.controller.base
+        found = Parameters(REFERENCE, self._version, base, at - LEAD, arrays)
+        self._supervisor.bus.publish(f"parameters.{REFERENCE}", found.pack())
+        self._sent = name, at, table

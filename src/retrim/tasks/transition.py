@@ -1,0 +1,149 @@
+"""From one reference to another in flight, without a jump of position, velocity, acceleration or jerk."""
+
+import math
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..physics.felt_frame import FeltFrame
+from ..physics.state import STANDARD_GRAVITY
+from ..physics.vehicle import Vehicle
+from .abstract_reference import AbstractReference, Point, TurnedReference
+from .feasibility import beyond_limits
+from .flatness import flat_command
+from .reference import Reference
+
+BEFORE = 1.0  # [s] of the old reference in the table of a transition
+LASTING = (2.0, 3.0, 4.0, 6.0, 8.0)  # [s], of which the first is taken that the vehicle can fly
+
+
+def transition_between(old: Reference, new: Reference, at: float, vehicle: Vehicle) -> Reference:
+    """Return the reference that is ``old`` until a time, goes over to ``new``, and stays that.
+
+    ``new`` begins at ``at``, from rest, while its share grows by a 7th-order smooth step: as slowly as it takes for the
+    vehicle to fly it, but within eight seconds.
+
+    Args:
+        old: What is followed before.
+        new: What is followed afterwards; its table begins at 0 s.
+        at: When the transition begins [s].
+        vehicle: Vehicle that flies.
+
+    Returns:
+        A table of the sizes of ``old``, so that it takes its place in a compiled program. It begins a second before
+        ``at``; a roll-out may start in the lap of ``new``.
+    """
+    for lasting in LASTING:
+        table = _table(old, new, at, lasting)
+        if not beyond_limits(np.asarray(table.rows, dtype=float), float(table.every), vehicle):
+            break
+    return table
+
+
+class Spliced(AbstractReference):
+    """What was followed one after another, as one reference; see :func:`spliced`."""
+
+    pieces: Reference
+    """Tables of one size; every leaf has a leading axis."""
+    began: Float[Array, " k"]
+    """Since when each is followed [s], in order."""
+
+    @property
+    def lap(self) -> Float[Array, "2"]:
+        """That of the last piece [s]."""
+        return self.pieces.lap[-1]
+
+    @property
+    def joins(self) -> Float[Array, "m 2"]:
+        """Those of the last piece [s]."""
+        return self.pieces.joins[-1]
+
+    def __call__(self, t: Float[Array, ""]) -> Point:
+        """Return the reference that is followed at time ``t`` [s]."""
+        now = jnp.maximum(jnp.sum(self.began <= t) - 1, 0)
+        piece: Reference = jax.tree.map(lambda leaf: leaf[now], self.pieces)
+        return piece(t)
+
+    def distance(self, p: Float[Array, "3"]) -> Float[Array, ""]:
+        """Return the distance from ``p`` to the nearest lap of them all [m]."""
+        return jnp.min(jax.vmap(lambda piece: piece.distance(p))(self.pieces))
+
+    def in_frame(self, frame: FeltFrame) -> TurnedReference:
+        """Return the same as it is in ``frame``."""
+        return TurnedReference(self, frame)
+
+
+def spliced(pieces: Sequence[tuple[float, Reference]]) -> Spliced:
+    """Join what was followed in a flight.
+
+    Args:
+        pieces: Since when [s], in order, which reference was followed; tables of one size.
+    """
+    began, tables = zip(*pieces, strict=True)
+    together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *tables)
+    return Spliced(together, jnp.asarray(began, together.every.dtype))
+
+
+def _table(old: Reference, new: Reference, at: float, lasting: float) -> Reference:
+    start, end = (float(t) for t in new.lap)
+    if start < end:
+        begins = at + max(start, lasting)
+        lap = (begins, begins + end - start)
+    else:
+        lap = (at + max(end, lasting),) * 2
+    since = at - BEFORE
+    times = np.linspace(since, lap[1], old.rows.shape[0])
+    join = lap if lap[0] < lap[1] else (since, lap[1])
+    dtype = old.every.dtype
+    rows = _mixed(old, new, *(jnp.asarray(value, dtype) for value in (times, at, lasting)))
+    return Reference(
+        rows,
+        jnp.asarray(times[1] - times[0], dtype),
+        jnp.asarray(lap, dtype),
+        jnp.broadcast_to(jnp.asarray(join, dtype), old.joins.shape),
+        jnp.asarray(since, dtype),
+    )
+
+
+@eqx.filter_jit
+def _mixed(
+    old: Reference, new: Reference, times: Float[Array, " n"], at: Float[Array, ""], lasting: Float[Array, ""]
+) -> Float[Array, "n 18"]:
+    first, last = old(at), new(jnp.zeros_like(at))
+    turns = 2.0 * math.pi * jnp.round((first.heading - last.heading) / (2.0 * math.pi))  # the shortest way round
+
+    def row(t: Float[Array, ""]) -> Float[Array, "18"]:
+        before, after = old(t), new(jnp.maximum(t - at, 0.0))
+        s, s1, s2, s3 = _smooth_step(jnp.clip((t - at) / lasting, 0.0, 1.0))
+        s1, s2, s3 = s1 / lasting, s2 / lasting**2, s3 / lasting**3
+        p, v, a = after.p - before.p, after.v - before.v, after.a - before.a
+        turn, rate = after.heading + turns - before.heading, after.heading_rate - before.heading_rate
+        moving_a = before.a + s * a + 2.0 * s1 * v + s2 * p
+        jerk = before.jerk + s * (after.jerk - before.jerk) + 3.0 * s1 * a + 3.0 * s2 * v + s3 * p
+        heading, heading_rate = before.heading + s * turn, before.heading_rate + s * rate + s1 * turn
+        up = jnp.array([0.0, 0.0, STANDARD_GRAVITY], dtype=moving_a.dtype)
+        mixed = Point(
+            before.p + s * p,
+            before.v + s * v + s1 * p,
+            flat_command(moving_a + up, jerk, heading, heading_rate),
+            heading,
+            moving_a,
+            jerk,
+            heading_rate,
+        )
+        return jnp.concatenate([leaf.reshape(-1) for leaf in mixed])
+
+    return jax.vmap(row)(times)
+
+
+def _smooth_step(x: Float[Array, ""]) -> tuple[Float[Array, ""], ...]:
+    """Return a 7th-order step from 0 to 1, and its first three derivatives, which are zero at both ends."""
+    s = x**4 * (35.0 - 84.0 * x + 70.0 * x**2 - 20.0 * x**3)
+    first = 140.0 * x**3 * (1.0 - x) ** 3
+    second = 420.0 * x**2 * (1.0 - x) ** 2 * (1.0 - 2.0 * x)
+    third = 840.0 * x * (1.0 - x) * (1.0 - 5.0 * x + 5.0 * x**2)
+    return s, first, second, third

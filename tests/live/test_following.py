@@ -1,0 +1,241 @@
+"""Another reference in flight: a person asks, the vehicle goes over to it, and the learner learns on it."""
+
+import dataclasses
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import random
+
+from helpers import brief_preset
+from live_helpers import TOPICS, plan
+from live_processes import DT, level, moved
+from retrim.config import load
+from retrim.config.scenario import Scenario
+from retrim.config.setup import Setup
+from retrim.io.trained import save_learnt
+from retrim.live import following
+from retrim.live.choices import choices, paths
+from retrim.live.controllers import adaptive_source
+from retrim.live.following import Following
+from retrim.live.learner_process import LearnerLoop, LearnerPlan
+from retrim.live.session import LiveRequest, live_spec
+from retrim.live.status import Status
+from retrim.live.supervisor import Supervisor
+from retrim.onboard.control import ControlLoop
+from retrim.onboard.messages import Parameters, Sample, last_note, unpack_note
+from retrim.onboard.topics import REFERENCE
+from retrim.physics import State
+from retrim.tasks.shapes import circle, figure8
+from retrim.tasks.transition import spliced, transition_between
+from retrim.transport import wire
+from retrim.transport.in_process import InProcessBus
+
+pytestmark = pytest.mark.usefixtures("optax_promotion")
+ROOM = TOPICS | {"parameters.reference": 400_000, "followed": 4096, "wish": 4096}
+ROOM |= {f"update.residual.{i}": 5_000_000 for i in (0, 1)}
+AT = 1.4  # [s]
+
+
+@pytest.fixture(scope="module")
+def made():
+    """A set-up on the circle, what it starts from, and the controller."""
+    with jax.numpy_dtype_promotion("standard"):
+        setup = Setup.of(brief_preset("track/retrim"), "circle")
+        state = setup.learner.init(setup.new_policy(random.key(0)), random.key(1))
+        return setup, state, adaptive_source(setup, state)
+
+
+@pytest.fixture(scope="module")
+def table(made):
+    return transition_between(made[0].followed, figure8(), AT, made[0].vehicle)
+
+
+def message(table, controller, version=1, computed_from=AT - 0.8):
+    arrays = {name: np.asarray(leaf) for name, leaf in wire.names(table).items()}
+    return Parameters(REFERENCE, version, controller.base, computed_from, arrays).pack()
+
+
+class Flight:
+    """The loop that flies, on a point mass without delay; no clock."""
+
+    def __init__(self, controller):
+        self.bus = InProcessBus(ROOM)
+        self.loop = ControlLoop(plan(controller, delay_ticks=0), self.bus)
+        self.x, self.tick, self.issued = level(np.array([0.0, 0.0, 1.0])), 0, []
+
+    def until(self, t):
+        while self.tick * DT < t - 1e-9:
+            now, u = time.monotonic(), self.issued[-1] if self.issued else np.array([9.81, 0.0, 0.0, 0.0])
+            self.bus.publish("sample", Sample(self.tick, self.tick * DT, now, 0.0, self.x, self.x, u).pack())
+            self.issued.append(self.loop.tick(now).u)
+            self.loop.idle()
+            self.x = moved(self.x, self.issued[-1])
+            self.tick += 1
+
+    @property
+    def status(self):
+        self.loop.report()
+        return unpack_note(self.bus.latest("status").data, "status")
+
+
+# ---- the process that flies
+
+
+def test_what_is_followed_is_a_parameter_of_the_controller(made, table):
+    one, other = Flight(made[2]), Flight(made[2])
+    for flight in (one, other):
+        flight.until(0.7)
+    other.bus.publish("parameters.reference", message(table, made[2]))
+    for flight in (one, other):
+        flight.until(0.96)  # what is seen 0.4 s ahead is still the old one
+    np.testing.assert_allclose(one.issued, other.issued, atol=0.02)
+    for t in (0.9, 2.0, 3.3, 20.0):
+        np.testing.assert_allclose(other.loop.pilot.target(t), table(jnp.array(t)).p, atol=1e-9)
+        np.testing.assert_allclose(one.loop.pilot.target(t), made[0].flown.target(jnp.array(t)), atol=1e-9)
+    assert other.status["versions"] == {"policy": 0, "residual": 0, REFERENCE: 1}
+    assert other.status["swaps"] == []  # nothing was learnt
+
+
+def test_it_stays_whether_learning_is_flown_or_not(made, table):
+    flight = Flight(made[2])
+    flight.until(0.7)
+    flight.loop.intake.open = False
+    flight.bus.publish("parameters.reference", message(table, made[2]))
+    flight.until(0.8)
+    wanted = np.asarray(table(jnp.array(9.0)).p)
+    for learnt in (False, True, False):
+        flight.loop.intake.open = learnt
+        np.testing.assert_allclose(flight.loop.pilot.target(9.0), wanted, atol=1e-9)
+        assert flight.status["versions"][REFERENCE] == 1
+
+
+def test_one_that_comes_too_late_would_jump_and_is_refused(made, table):
+    flight = Flight(made[2])
+    flight.until(AT)
+    flight.bus.publish("parameters.reference", message(table, made[2]))
+    flight.until(AT + 0.1)
+    assert flight.status["refused"] == {"late reference": 1}
+    np.testing.assert_allclose(flight.loop.pilot.target(9.0), made[0].flown.target(jnp.array(9.0)), atol=1e-9)
+
+
+# ---- the learner
+
+
+def test_the_learner_learns_on_it_without_compiling_again(made, table, tmp_path):
+    setup, state, controller = made
+    start = tmp_path / "start.safetensors"
+    save_learnt(start, state, setup.preset)
+    bus = InProcessBus(ROOM)
+    loop = LearnerLoop(LearnerPlan(tmp_path, "policy", start, "circle", 3, controller.base, 0), bus)
+    before = loop.worker.learner
+    bus.publish("parameters.reference", message(table, controller)[:-1] + b"x")  # damaged on the way
+    loop.due()
+    assert loop.worker.learner is before
+    bus.publish("parameters.reference", message(table, controller))
+    loop.due()
+    after = loop.worker.learner
+    t = jnp.array(9.0)
+    np.testing.assert_allclose(after.env.task.target(t), table(t).p, atol=1e-9)
+    np.testing.assert_allclose(after.env.task.observation.reference(t).p, table(t).p, atol=1e-9)
+    assert jax.tree.structure(after) == jax.tree.structure(before)
+    for leaf, other in zip(jax.tree.leaves(after), jax.tree.leaves(before), strict=True):
+        if isinstance(leaf, jax.Array):
+            assert (leaf.aval, leaf.weak_type) == (other.aval, other.weak_type)
+
+
+# ---- who asks
+
+
+class Told(Supervisor):
+    """Has a bus and no processes."""
+
+    def __init__(self, spec):
+        super().__init__(spec)
+        self.bus, self.epoch = InProcessBus(ROOM), time.monotonic() - 10.0
+
+
+def asked(made, folder, fence=3.0):
+    setup, state, _ = made
+    request = LiveRequest(setup, state.policy.policy, Scenario(reference="circle"), "full", 60.0, 0, fence, folder)
+    supervisor = Told(live_spec(request))
+    return Following(request, supervisor, ThreadPoolExecutor(1)), supervisor
+
+
+def status(supervisor, version=0):
+    t = time.monotonic() - supervisor.epoch
+    return Status(t, {"versions": {REFERENCE: version}}, {}, {}, {}, None, [], False, 0, None)
+
+
+def obeyed(follows, supervisor, done, version=0):
+    """Events until ``done``."""
+    events, until = [], time.monotonic() + 60.0
+    while not done() and time.monotonic() < until:
+        events += [f"{event.kind}: {event.note}" for event in follows.obey(status(supervisor, version))]
+        time.sleep(0.005)
+    return events
+
+
+def test_a_choice_becomes_a_table_and_counts_once_it_is_taken(made, tmp_path):
+    follows, supervisor = asked(made, tmp_path)
+    assert follows.ask("circle", 1.0) == follows.ask("module:name", 1.0) == []  # followed already; not offered
+    assert [event.note for event in follows.ask("figure8", 1.0)] == ["reference figure8"]
+    assert follows.ask("star", 1.0) == []  # one at a time
+    bus = supervisor.bus
+    assert obeyed(follows, supervisor, lambda: bus.latest("parameters.reference") is not None) == []
+    assert len(follows.pieces) == 1
+    controller = supervisor.spec.controller
+    found = Parameters.unpack(
+        bus.latest("parameters.reference").data, controller.parameters[REFERENCE], half=REFERENCE, base=controller.base,
+        after=0,
+    )  # fmt: skip
+    assert found.computed_from <= time.monotonic() - supervisor.epoch
+    assert obeyed(follows, supervisor, lambda: len(follows.pieces) > 1, 1) == ["reference: it goes over to figure8"]
+    assert follows.name == last_note(bus, "followed")["name"] == "figure8"
+    at, table = follows.pieces[-1]
+    t = at + 12.0
+    wanted = figure8()(jnp.array(12.0)).p
+    np.testing.assert_allclose(table(jnp.array(t)).p, wanted, atol=1e-3)
+
+    whole = made[0].on(spliced(follows.pieces))  # what its errors are measured by
+    x = State.at(wanted)
+    assert float(whole.flown.error(jnp.array(t), x)) < 1e-3
+    assert float(whole.flown.error(jnp.array(5.0), State.at(circle()(jnp.array(5.0)).p))) < 1e-9
+
+
+def test_what_leaves_the_fence_or_is_not_taken_is_told(made, tmp_path, monkeypatch):
+    follows, supervisor = asked(made, tmp_path, fence=0.5)
+    follows.ask("figure8", 1.0)
+    (told,) = obeyed(follows, supervisor, lambda: follows._coming is None)
+    assert "reference figure8 cannot be followed: it passes" in told
+    assert "--fence" in told
+    assert supervisor.bus.latest("parameters.reference") is None
+    assert follows.ask("figure8", 2.0) == []  # a page repeats what it wishes
+
+    monkeypatch.setattr(following, "LEAD", 0.05)
+    follows.ask("star", 2.0)
+    events = obeyed(follows, supervisor, lambda: follows._attempts == 3 and follows._coming is follows._sent is None)
+    assert events == ["asked: reference star cannot be followed: it was not taken"]
+    assert follows.name == "circle"
+
+
+def test_only_who_sees_its_reference_has_a_choice(made):
+    assert choices(made[0], "circle") == ("circle", "figure8", "star")
+    assert choices(made[0], "my.csv") == ("my.csv", "circle", "figure8", "star")
+    assert choices(Setup.of(load("track/paper")), "figure8") == ()
+    assert choices(Setup.of(load("hover/retrim")), "") == ()
+    drawn = paths(("circle", "star"), 20.0)
+    np.testing.assert_allclose(drawn["circle"][-1], circle()(jnp.array(19.95)).p, atol=1e-9)
+    assert drawn["star"].shape == (400, 3)
+
+
+def test_a_set_up_on_another_reference_is_the_same_but_for_it(made, table):
+    other = made[0].on(table)
+    assert other.followed is table
+    assert other.env is made[0].env
+    assert dataclasses.replace(other, flown=made[0].flown, learner=made[0].learner).preset == made[0].preset
+    back = other.on(made[0].followed)
+    jax.tree.map(np.testing.assert_array_equal, jax.tree.leaves(back.flown), jax.tree.leaves(made[0].flown))
