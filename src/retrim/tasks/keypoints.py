@@ -1,6 +1,7 @@
 """Observation from a camera: pixels of seven keypoints on the ground in five frames, and the last commands."""
 
 import dataclasses
+import functools
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -81,7 +82,9 @@ class Keypoints(AbstractObservation[KeypointMemory]):
         plain = cls(Camera.published(), goal, omega_max, jnp.array(noise), jnp.zeros(70), jnp.eye(70), dt)
         if not whitened:
             return plain
-        whitened_: Keypoints = eqx.tree_at(lambda o: (o.mean, o.whiten), plain, _whitening(plain))
+        x, y, z = (float(value) for value in goal)
+        statistics = _whitening_at((x, y, z), dt, jax.config.values["jax_enable_x64"])
+        whitened_: Keypoints = eqx.tree_at(lambda o: (o.mean, o.whiten), plain, statistics)
         return whitened_
 
     @property
@@ -157,6 +160,16 @@ class Keypoints(AbstractObservation[KeypointMemory]):
 def key_of(x: State) -> Key[Array, ""]:
     """Return the key of the noise of a flight that starts in ``x``."""
     return random.key(lax.bitcast_convert_type(jnp.sum(x.p + x.v).astype(jnp.float32), jnp.int32))
+
+
+@functools.cache
+def _whitening_at(
+    goal: tuple[float, float, float], dt: float, x64: bool
+) -> tuple[Float[Array, "70"], Float[Array, "70 70"]]:
+    """Motions of training never change: they are looked at once per process, goal, tick and precision."""
+    plain = Keypoints.of(jnp.array(goal, float), jnp.ones(3), whitened=False, dt=dt)
+    found: tuple[Float[Array, "70"], Float[Array, "70 70"]] = _whitening(plain)
+    return found
 
 
 @eqx.filter_jit
