@@ -17,6 +17,8 @@ from ..physics.state import STANDARD_GRAVITY, Command, State
 from .motions import NEAR
 from .observation import AbstractObservation
 
+Statistics = tuple[Float[Array, "70"], Float[Array, "70 70"]]
+"""Mean and whitening matrix of pixels."""
 PATTERN = ((0.5, 0.5), (0.5, -0.5), (-0.5, -0.5), (-0.5, 0.5), (-0.5, 0.0), (0.0, 0.5), (0.5, 0.0))
 """The points, relative to the one below the goal [m]: a square's corners and three mid-points of its sides."""
 BELOW = 1.0  # [m], from the goal to the ground
@@ -163,17 +165,15 @@ def key_of(x: State) -> Key[Array, ""]:
 
 
 @functools.cache
-def _whitening_at(
-    goal: tuple[float, float, float], dt: float, x64: bool
-) -> tuple[Float[Array, "70"], Float[Array, "70 70"]]:
+def _whitening_at(goal: tuple[float, float, float], dt: float, x64: bool) -> Statistics:
     """Motions of training never change: they are looked at once per process, goal, tick and precision."""
     plain = Keypoints.of(jnp.array(goal, float), jnp.ones(3), whitened=False, dt=dt)
-    found: tuple[Float[Array, "70"], Float[Array, "70 70"]] = _whitening(plain)
+    found: Statistics = _whitening(plain)
     return found
 
 
 @eqx.filter_jit
-def _whitening(plain: Keypoints) -> tuple[Float[Array, "70"], Float[Array, "70 70"]]:
+def _whitening(plain: Keypoints) -> Statistics:
     """Return mean and whitening matrix of the frames of random short motions, always the same ones."""
     keys = random.split(random.key(0), 20000)
     frames = jax.vmap(lambda k: plain.stacked(plain.history(*NEAR.draw(k, plain.goal))))(keys)
