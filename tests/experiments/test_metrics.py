@@ -9,7 +9,7 @@ import pytest
 from made_up import DT, flight, log
 from retrim import Scenario
 from retrim.experiments import FlightSpec, rows
-from retrim.experiments.metrics import cell, interval, metres
+from retrim.experiments.metrics import cell, interval, mean_and_deviation, metres
 from retrim.runtime.flight import States
 
 
@@ -165,3 +165,10 @@ def test_nothing_is_shown_as_zero():
     assert cell(row) == "< 0.0001, 1 of 2 crashed"
     (row,) = rows([flight(0.004)])
     assert cell(row, digits=2) == "< 0.01"
+
+
+def test_a_mean_with_its_deviation_is_never_zero():
+    assert mean_and_deviation(np.array([0.1, 0.3])) == "0.200 ± 0.141"
+    assert mean_and_deviation(np.array([2e-4, 4e-4])) == "0.0003 ± 0.0001"
+    assert mean_and_deviation(np.array([0.25])) == "0.250 ± 0.000"
+    assert mean_and_deviation(np.array([1e-5, 2e-5])) == "< 0.0001"

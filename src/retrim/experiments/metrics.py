@@ -170,6 +170,17 @@ def metres(value: float) -> str:
     return _shown(value, _digits(value))
 
 
+def mean_and_deviation(values: np.ndarray) -> str:
+    """Return errors [m] as mean ± standard deviation, with the digits of :func:`metres` for the mean."""
+    mean, deviation = float(values.mean()), float(values.std(ddof=len(values) > 1))
+    return _with_deviation(mean, deviation, _digits(mean))
+
+
+def _with_deviation(mean: float, deviation: float | None, digits: int) -> str:
+    text = _shown(mean, digits)
+    return text if deviation is None or text.startswith("<") else f"{text} ± {deviation:.{digits}f}"
+
+
 def _digits(value: float) -> int:
     return 3 if value >= 1e-3 else 4
 
@@ -189,10 +200,7 @@ def cell(row: dict[str, Any], digits: int | None = None) -> str:
     failed = f", {len(row['failures'])} of {row['n']} failed" if row.get("failures") else ""
     if row["mean"] is None:
         return f"crashed, {row['crashes']} of {row['n']}" + failed if row["crashes"] else failed.removeprefix(", ")
-    digits = digits or _digits(row["mean"])
-    text = _shown(row["mean"], digits)
-    if row["std"] is not None and not text.startswith("<"):
-        text += f" ± {row['std']:.{digits}f}"
+    text = _with_deviation(row["mean"], row["std"], digits or _digits(row["mean"]))
     return text + (f", {row['crashes']} of {row['n']} crashed" if row["crashes"] else "") + failed
 
 

@@ -24,6 +24,7 @@ from ..design import (
 from ..design import flown as fly_as_it_is
 from ..flights import FlightSpec
 from ..flying import scored, until_terminated
+from ..metrics import mean_and_deviation
 from ..reporter import Reporter
 from ..run import Run
 from .document import Document, TableSection
@@ -105,6 +106,6 @@ def _section(rows: list[dict[str, Any]]) -> TableSection:
             f"{np.median(times) / (1e3 * first):.2f}",
             f"{max(row['compile_s'] for row in mine):.1f}",
             f"{np.mean([row['residual_rms'] for row in mine]):.3f}",
-            f"{whole.mean():.3f} ± {whole.std(ddof=len(whole) > 1):.3f}{crashed}" if len(whole) else "all crashed",
+            mean_and_deviation(whole) + crashed if len(whole) else "all crashed",
         ))  # fmt: skip
     return TableSection(COLUMNS, tuple(lines), "", PAPER[0].upper() + PAPER[1:] + ".")

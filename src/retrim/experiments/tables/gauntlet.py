@@ -13,6 +13,7 @@ from ...errors import ConfigError, JobError, PlantError
 from ...viz import plots
 from ...viz.panels import Curve, Panel, heat_map, panel_figure
 from ..flights import Flight
+from ..metrics import metres
 from ..recovery import change_times, recoveries
 from ..reporter import Reporter
 from ..run import Run
@@ -168,7 +169,8 @@ def _value(row: dict[str, Any] | None) -> float:
 
 
 def _cell(row: dict[str, Any]) -> str:
-    value, worst = ("∞" if row[key] is None else f"{row[key]:.3f}" for key in ("value", "worst"))
+    text = metres if METRICS[row["metric"]] == "[m]" else "{:.3f}".format
+    value, worst = ("∞" if row[key] is None else text(row[key]) for key in ("value", "worst"))
     return f"{value} ({worst})"
 
 

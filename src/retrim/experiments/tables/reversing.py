@@ -11,7 +11,7 @@ from ...config.setup import Setup
 from ...errors import ConfigError
 from ..figures import picture
 from ..flights import Flight
-from ..metrics import metres, rows
+from ..metrics import mean_and_deviation, metres, rows
 from ..reporter import Reporter
 from ..run import Run
 from .document import Document, TableSection
@@ -115,7 +115,7 @@ def _section(
         for method, name in METHODS.items():
             table = [found[i] for found in errors[method]]
             columns = np.array(table).T  # empty where none was flown to its end
-            cells = [f"{c.mean():.3f} ± {c.std(ddof=len(table) > 1):.3f}" for c in columns]
+            cells = [mean_and_deviation(column) for column in columns]
             cells = cells or ["-"] * moments.shape[1]
             lines.append((f"reversed at {reversal:g} s, {name}", *cells))
     columns_ = ("", "just before it", "before an update takes effect", *(f"after update {i}" for i in updates))
