@@ -10,6 +10,7 @@ from made_up import DT, flight, log
 from retrim import Scenario
 from retrim.experiments import FlightSpec, rows
 from retrim.experiments.metrics import cell, interval, mean_and_deviation, metres
+from retrim.experiments.tables.beside import figures_table
 from retrim.runtime.flight import States
 
 
@@ -172,3 +173,13 @@ def test_a_mean_with_its_deviation_is_never_zero():
     assert mean_and_deviation(np.array([2e-4, 4e-4])) == "0.0003 ± 0.0001"
     assert mean_and_deviation(np.array([0.25])) == "0.250 ± 0.000"
     assert mean_and_deviation(np.array([1e-5, 2e-5])) == "< 0.0001"
+
+
+def test_no_other_figure_in_metres_is_shown_as_zero():
+    row = {"method": "indi", "disturbance": "large", "interval": [1e-6, 2e-6], "settle_s": 1.52, "peak_after_5s": 1e-5,
+           "rates_rms": 0.0, "rates_change_rms": 0.0}  # fmt: skip
+    wide = row | {"method": "full", "interval": [1e-6, 0.0123], "peak_after_5s": 0.0123}
+    table = figures_table([row, wide, row | {"interval": None, "peak_after_5s": None}], "Hover", {"large": "large"})
+    assert [line[1:4] for line in table.rows] == [
+        ("< 0.0001", "1.5", "< 0.0001"), ("< 0.0001 to 0.0123", "1.5", "0.012"), ("-", "1.5", "-"),
+    ]  # fmt: skip

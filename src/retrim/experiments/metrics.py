@@ -165,9 +165,14 @@ def _column(records: Sequence[Mapping[str, Any]], name: str) -> np.ndarray:
     return np.array([np.inf if each[name] is None else each[name] for each in records])
 
 
-def metres(value: float) -> str:
-    """Return an error [m] as text, with three digits behind the point, four below a millimetre, and never as zero."""
-    return _shown(value, _digits(value))
+def metres(value: float, digits: int | None = None) -> str:
+    """Return an error [m] as text, and never as zero.
+
+    Args:
+        value: The error.
+        digits: Behind the point; three by default, four below a millimetre.
+    """
+    return _shown(value, digits or _digits(value))
 
 
 def mean_and_deviation(values: np.ndarray) -> str:

@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from ...config.methods import find_method
+from ..metrics import metres
 from .document import TableSection
 
 
@@ -20,7 +21,7 @@ def figures_table(found: Sequence[dict[str, Any]], title: str, levels: Mapping[s
     columns: dict[str, Callable[[dict[str, Any]], str]] = {
         "95 % interval [m]": lambda row: _interval(row["interval"]),
         "to 5 cm [s]": lambda row: _figure(row["settle_s"], 1),
-        "worst after 5 s [m]": lambda row: _figure(row["peak_after_5s"], 3),
+        "worst after 5 s [m]": lambda row: _metres(row["peak_after_5s"]),
         **(BEHIND_COLUMNS if tracks else {}),
         "body rates [rad/s]": lambda row: _figure(row["rates_rms"], 2),
         "their change in a tick [rad/s]": lambda row: _figure(row["rates_change_rms"], 3),
@@ -40,12 +41,19 @@ def figures_table(found: Sequence[dict[str, Any]], title: str, levels: Mapping[s
 
 BEHIND_COLUMNS: dict[str, Callable[[dict[str, Any]], str]] = {
     "behind [s]": lambda row: _figure(row.get("behind_s"), 3),
-    "error but for that [m]": lambda row: _figure(row.get("unshifted_m"), 3),
+    "error but for that [m]": lambda row: _metres(row.get("unshifted_m")),
 }
 
 
 def _interval(ends: Sequence[float] | None) -> str:
-    return "-" if ends is None else f"{ends[0]:.4f} to {ends[1]:.4f}"
+    if ends is None:
+        return "-"
+    low, high = (metres(end, 4) for end in ends)
+    return high if high.startswith("<") else f"{low} to {high}"
+
+
+def _metres(value: float | None) -> str:
+    return "-" if value is None else metres(value)
 
 
 def _figure(value: float | None, digits: int) -> str:
