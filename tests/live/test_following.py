@@ -183,7 +183,7 @@ def test_a_choice_becomes_a_table_and_counts_once_it_is_taken(made, tmp_path):
     follows, supervisor = asked(made, tmp_path)
     assert follows.ask("circle", 1.0) == follows.ask("module:name", 1.0) == []  # followed already; not offered
     assert [event.note for event in follows.ask("figure8", 1.0)] == ["reference figure8"]
-    assert follows.ask("star", 1.0) == []  # one at a time
+    assert follows.ask("star", 1.0) == []  # one at a time: it is asked for again below
     bus = supervisor.bus
     assert obeyed(follows, supervisor, lambda: bus.latest("parameters.reference") is not None) == []
     assert len(follows.pieces) == 1
@@ -193,7 +193,9 @@ def test_a_choice_becomes_a_table_and_counts_once_it_is_taken(made, tmp_path):
         after=0,
     )  # fmt: skip
     assert found.computed_from <= time.monotonic() - supervisor.epoch
-    assert obeyed(follows, supervisor, lambda: len(follows.pieces) > 1, 1) == ["reference: it goes over to figure8"]
+    assert obeyed(follows, supervisor, lambda: len(follows.pieces) > 1, 1) == [
+        "reference: it goes over to figure8", "asked: reference star",
+    ]  # fmt: skip
     assert follows.name == last_note(bus, "followed")["name"] == "figure8"
     at, table = follows.pieces[-1]
     t = at + 12.0
@@ -220,6 +222,9 @@ def test_what_leaves_the_fence_or_is_not_taken_is_told(made, tmp_path, monkeypat
     events = obeyed(follows, supervisor, lambda: follows._attempts == 3 and follows._coming is follows._sent is None)
     assert events == ["asked: reference star cannot be followed: it was not taken"]
     assert follows.name == "circle"
+    last, controller = supervisor.bus.latest("parameters.reference").data, supervisor.spec.controller
+    back = Parameters.unpack(last, controller.parameters[REFERENCE], half=REFERENCE, base=controller.base, after=3)
+    np.testing.assert_array_equal(back.arrays["rows"], made[0].followed.rows)  # learners go back to what is flown
 
 
 def test_only_who_sees_its_reference_has_a_choice(made):

@@ -42,23 +42,20 @@ class Following:
         self.name, self.pieces = present, list[tuple[float, Reference]]()
         if request.setup.followed is not None:
             self.pieces = [(0.0, request.setup.followed)]
-        self._version, self._attempts, self._asked = 0, 0, present
+        self._version, self._attempts, self._asked, self._next = 0, 0, present, present
         self._coming: tuple[str, Future[tuple[float, Reference]]] | None = None
         self._sent: tuple[str, float, Reference] | None = None
 
     def ask(self, name: str, t: float) -> list[Event]:
-        """Begin to go over to another reference; return that as an event.
+        """Begin to go over to another reference, once nothing else is on its way; return that as an event.
 
         Args:
-            name: One of the choices.
+            name: One of the choices; what was asked for last already is not asked for again.
             t: Time of the flight [s].
         """
-        busy = self._coming is not None or self._sent is not None
-        if name in (self.name, self._asked) or name not in self._choices or busy:
-            return []
-        self._asked, self._attempts = name, 0
-        self._make(name)
-        return [Event(t, "asked", f"reference {name}")]
+        if name in self._choices:
+            self._next = name
+        return self._begun(t)
 
     def obey(self, status: Status) -> list[Event]:
         """Send a table that has been made, and take note of one that is followed."""
@@ -69,13 +66,13 @@ class Following:
                 at, table = made.result()
             except RetrimError as error:
                 return [Event(status.t, "asked", f"reference {name} cannot be followed: {error}")]
-            self._send(name, at, table)
+            self._publish(table, at - LEAD)
+            self._sent = name, at, table
         if self._sent is not None:
             name, at, table = self._sent
             if status.control.get("versions", {}).get(REFERENCE, 0) >= self._version:
                 self.name, self._sent = name, None
                 self.pieces.append((at, table))
-                self._asked = name
                 self._supervisor.bus.publish(TOLD, pack_note(TOLD, name=name))
                 new = [Event(at, "reference", f"it goes over to {name}")]
             elif status.t > at:  # it came too late to be taken
@@ -83,8 +80,18 @@ class Following:
                 if self._attempts < ATTEMPTS:
                     self._make(name)
                 else:
+                    self._publish(self.pieces[-1][1], status.t)  # learners go back to what is flown
                     new = [Event(status.t, "asked", f"reference {name} cannot be followed: it was not taken")]
-        return new
+        return new + self._begun(status.t)
+
+    def _begun(self, t: float) -> list[Event]:
+        if self._coming is not None or self._sent is not None or self._next == self._asked:
+            return []
+        self._asked, self._attempts = self._next, 0
+        if self._asked == self.name:
+            return []
+        self._make(self._asked)
+        return [Event(t, "asked", f"reference {self._asked}")]
 
     def _make(self, name: str) -> None:
         self._attempts += 1
@@ -104,10 +111,9 @@ class Following:
             raise ConfigError(f"it passes {place} m, outside the fence; a wider one is had with --fence")
         return at, table
 
-    def _send(self, name: str, at: float, table: Reference) -> None:
+    def _publish(self, table: Reference, since: float) -> None:
         self._version += 1
         arrays = {key: np.asarray(leaf) for key, leaf in wire.names(table).items()}
         base = self._supervisor.spec.controller.base
-        found = Parameters(REFERENCE, self._version, base, at - LEAD, arrays)
+        found = Parameters(REFERENCE, self._version, base, since, arrays)
         self._supervisor.bus.publish(f"parameters.{REFERENCE}", found.pack())
-        self._sent = name, at, table
