@@ -24,8 +24,6 @@ class Worker(Protocol):
     """One layer of learning."""
 
     layer: Layer
-    learner: OnlineLearner
-    """How it learns, and in which environment."""
 
     def learn(self, window: Window) -> Update:
         """Learn from a window; blocks until the result is there."""

@@ -16,7 +16,7 @@ from jax import random
 from ..adapt.buffer import RollingBuffer
 from ..adapt.learner import LearnerState
 from ..adapt.updates import Layer, PolicyUpdate, ResidualUpdate, Update, pack_update
-from ..adapt.workers import PolicyWorker, ResidualWorker, Worker
+from ..adapt.workers import PolicyWorker, ResidualWorker
 from ..config.presets import Preset
 from ..config.setup import Setup
 from ..errors import MessageError
@@ -90,7 +90,7 @@ class LearnerLoop:
         self._pending: tuple[int, PolicyUpdate, float] | None = None
         self._flown: list[tuple[int, Update]] = []
 
-    def new_worker(self) -> Worker:
+    def new_worker(self) -> ResidualWorker | PolicyWorker:
         """Return a worker that begins with what was learnt before the flight."""
         if self.plan.layer == "residual":
             return ResidualWorker(self.setup.learner, self.state)
