@@ -35,7 +35,7 @@ class Following:
             supervisor: Of its processes.
             work: What makes tables.
         """
-        self._setup, self._supervisor, self._work = request.setup, supervisor, work
+        self._supervisor, self._work = supervisor, work
         self._vehicle = request.scenario.make_vehicle(request.setup.preset.vehicle)
         present = request.followed
         self._choices = choices(request.setup, present) if REFERENCE in supervisor.spec.controller.parameters else ()
