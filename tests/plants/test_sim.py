@@ -1,10 +1,12 @@
 """The simulated plant: command delay, disturbances, and what it measures beside the state."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from helpers import CheapModel
 from retrim.config.sensors import SENSORS
 from retrim.physics import BemQuadrotor, Command, Constant, LinearDragQuadrotor, Push, State, small, so3
 from retrim.plants import SensorModel, SimPlant
@@ -125,3 +127,18 @@ def test_a_measurement_tells_its_age(name, age):
     plant = simulated(sensors=SENSORS.find(name)())
     assert plant.reset(START).age == age
     assert plant.step(WILD)[0].age == age
+
+
+def test_the_clock_of_a_long_flight_is_its_ticks_in_single_precision():
+    """Ticks, not a sum of them: that drifts by milliseconds in a minute, and a tracking error with it."""
+    model = CheapModel(0.02)
+    felt = Push(lambda t, x: t * jnp.ones(3, jnp.float32))
+    simulation = SimPlant(model, felt, delay_s=0.0).simulation
+    x0 = State.at(jnp.array([0.0, 0.0, 1.0], jnp.float32))
+    launched = simulation.launch(x0)
+    advance = eqx.filter_jit(simulation.advance)
+    for tick in (0, 2999, 89_999):
+        after = advance(launched, Command.hover(jnp.float32), tick)
+        assert after.t.dtype == jnp.float32
+        np.testing.assert_allclose(after.t, 0.02 * (tick + 1), rtol=2e-7)
+        np.testing.assert_allclose(after.a, 0.02 * (tick + 0.475), rtol=1e-5, atol=1e-4)  # mean time of 20 substeps

@@ -98,7 +98,8 @@ class Simulation(eqx.Module):
             after = self.model.substep(inner, acting, self.disturbance(t, self.model.state(inner)))
             return after, self.model.state(after)
 
-        times = s.t + SUBSTEP * jnp.arange(per_tick, dtype=s.t.dtype)
+        begun = jnp.asarray(tick, s.t.dtype) * self.model.dt  # not s.t and so on: a sum drifts off in single precision
+        times = begun + SUBSTEP * jnp.arange(per_tick, dtype=s.t.dtype)
         acting = jax.tree.map(lambda leaf: leaf[slots - 1 - ages], queue)
         inner, path = lax.scan(millisecond, s.model, (times, acting))
         if (sensors := self.sensors) is None:
@@ -107,7 +108,7 @@ class Simulation(eqx.Module):
             sampled = jax.tree.map(lambda leaf: leaf[sensors.period - 1 :: sensors.period], path)
             samples = sensors.received(s.samples, sampled, random.fold_in(self.key, tick))
         a = (self.model.state(inner).v - self.model.state(s.model).v) / self.model.dt
-        return SimState(inner, queue, samples, s.t + self.model.dt, a)
+        return SimState(inner, queue, samples, (jnp.asarray(tick, s.t.dtype) + 1.0) * self.model.dt, a)
 
     def measured(self, s: SimState) -> State:
         """Return the newest sample that has arrived."""
