@@ -36,7 +36,10 @@ def drawn(monkeypatch, tmp_path):
 
             def draw(*words, name=name, **more):
                 asked.setdefault(name, []).append((words, more))
-                return (tmp_path / "picture.png", tmp_path / "picture.svg")
+                files = (tmp_path / "picture.png", tmp_path / "picture.svg")
+                for path in files:
+                    path.touch()
+                return files
 
             monkeypatch.setattr(table, name, draw)
         return asked

@@ -17,7 +17,7 @@ from retrim import ConfigError, PlantError, Setup, changed
 from retrim.cli.reproduce import COMMANDS
 from retrim.config import load, named_presets
 from retrim.config.baselines import BASELINES
-from retrim.experiments import Run, design, effort, provenance, tables
+from retrim.experiments import Run, design, effort, tables
 from retrim.experiments.reporter import Silent
 
 # The package has functions of these names.
@@ -139,7 +139,6 @@ def test_all_tables_go_on_where_they_were_killed(tmp_path, monkeypatch):
     monkeypatch.setattr(everything, "PLAN", tuple((make, "Table", {"size": 9}) for make in (one, two)))
     for name in ("one", "two"):
         monkeypatch.setitem(quick.QUICK, name, {"size": 1})
-    monkeypatch.setattr(provenance, "commit", lambda: "abc")
     dying.insert(0, False)
     for name in ("one", "two"):
         (tmp_path / name).mkdir()
@@ -188,6 +187,17 @@ def test_every_table_of_the_plan_has_the_options_that_are_planned():
     assert "all" in COMMANDS
 
 
+def test_a_command_that_goes_on_has_a_folder_to_go_on_in():
+    """And a quick look another one, or it would write over the pages of the whole."""
+    made = {make.__name__: make for make in (*tables.MADE, tables.everything)}
+    assert set(quick.GO_ON) <= set(made)
+    folders = {str(quick.folder_of(made[name], quick=look)) for name in quick.GO_ON for look in (False, True)}
+    assert len(folders) == 2 * len(quick.GO_ON) - 1  # that of all tables has one for quick looks
+    assert str(quick.folder_of(tables.everything)) == "runs/reproduce-all"
+    assert quick.folder_of(tables.design) is None
+    assert "runs/reproduce-hover, where the command goes on by default" in quick.help_of(tables.hover)
+
+
 def test_every_table_of_the_paper_has_a_quick_look_of_options_that_it_has():
     made = {make.__name__: make for make in tables.MADE}
     of_paper = {"hover", "track", "vision", "reversing", "design", "efficiency", "transfer"}
@@ -210,6 +220,10 @@ def test_a_quick_look_takes_less_of_what_nobody_asked_for(tmp_path):
         {k: chosen[k] for k in options if k in chosen},
         "",
     )
+    asked = inspect.signature(tables.hover).parameters
+    named = {**{name: asked[name].default for name in asked if name not in ("run", "reporter")}, "quick": True}
+    assert quick.looked(tables.hover, named)[0]["starts"] == 2
+    assert quick.looked(tables.hover, named, ["--starts", "8"])[0]["starts"] == asked["starts"].default
     words = "--methods", "geometric", "--candidates", "1", "--seconds", "4", "--plant", "simple", "--quick"
     retrim("reproduce", "tuning", *words, "--out", "t", cwd=tmp_path)
     assert remark in (tmp_path / "t" / "tuning.md").read_text()

@@ -9,7 +9,8 @@ from commands import results
 from helpers import brief_preset
 from retrim import PlantError, Scenario
 from retrim.config.levers import CONTROL, OFF, ON
-from retrim.experiments import Run, provenance
+from retrim.experiments import Run
+from retrim.experiments.gathering import Flights
 from retrim.experiments.reporter import Silent
 from retrim.experiments.tables.document import Document
 
@@ -162,7 +163,6 @@ def test_the_ablation_trains_what_differs_and_has_a_line_for_each_lever(task, tm
 
 def test_an_ablation_goes_on_where_it_was_killed(tmp_path, imagine, monkeypatch):
     """Levers that were flown whole are not flown again; other seeds, starts or lengths are."""
-    monkeypatch.setattr(provenance, "commit", lambda: "abc")
     every = len([*CONTROL, *OFF["hover"], *CONTROL, *ON["hover"]])
     done = imagine(ablation, lambda spec: 0.1)
 
@@ -254,3 +254,14 @@ def test_errors_around_reversals_are_those_of_whole_flights(tmp_path, imagine, d
     assert "INDI -" in text  # two of four crashed: the median is beyond what was flown
     ((shown, *_), _), = said["picture"]  # fmt: skip
     assert {f.spec.method for f in shown} == {"base", "full"}
+
+
+def test_where_nothing_that_is_drawn_has_landed_the_rest_is_kept(tmp_path, imagine, monkeypatch):
+    """As after a Ctrl-C early on: other methods' flights have landed, and no picture can be made."""
+    done = imagine(reversing, lambda spec: 0.1)
+    fly = reversing.fly_all
+    rest = lambda *a, **k: Flights([f for f in fly(*a, **k).flown if f.spec.method == "indi"], True)  # noqa: E731
+    monkeypatch.setattr(reversing, "fly_all", rest)
+    reversing.reversing(Run("test", tmp_path), Silent(), plant="simple", seeds=SEEDS, seconds=45.0, starts=STARTS)
+    assert done.flown
+    assert [row["method"] for row in results(tmp_path, "reversing.json")["rows"]] == ["indi"]

@@ -126,6 +126,19 @@ def test_a_flight_that_is_late_is_found_to_be_late(late_s, lap, found):
     assert dataclasses.replace(late, cross=None).behind is None  # it follows nothing
 
 
+def test_of_shifts_a_lap_apart_the_smallest_is_told_whatever_else_the_flight_is_off():
+    """A flight in step, and off by what repeats with each lap: a shift by a lap is no better."""
+    t, flown = DT * np.arange(1001), log(20.0)
+    angle = 2.0 * np.pi * t / 3.0
+    path = np.stack([np.cos(angle), np.sin(angle), np.ones_like(t)], axis=1)
+    off = np.stack([np.zeros_like(t), np.zeros_like(t), 0.2 + 0.1 * np.sin(angle + 0.4)], axis=1)
+    true = States(path + off, *flown.true[1:])
+    made = flight(1.0, flown=flown._replace(true=true), cross=np.zeros(1001), steady_seconds=10.0)
+    behind, error = dataclasses.replace(made, target=path).behind
+    assert behind == 0.0
+    assert error == pytest.approx(np.linalg.norm(off, axis=1)[-500:].mean(), rel=0.02)
+
+
 def test_effort_is_that_of_the_commands():
     flown = log(10.0)
     u = np.array(flown.u)

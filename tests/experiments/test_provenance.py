@@ -79,7 +79,8 @@ def test_ctrl_c_is_remembered_and_raises_where_it_may(tmp_path):
 
 
 def test_a_commit_is_that_of_the_checkout_and_tells_local_changes(monkeypatch):
-    said = {"rev-parse --short=12 HEAD": "abc", "status --porcelain": ""}
+    status = "status --porcelain -- :/src :/pyproject.toml"
+    said = {"rev-parse --short=12 HEAD": "abc", status: ""}
 
     def run(words, **_):
         asked = " ".join(words[3:])
@@ -91,7 +92,7 @@ def test_a_commit_is_that_of_the_checkout_and_tells_local_changes(monkeypatch):
     monkeypatch.setattr(provenance.subprocess, "run", run)
     asked = provenance.commit.__wrapped__
     assert asked() == "abc"
-    said["status --porcelain"] = " M file"
+    said[status] = " M file"
     assert asked() == "abc-dirty"
     said["elsewhere"] = ""
     assert asked() == "unknown"  # a checkout of something else around an installed package
@@ -101,14 +102,31 @@ def test_a_commit_is_that_of_the_checkout_and_tells_local_changes(monkeypatch):
 
     monkeypatch.setattr(provenance.subprocess, "run", nothing)
     assert asked() == "unknown"
-    monkeypatch.setattr(provenance, "commit", lambda: "abc-dirty")
-    assert not provenance.is_committed()
-    monkeypatch.setattr(provenance, "commit", lambda: "abc")
-    assert provenance.is_committed()
+
+
+def test_code_is_told_apart_wherever_it_lies(tmp_path, monkeypatch):
+    """By what is in its files and by their names, not by a version, a commit, or what Python left beside them."""
+    here = tmp_path / "retrim" / "experiments"
+    here.mkdir(parents=True)
+    monkeypatch.setattr(provenance, "__file__", str(here / "provenance.py"))
+    code = provenance.code.__wrapped__
+    (here / "one.py").write_text("a = 1\n")
+    (tmp_path / "retrim" / "data.toml").write_text("x = 1\n")
+    first = code()
+    (here / "__pycache__").mkdir()
+    (here / "__pycache__" / "one.pyc").write_bytes(b"1")
+    (tmp_path / "beside.py").touch()
+    assert code() == first
+    found = {first}
+    for path, text in ((here / "one.py", "a = 2\n"), (tmp_path / "retrim" / "data.toml", "x = 2\n")):
+        path.write_text(text)
+        found.add(code())
+    (here / "one.py").rename(here / "two.py")
+    assert len(found | {code()}) == 4
 
 
 def test_a_page_says_what_it_was_made_by(monkeypatch):
     monkeypatch.setattr(provenance, "commit", lambda: "abc-dirty")
     assert provenance.describe_code() == "Commit abc-dirty"
     monkeypatch.setattr(provenance, "commit", lambda: "unknown")
-    assert provenance.describe_code() == f"retrim {retrim.__version__}, installed"
+    assert provenance.describe_code() == f"retrim {retrim.__version__}, installed, code {provenance.code()}"

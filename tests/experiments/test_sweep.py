@@ -3,19 +3,20 @@
 import json
 import signal
 import time
+from pathlib import Path
 
 import jax
 import pytest
 
 from commands import OVERLAY, results, retrim, started
-from helpers import brief_preset
+from helpers import BRIEF, brief_preset
 from made_up import flight
-from retrim import Fleet, Scenario, Setup
-from retrim.experiments import FlightSpec, Run, sweep
+from retrim import ConfigError, Fleet, Scenario, Setup
+from retrim.experiments import FlightSpec, Run, provenance, sweep
 from retrim.experiments.gathering import Flights
 from retrim.experiments.metrics import record
 from retrim.experiments.reporter import Silent
-from retrim.experiments.sweep import Sweep
+from retrim.experiments.sweep import Sweep, read_sweep, run_sweep
 
 pytestmark = pytest.mark.usefixtures("as_a_user")
 
@@ -103,6 +104,42 @@ def test_a_sweep_that_is_done_flies_nothing_and_a_smaller_one_reports_its_own_fl
     assert found[0]["mean"] == pytest.approx(mine)
 
 
+def test_policies_and_flights_are_of_the_code_and_the_files_that_made_them(tmp_path, monkeypatch):
+    """Those of other code, or of a file that has changed since, are made again."""
+    monkeypatch.chdir(tmp_path)
+    asked = Sweep(methods=("indi",), disturbances=("none",), plants=("simple",), seconds=1.0, overlay=BRIEF)
+    trained = []
+    made = sweep.train
+    monkeypatch.setattr(sweep, "train", lambda *a, **k: trained.append(0) or made(*a, **k))
+
+    def fly():
+        trained.clear()
+        run_sweep(asked, Run("sweep", tmp_path / "out"), Silent())
+        return len(trained), len(flown(tmp_path / "out"))
+
+    assert [fly(), fly()] == [(1, 1), (0, 1)]
+    assert "An earlier run had made 1 of the parts" in (tmp_path / "out" / "sweep.md").read_text()
+    monkeypatch.setattr(provenance, "code", lambda: "changed")
+    assert fly() == (1, 2)
+    assert results(tmp_path / "out", "sweep.json")["rows"][0]["n"] == 1
+    monkeypatch.setattr(sweep, "files_behind", lambda *names: {"mine.csv": "changed"})
+    assert fly() == (1, 3)
+
+
+def test_a_vehicle_file_is_looked_up_beside_that_of_the_sweep(tmp_path):
+    studies = tmp_path / "studies"
+    studies.mkdir()
+    text = (Path(__file__).parents[2] / "examples" / "seven_inch.toml").read_text()
+    (studies / "my.toml").write_text(text)
+    (studies / "s.toml").write_text('vehicles = ["my.toml", "large"]\n[overlay]\nvehicle = "my.toml"\n')
+    found = read_sweep(studies / "s.toml")
+    assert [s.vehicle if isinstance(s.vehicle, str) else s.vehicle.mass for s in found.scenarios()] == [1.2, "large"]
+    assert found.overlay["vehicle"]["mass"] == 1.2
+    (studies / "s.toml").write_text('vehicles = ["none_such.toml"]\n')
+    with pytest.raises(ConfigError, match=r"none_such\.toml"):
+        read_sweep(studies / "s.toml")
+
+
 def test_a_sweep_is_every_combination():
     sweep = Sweep(disturbances=("none", "wind"), plants=("bem", "simple"), sensors=("ideal", "mocap"))
     found = sweep.scenarios()
@@ -131,7 +168,7 @@ def test_a_report_has_a_row_for_each_combination_and_bars_for_each_flight(tmp_pa
                 if method == "indi" and error is None:
                     row |= {"failed": "OSError: gone"}
                 kept.append({"preset": "p", **row})
-    found = sweep._report(asked, kept, Run("test", tmp_path), Silent())
+    found = sweep._report(asked, kept, Run("test", tmp_path), Silent(), 0)
     assert [(row["disturbance"], row["method"], row["n"], row["crashes"]) for row in found] == [
         ("none", "base", 4, 0), ("none", "indi", 4, 0), ("large", "base", 4, 1), ("large", "indi", 4, 0)
     ]  # fmt: skip
@@ -147,7 +184,8 @@ def test_a_report_has_a_row_for_each_combination_and_bars_for_each_flight(tmp_pa
         "large": {"base": [0.1, 0.2, 0.4, float("inf")], "indi": [0.1, 0.2, 0.4]},
     }
     one = [row for row in kept if row["disturbance"] == "large"]
-    sweep._report(asked, one, Run("test", tmp_path), Silent())
+    sweep._report(asked, one, Run("test", tmp_path), Silent(), 3)
+    assert "An earlier run had made 3 of the parts" in (tmp_path / "sweep.md").read_text()
     assert list(shown[1]) == ["large"]  # where nothing varies, the disturbance is the label
 
 

@@ -18,12 +18,13 @@ from made_up import DT, Watching, flight, log
 from retrim import ConfigError, Scenario, Setup, changed, load
 from retrim.config import named_presets as presets
 from retrim.config.disturbances import DISTURBANCES
+from retrim.config.loading import dump, with_vehicle
 from retrim.config.presets import Adapt
 from retrim.experiments import Run, provenance, rivals
 from retrim.experiments.lots import LOT
 from retrim.experiments.reporter import Silent
 from retrim.experiments.tables.document import Document, TableSection
-from retrim.experiments.tables.kept import files_behind
+from retrim.experiments.tables.kept import files_behind, named_by, named_in
 from retrim.experiments.tables.levels import Levels, fly_levels
 from retrim.experiments.tables.reversing import METHODS, _errors, _moments, _section
 from retrim.experiments.tables.study import Study, fly_all, refuse_misfits, train_all
@@ -89,7 +90,6 @@ def test_a_run_goes_on_where_it_was_killed(tmp_path, monkeypatch):
     """What is finished is not flown again, and the table is the same; another size, or other code, is flown."""
     preset = brief_preset()
     sections = [Levels(f"{n}", preset, Scenario(plant="simple"), f"x{n}", ("base", "indi")) for n in (1, 2)]
-    monkeypatch.setattr(provenance, "commit", lambda: "abc")
     flown = []
     made = levels._level_section
     monkeypatch.setattr(levels, "_level_section", lambda *a, **k: flown.append(a[1].title) or made(*a, **k))
@@ -107,14 +107,16 @@ def test_a_run_goes_on_where_it_was_killed(tmp_path, monkeypatch):
     assert "An earlier run had made 2 of the parts" in (tmp_path / "table.md").read_text()
     table(sections, starts=2)
     assert flown == ["1", "2"] * 2
-    monkeypatch.setattr(provenance, "commit", lambda: "abc-dirty")
+    (tmp_path / "x1.png").write_bytes(b"what another table of this folder drew")
     table(sections[:1])
     assert flown[4:] == ["1"]
+    monkeypatch.setattr(provenance, "code", lambda: "changed")
+    table(sections[:1])
+    assert flown[5:] == ["1"]
 
 
 def test_a_section_is_made_again_for_every_thing_that_it_follows_from(tmp_path, monkeypatch):
     base = Levels("title", brief_preset(), Scenario(plant="simple"), "x", ("indi", "datt"))
-    monkeypatch.setattr(provenance, "commit", lambda: "abc")
     asked = []
     monkeypatch.setattr(levels, "_level_section", lambda *a, **k: asked.append(0) or (TableSection((), ()), []))
     monkeypatch.setattr(levels, "figures_table", lambda *_: TableSection((), ()))
@@ -137,6 +139,20 @@ def test_a_section_is_made_again_for_every_thing_that_it_follows_from(tmp_path, 
     assert fly() == 0
     monkeypatch.setattr(levels, "files_behind", lambda *names: {"my_wind:breeze": "changed"})
     assert fly() == 1
+
+
+def test_a_vehicle_of_a_file_or_a_module_is_one_of_the_things(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    Path("my_quad.py").write_text("from retrim.physics.vehicle import small as make\n")
+    preset = with_vehicle(load("hover/retrim"), "my_quad:make")
+    assert set(files_behind(*named_in(preset))) == set(files_behind(*named_by(Scenario(vehicle="my_quad:make"))))
+    assert set(files_behind(*named_in(preset))) == {"my_quad:make"}
+    text = (Path(__file__).parents[2] / "examples" / "seven_inch.toml").read_text()
+    Path("my.toml").write_text(text)
+    before = dump(with_vehicle(preset, "my.toml"))
+    Path("my.toml").write_text(text.replace("mass = 1.2", "mass = 1.3"))
+    assert dump(with_vehicle(preset, "my.toml")) != before
 
 
 def test_progress_of_flights_goes_from_nothing_to_all(tmp_path):
@@ -186,7 +202,6 @@ def small_datt(monkeypatch):
 @pytest.mark.usefixtures("small_datt")
 def test_datt_is_trained_once_for_a_folder(tmp_path, monkeypatch):
     """Of a seed and a vehicle; a file that is damaged, or made by code that has changed, is made again."""
-    monkeypatch.setattr(provenance, "commit", lambda: "abc")
     said = []
     reporter = Silent()
     reporter.say = said.append
@@ -200,7 +215,7 @@ def test_datt_is_trained_once_for_a_folder(tmp_path, monkeypatch):
     other = rivals.trained_datt(preset, [0], run, reporter, steps=200)
     assert "trained again" in said[0]
     jax.tree.map(np.testing.assert_array_equal, first[0], other[0])
-    monkeypatch.setattr(provenance, "commit", lambda: "abd")
+    monkeypatch.setattr(provenance, "code", lambda: "changed")
     rivals.trained_datt(preset, [0], run, reporter, steps=200)
     assert len(list(tmp_path.glob("datt_*_seed0.safetensors"))) == 2
     with pytest.raises(ConfigError, match=r"DATT looks ahead in steps of 0\.06 s, which must be whole control periods"):
@@ -209,7 +224,6 @@ def test_datt_is_trained_once_for_a_folder(tmp_path, monkeypatch):
 
 def test_a_network_of_datt_is_of_its_vehicle_its_lag_its_steps_and_its_seed(tmp_path, monkeypatch):
     """Another of these is another file; what is learnt goes on from update to update."""
-    monkeypatch.setattr(provenance, "commit", lambda: "abc")
     preset, watching, asked = load("hover/retrim"), Watching(), []
 
     def ppo(problem, net, key, settings, *, steps):

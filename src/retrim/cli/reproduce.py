@@ -1,6 +1,7 @@
 """``retrim reproduce``: a command for each table, with the options of the function that makes it."""
 
 import inspect
+import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Any
 from ..experiments import tables
 from ..experiments.cluster import joined
 from ..experiments.run import Run
-from ..experiments.tables.quick import help_of, looked, options_of
+from ..experiments.tables.quick import folder_of, help_of, looked, options_of
 from .console import RichReporter, show_paths, started
 
 Ordered = Callable[[threading.Event], int]
@@ -26,9 +27,10 @@ def command_of(make: Callable[..., None], called: str = "reproduce") -> Callable
 
     def command(*, out: Path | None = None, on: str | None = None, **chosen: Any) -> Ordered:
         def ordered(stop: threading.Event) -> int:
-            (asked, remark), reporter = looked(make, chosen), RichReporter()
+            (asked, remark), reporter = looked(make, chosen, sys.argv[1:]), RichReporter()
+            folder = out or folder_of(make, quick=bool(chosen.get("quick")))
             with joined(on, reporter) as executor:
-                run = started(Run(called, out, stop=stop, remark=remark, executor=executor))
+                run = started(Run(called, folder, stop=stop, remark=remark, executor=executor))
                 make(run, reporter, **asked)
             show_paths(run.pages)
             return run.exit_code

@@ -10,7 +10,8 @@ from ..errors import ConfigError
 from .named_presets import PRESETS
 from .presets import BUILT_IN_TASKS, Preset
 from .validation import read_toml, suggestion, validated
-from .vehicle_file import read_vehicle
+from .vehicle_file import VehicleSpec, read_vehicle
+from .vehicles import vehicle_from
 
 
 def load(name: str, overlay: Path | None = None) -> Preset:
@@ -52,10 +53,33 @@ def overlaid(preset: Preset, overlay: Path) -> Preset:
     Raises:
         ConfigError: The file cannot be read, is not TOML, or has a key or value that does not fit.
     """
-    above = read_toml(overlay)
-    if isinstance(above.get("vehicle"), str) and above["vehicle"].endswith(".toml"):
-        above["vehicle"] = dataclasses.asdict(read_vehicle(overlay.parent / above["vehicle"]))
-    return validated(Preset, merged(values(preset), above), source=str(overlay))
+    return validated(Preset, merged(values(preset), beside(read_toml(overlay), overlay.parent)), source=str(overlay))
+
+
+def beside(above: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """Return values of a file with the content of the vehicle file that they name.
+
+    Args:
+        above: The values.
+        folder: Of their file; a relative vehicle file is looked up there.
+
+    Raises:
+        ConfigError: The vehicle file cannot be used.
+    """
+    vehicle = above.get("vehicle")
+    if not (isinstance(vehicle, str) and vehicle.endswith(".toml")):
+        return above
+    return {**above, "vehicle": dataclasses.asdict(read_vehicle(folder / vehicle))}
+
+
+def with_vehicle(preset: Preset, vehicle: str | VehicleSpec) -> Preset:
+    """Return a preset for a vehicle: of a file its content, so that nothing outside the preset says what it flies.
+
+    Raises:
+        ConfigError: There is no such vehicle, or its file cannot be used.
+    """
+    found = vehicle_from(vehicle)
+    return changed(preset, vehicle=dataclasses.asdict(found) if isinstance(found, VehicleSpec) else found)
 
 
 def values(preset: Preset) -> dict[str, Any]:

@@ -5,13 +5,11 @@ from pathlib import Path
 from typing import Any
 
 from ..adapt.learner import LearnerState
-from ..config.loading import changed, load_for, overlaid
+from ..config.loading import changed, load_for, overlaid, with_vehicle
 from ..config.plants import DELAY, is_vehicle
 from ..config.presets import Preset
 from ..config.scenario import THRUST_ERROR, Scenario
 from ..config.tasks import find_task
-from ..config.vehicle_file import VehicleSpec
-from ..config.vehicles import vehicle_from
 from ..control.policy import Policy
 from ..errors import ConfigError
 from ..io.checkpoint import load_delta
@@ -187,8 +185,7 @@ def asked_preset(
     if residual is not None:
         chosen = changed(chosen, adapt={"residual": residual})
     if vehicle is not None:
-        found = vehicle_from(vehicle)
-        chosen = changed(chosen, vehicle=_table(found) if isinstance(found, VehicleSpec) else found)
+        chosen = with_vehicle(chosen, vehicle)
     return chosen
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from ..errors import ConfigError, JobError
 from ..plants.extras import import_extra
-from .provenance import EXTRAS, commit, versions
+from .provenance import EXTRAS, code, versions
 from .reporter import Reporter
 
 ANSWERS_S = 10.0  # for somebody to be there
@@ -131,9 +131,9 @@ def joined(address: str | None, reporter: Reporter) -> Iterator[Cluster | None]:
 
 
 def ours() -> dict[str, str]:
-    """Return what must be the same everywhere: versions, and the commit of a checkout."""
+    """Return what must be the same everywhere: versions, and the code of retrim."""
     found = versions()
-    return {name: found.get(name, "missing") for name in (*ALIKE, *EXTRAS)} | {"commit": commit()}
+    return {name: found.get(name, "missing") for name in (*ALIKE, *EXTRAS)} | {"code": code()}
 
 
 def check_alike(theirs: dict[str, str], who: str) -> None:

@@ -13,7 +13,7 @@ from ..runtime.flight import Log
 
 SETTLED = 0.05  # [m]
 LONGEST_SHIFT = 3.0  # [s], half of the longest lap of the paper
-AS_GOOD = 1e-3  # [m]: of shifts that are as good, as those of a lap are, the smallest counts
+AS_GOOD, AS_GOOD_M = 0.02, 1e-3  # as a share, and [m]: shifts whose errors differ by less are as good as each other
 LEARNER_TAG = 2**30 + 2  # folded into a seed: learners share no key with training, starts and disturbances
 
 
@@ -86,18 +86,18 @@ class Flight:
     def behind(self) -> tuple[float, float] | None:
         """Return by how much the flight is behind its reference [s], and the mean error but for that [m].
 
-        It is the constant shift in time, of 3 s at most, with the smallest mean error over the last seconds; None for a
-        flight that was terminated or follows nothing.
+        It is the constant shift in time, of 3 s at most, with the smallest mean error over the last seconds; of shifts
+        that are as good, as those of a lap are, the smallest. None for a flight that was terminated or follows nothing.
         """
         if self.cross is None or self.target is None or self.log.terminated:
             return None
         rows = np.flatnonzero(self._late_rows())
         most = min(round(LONGEST_SHIFT / self.log.dt), int(rows[0]), len(rows) // 2)
+        rows = rows[rows + most < len(self.target)]  # the same for every shift, or they could not be compared
         shifts, errors = sorted(range(-most, most + 1), key=abs), list[float]()
         for k in shifts:
-            known = rows[rows - k < len(self.target)]
-            errors.append(float(np.linalg.norm(self.log.p[known] - self.target[known - k], axis=1).mean()))
-        best = int(np.argmax(np.array(errors) <= min(errors) + AS_GOOD))
+            errors.append(float(np.linalg.norm(self.log.p[rows] - self.target[rows - k], axis=1).mean()))
+        best = int(np.argmax(np.array(errors) <= (1.0 + AS_GOOD) * min(errors) + AS_GOOD_M))
         return shifts[best] * self.log.dt, errors[best]
 
     @property

@@ -28,7 +28,6 @@ FIGURES = (
 """What a flight is told by, but whether it crashed."""
 EFFORT = ("rates_rms", "rates_change_rms")
 """Commanded body rates, and their change in a tick [rad/s]."""
-BEHIND = ("behind_s", "unshifted_m")
 """How far a flight is behind its reference [s], and its error but for that [m]."""
 
 
@@ -123,7 +122,7 @@ def summary(records: Sequence[Mapping[str, Any]], keys: Sequence[str] = CONDITIO
         "settle_s": _finite(float(np.median(_column(records, "settle_s")))),
         **({"cross_track_m": float(np.mean(cross))} if cross else {}),
         **{name: _mean(records, name) for name in EFFORT},
-        **({name: _mean(records, name) for name in BEHIND} if cross else {}),
+        **({"behind_s": _median(records, "behind_s"), "unshifted_m": _mean(records, "unshifted_m")} if cross else {}),
         "interval": interval(records),
         "n": len(records) + len(why),
         "crashes": sum(each["crashed"] for each in records),
@@ -159,6 +158,11 @@ def interval(records: Sequence[Mapping[str, Any]], draws: int = 2000) -> list[fl
 def _mean(records: Sequence[Mapping[str, Any]], name: str) -> float | None:
     found = [each[name] for each in records if each.get(name) is not None]
     return float(np.mean(found)) if found else None
+
+
+def _median(records: Sequence[Mapping[str, Any]], name: str) -> float | None:
+    found = [each[name] for each in records if each.get(name) is not None]
+    return float(np.median(found)) if found else None
 
 
 def _column(records: Sequence[Mapping[str, Any]], name: str) -> np.ndarray:

@@ -19,11 +19,16 @@ EXTRAS = ("rotorpy", "mujoco", "crazyflow", "foundation-policy")
 """Packages that fly in some flights, where they are installed."""
 UNKNOWN = "unknown"
 """In the place of a commit, where the package is no checkout."""
+PACKAGE = ("src", "pyproject.toml")
+"""What of a checkout is the package."""
 
 
 @functools.cache
 def commit() -> str:
-    """Return the commit of the checkout of this package, with ``-dirty`` for local changes; or ``unknown``."""
+    """Return the commit of the checkout of this package, with ``-dirty`` for local changes of it; or ``unknown``.
+
+    Results that are written into the checkout, and notes that lie there, are no changes of the package.
+    """
     here = Path(__file__).resolve().parent
 
     def git(*words: str) -> str:
@@ -34,19 +39,25 @@ def commit() -> str:
     try:
         if Path(git("rev-parse", "--show-toplevel")) / "src" / "retrim" != here.parent:
             return UNKNOWN
-        return git("rev-parse", "--short=12", "HEAD") + ("-dirty" if git("status", "--porcelain") else "")
+        changes = git("status", "--porcelain", "--", *(f":/{path}" for path in PACKAGE))
+        return git("rev-parse", "--short=12", "HEAD") + ("-dirty" if changes else "")
     except (OSError, subprocess.CalledProcessError):
         return UNKNOWN
 
 
+@functools.cache
+def code() -> str:
+    """Return a digest of the files of this package: the same code has the same, committed or changed or installed."""
+    here, digest = Path(__file__).resolve().parents[1], hashlib.sha256()
+    for path in sorted(here.rglob("*")):
+        if path.is_file() and "__pycache__" not in path.parts:
+            digest.update(f"{path.relative_to(here).as_posix()}\0{path.stat().st_size}\0".encode() + path.read_bytes())
+    return digest.hexdigest()[:12]
+
+
 def describe_code() -> str:
-    """Return the commit in words; of an installed package, which has none, its version."""
-    return f"Commit {commit()}" if commit() != UNKNOWN else f"retrim {version('retrim')}, installed"
-
-
-def is_committed() -> bool:
-    """Return whether the commit says all of the code: with local changes nothing that was made before is used again."""
-    return not commit().endswith("-dirty")
+    """Return the commit in words; of an installed package, which has none, its version and the digest of its code."""
+    return f"Commit {commit()}" if commit() != UNKNOWN else f"retrim {version('retrim')}, installed, code {code()}"
 
 
 def versions() -> dict[str, str]:
@@ -64,7 +75,7 @@ def section_key(**what: Any) -> str:
     Args:
         **what: Numbers, texts, and lists and dictionaries of them.
     """
-    text = json.dumps({"commit": commit(), "versions": versions(), **what}, sort_keys=True)
+    text = json.dumps({"code": code(), "versions": versions(), **what}, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 

@@ -16,7 +16,7 @@ from ..io.files import write_whole
 from ..learn.datt import DISCOUNT, DattProblem, reference_bank
 from ..learn.ppo import PpoSettings, ppo
 from ..transport import wire
-from .provenance import is_committed, section_key
+from .provenance import section_key
 from .reporter import Reporter
 from .run import Run
 
@@ -79,7 +79,7 @@ def trained_datt(
         k_net, k_learn = random.split(key)
         net: DattNet = eqx.filter_jit(DattNet.of)(key=k_net)
         arrays, fixed = eqx.partition(net, eqx.is_array)
-        if path.is_file() and is_committed():
+        if path.is_file():
             try:
                 nets[seed] = eqx.combine(wire.unpack(path.read_bytes(), arrays, kind="datt", source=str(path)), fixed)
                 continue

@@ -11,10 +11,12 @@ from pathlib import Path
 from typing import Any
 
 from ..io.files import check_writable, write_whole
-from .provenance import command_line, commit, describe_hardware, versions
+from .provenance import code, command_line, commit, describe_hardware, versions
 from .stopwatch import Stopwatch
 
 SCHEMA = "retrim.results/2"
+PARTS = "sections"
+"""Folder of the parts of a run that are finished, whatever happens to the rest."""
 INTERRUPTED = 130  # exit code
 
 
@@ -53,9 +55,10 @@ class Run:
         self.executor, self.failed = executor, False
         self.pages: list[Path] = []  # that its documents have written
         self.watch = Stopwatch()
-        self.replaces = out is not None and any(self.folder.glob("*.json"))
+        self.replaces = any(self.folder.glob("*.json"))
+        self.has_parts = any((self.folder / PARTS).glob("*"))
         self.stop = stop or threading.Event()
-        commit()  # remembered from before the run writes anything into the checkout
+        commit(), code()  # as they are now: the run may last for hours
         check_writable(self.folder)
 
     @property
@@ -91,6 +94,7 @@ class Run:
             "schema": SCHEMA,
             "command": command_line(sys.argv[1:]),
             "commit": commit(),
+            "code": code(),
             "versions": versions(),
             "device": describe_hardware(),
             "seeds": list(seeds),

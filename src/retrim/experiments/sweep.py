@@ -1,7 +1,6 @@
 """Sweeps: policies x scenarios x seeds from one TOML file, resumable after a kill."""
 
 import dataclasses
-import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -11,11 +10,12 @@ from jax import random
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from ..config.loading import changed, dump, load
+from ..config.loading import beside, changed, dump, load
 from ..config.presets import Preset
 from ..config.scenario import Scenario
 from ..config.setup import Setup
 from ..config.validation import read_toml, validated
+from ..config.vehicle_file import VehicleSpec
 from ..control.policy import Policy
 from ..io.files import write_whole
 from ..io.trained import load_policy, save_policy
@@ -26,9 +26,11 @@ from .flights import Flight, FlightSpec
 from .gathering import told_by
 from .limits import check_seeds
 from .metrics import Rows, cell, failed_record, metres, record, summary
+from .provenance import section_key
 from .reporter import Reporter
 from .run import Run
 from .tables.document import Document, TableSection
+from .tables.kept import files_behind, named_by, named_in
 from .training import train, trained_elsewhere
 
 STRICT = ConfigDict(extra="forbid")
@@ -45,8 +47,8 @@ class Sweep:
     methods: tuple[str, ...] = Field(default=("base", "full"), min_length=1)
     disturbances: tuple[str, ...] = Field(default=("none",), min_length=1)
     plants: tuple[str, ...] = Field(default=("bem",), min_length=1)
-    vehicles: tuple[str, ...] = ()
-    """Vehicles that fly; that of training by default."""
+    vehicles: tuple[str | VehicleSpec, ...] = ()
+    """Vehicles that fly; that of training by default. A file is looked up beside the sweep's, and its content kept."""
     sensors: tuple[str, ...] = Field(default=("ideal",), min_length=1)
     references: tuple[str, ...] = ()
     """What tracking policies follow."""
@@ -54,7 +56,7 @@ class Sweep:
     seconds: float | None = Field(default=None, ge=1.0, le=36_000.0)
     """Length of a flight; the task's own by default."""
     overlay: dict[str, Any] = Field(default_factory=dict)
-    """Values on top of every preset, as in a preset's own TOML file."""
+    """Values on top of every preset, as in a preset's own TOML file: a vehicle file is looked up beside the sweep's."""
 
     def scenarios(self) -> list[Scenario]:
         """Return every combination of disturbance, plant, vehicle, sensors and reference."""
@@ -74,14 +76,20 @@ def read_sweep(path: Path) -> Sweep:
     Raises:
         ConfigError: It cannot be read, or a key or value does not fit.
     """
-    return validated(Sweep, read_toml(path), source=str(path))
+    tables = read_toml(path)
+    if isinstance(overlay := tables.get("overlay"), dict):
+        tables["overlay"] = beside(overlay, path.parent)
+    if isinstance(names := tables.get("vehicles"), list):
+        tables["vehicles"] = [beside({"vehicle": name}, path.parent)["vehicle"] for name in names]
+    return validated(Sweep, tables, source=str(path))
 
 
 def run_sweep(sweep: Sweep, run: Run, reporter: Reporter) -> Rows:
     """Train and fly everything that the run's folder does not hold yet.
 
     Policies are kept in ``policies/``, each flight's row in ``flights.jsonl``; a run that was killed goes on from
-    them. ``sweep.md``, ``sweep.json`` and ``sweep.png`` are written at the end, and after an interruption.
+    those that this code made from these files. ``sweep.md``, ``sweep.json`` and ``sweep.png`` are written at the end,
+    and after an interruption.
 
     Returns:
         One row per preset, scenario and method.
@@ -102,7 +110,8 @@ def run_sweep(sweep: Sweep, run: Run, reporter: Reporter) -> Rows:
         if run.interrupted:
             break
     keys = [_key(fleet.preset, spec, fleet.seconds) for fleet in fleets for spec in fleet.specs]
-    return _report(sweep, [kept.rows[key] for key in keys if key in kept.rows], run, reporter)
+    earlier = len(kept.earlier.intersection(keys))
+    return _report(sweep, [kept.rows[key] for key in keys if key in kept.rows], run, reporter, earlier)
 
 
 def _fleet(preset: Preset, policies: Mapping[int, Policy], sweep: Sweep) -> Fleet:
@@ -145,8 +154,8 @@ def _trained(preset: Preset, sweep: Sweep, run: Run, reporter: Reporter) -> dict
     Raises:
         KeyboardInterrupt: The run was interrupted before all were trained.
     """
-    digest = hashlib.sha256(dump(preset).encode()).hexdigest()[:8]
-    stem = f"{preset.name.replace('/', '-')}-{digest}"
+    digest = section_key(preset=dump(preset), files=files_behind(*named_in(preset)))
+    stem = f"{preset.name.replace('/', '-')}-{digest[:8]}"
     paths = {seed: run.folder / "policies" / f"{stem}-seed{seed}.safetensors" for seed in sweep.seeds}
     found = {seed: load_policy(path)[0] for seed, path in paths.items() if path.is_file()}
     missing = [seed for seed in sweep.seeds if seed not in found]
@@ -182,6 +191,7 @@ class _Kept:
                     self.rows[row["key"]] = row
             except (json.JSONDecodeError, KeyError, TypeError):
                 continue
+        self.earlier = frozenset(self.rows)
 
     def add(self, rows: Mapping[str, Mapping[str, Any]]) -> None:
         """Keep rows by their keys; the whole file is written."""
@@ -190,14 +200,14 @@ class _Kept:
 
 
 def _key(preset: Preset, spec: FlightSpec, seconds: float) -> str:
-    text = dump(preset) + repr((spec, seconds))
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
+    files = files_behind(spec.method, *named_in(preset), *named_by(spec.scenario))
+    return section_key(preset=dump(preset), spec=repr(spec), seconds=seconds, files=files)
 
 
 GROUP = ("preset", "plant", "vehicle", "sensors", "reference", "disturbance", "method")
 
 
-def _report(sweep: Sweep, kept: Sequence[dict[str, Any]], run: Run, reporter: Reporter) -> Rows:
+def _report(sweep: Sweep, kept: Sequence[dict[str, Any]], run: Run, reporter: Reporter, earlier: int) -> Rows:
     """Write the documents of the flights that are over, in the order of the sweep."""
     groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
     for row in kept:
@@ -211,7 +221,9 @@ def _report(sweep: Sweep, kept: Sequence[dict[str, Any]], run: Run, reporter: Re
         figures = (none if row[name] is None else metres(row[name]) for name in ("median", "max"))
         cells.append((*(str(flights[0][name]) for name in varied), cell(row), *figures))
     intro = "Made by `retrim sweep`. Error [m] over the last seconds of each flight, over seeds and starts."
-    document = Document(run, "sweep", "Sweep", intro, sweep.seeds, reporter, {"sweep": dataclasses.asdict(sweep)})
+    document = Document(
+        run, "sweep", "Sweep", intro, sweep.seeds, reporter, {"sweep": dataclasses.asdict(sweep)}, earlier=earlier
+    )
     if cells:
         drawn = save(bars("Error at the end of the flights [m]", _bar_groups(groups)), run.folder, "sweep")
         columns = (*varied, "mean ± std [m]", "median [m]", "maximum [m]")

@@ -1,17 +1,17 @@
 """All tables of the paper, one after another."""
 
+import json
 from collections.abc import Callable
 from typing import Any
 
 from ...errors import PlantError
-from ..provenance import is_committed, section_key
+from ..provenance import section_key
 from ..reporter import Reporter
-from ..run import Run
+from ..run import PARTS, Run
 from .design import design
 from .document import Document, TableSection
 from .efficiency import efficiency
 from .hover import hover
-from .kept import FOLDER
 from .levels import METHODS
 from .model import model
 from .phase import phase
@@ -41,6 +41,8 @@ PLAN: tuple[tuple[Callable[..., None], str, Options], ...] = (
 )
 """Table, what of the paper it is, and its options."""
 QUICK_LEAVES_OUT = (phase, plants)
+AT_LEAST = "at least "
+"""Where an earlier run had made a part, whose time nobody has noted."""
 
 
 def everything(run: Run, reporter: Reporter, *, quick: bool = False) -> None:
@@ -69,24 +71,26 @@ def everything(run: Run, reporter: Reporter, *, quick: bool = False) -> None:
         row: dict[str, Any] = {"table": name, "what": what, "page": f"{folder}/{name}.md"}
         place = run.folder / folder
         part = Run("reproduce", place, stop=run.stop, remark=remark, trained=run.folder, executor=run.executor)
-        done = run.folder / FOLDER / f"{section_key(table=name, options=options)}.done"
-        if done.is_file() and (run.folder / row["page"]).is_file() and is_committed():
+        done = run.folder / PARTS / f"{section_key(table=name, options=options)}.done"
+        if done.is_file() and (run.folder / row["page"]).is_file():
             reporter.say(f"{name}: as an earlier run of this folder has made it")
-            row["s"] = float(done.read_text())
+            document.earlier += 1
+            row |= json.loads(done.read_text())
         else:
             try:
                 make(part, reporter, **options)
             except PlantError as error:
                 rows.append({"table": name, "what": what, "left_out": str(error)})
                 continue
-            row["s"] = part.watch.total_s
+            took = {"s": round(part.watch.total_s, 1), "at_least": part.has_parts}
+            row |= took
             if not run.interrupted:
-                run.write_text(str(done.relative_to(run.folder)), f"{part.watch.total_s:.1f}\n")
+                run.write_text(str(done.relative_to(run.folder)), json.dumps(took) + "\n")
         rows.append(row)
     lines = tuple(
         (row["what"], f"{row['table']}, left out: {row['left_out']}", "-")
         if "left_out" in row
-        else (row["what"], f"[{row['table']}]({row['page']})", f"{row['s'] / 60:.1f}")
+        else (row["what"], f"[{row['table']}]({row['page']})", f"{AT_LEAST * row['at_least']}{row['s'] / 60:.1f}")
         for row in rows
     )
     document.add(TableSection(("of the paper", "table", "minutes"), lines), rows)

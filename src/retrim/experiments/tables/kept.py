@@ -7,36 +7,38 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from ..provenance import is_committed
-from ..run import Run
+from ...config.presets import Preset
+from ...config.scenario import Scenario
+from ..run import PARTS, Run
 from .document import TableSection
-
-FOLDER = "sections"
 
 
 def keep(run: Run, key: str, section: TableSection, rows: list[dict[str, Any]]) -> None:
     """Write a section and the rows behind it to the folder of the run."""
-    whole = dataclasses.asdict(section) | {"picture": None if section.picture is None else section.picture.name}
-    run.write_text(f"{FOLDER}/{key}.json", json.dumps({"section": whole, "rows": rows}) + "\n")
+    drawn = None if section.picture is None else {section.picture.name: _digest(section.picture)}
+    whole = dataclasses.asdict(section) | {"picture": drawn}
+    run.write_text(f"{PARTS}/{key}.json", json.dumps({"section": whole, "rows": rows}) + "\n")
 
 
 def kept(run: Run, key: str) -> tuple[TableSection, list[dict[str, Any]]] | None:
     """Return a section that an earlier run of this folder has finished, with its rows; None if there is none.
 
-    Local changes to the code are told by nothing but ``-dirty``, so that with them nothing counts as finished.
+    Another run may have drawn over its picture since: then it is made again.
     """
-    path = run.folder / FOLDER / f"{key}.json"
-    if not (is_committed() and path.is_file()):
+    path = run.folder / PARTS / f"{key}.json"
+    if not path.is_file():
         return None
     try:
         found = json.loads(path.read_text())
         whole, rows = found["section"], found["rows"]
-        picture = None if whole["picture"] is None else run.folder / whole["picture"]
+        drawn = {run.folder / name: digest for name, digest in (whole["picture"] or {}).items()}
+        if any(_digest(path) != digest for path, digest in drawn.items()):
+            return None
         lines = tuple(tuple(row) for row in whole["rows"])
-        section = TableSection(tuple(whole["columns"]), lines, whole["title"], whole["about"], picture)
-    except (OSError, ValueError, KeyError, TypeError):
+        section = TableSection(tuple(whole["columns"]), lines, whole["title"], whole["about"], next(iter(drawn), None))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None  # it is made again
-    return None if picture is not None and not picture.is_file() else (section, rows)
+    return section, rows
 
 
 def files_behind(*names: str | None) -> dict[str, str]:
@@ -50,5 +52,22 @@ def files_behind(*names: str | None) -> dict[str, str]:
         head = part.partition(":")[0].partition("=")[0]
         path = Path(getattr(sys.modules.get(head) if ":" in part else None, "__file__", None) or head)
         if path.is_file():
-            found[part] = hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+            found[part] = _digest(path)
     return found
+
+
+def named_in(preset: Preset) -> list[str | None]:
+    """Return the names in a preset behind which a file may stand."""
+    trained_on = None if preset.track is None else preset.track.reference
+    vehicle = preset.vehicle if isinstance(preset.vehicle, str) else None
+    return [preset.task, preset.adapt.residual, trained_on, vehicle]
+
+
+def named_by(scenario: Scenario) -> list[str | None]:
+    """Return the names in a scenario behind which a file may stand."""
+    vehicle = scenario.vehicle if isinstance(scenario.vehicle, str) else None
+    return [scenario.plant, scenario.sensors, scenario.disturbance, scenario.reference, vehicle]
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:16]

@@ -20,7 +20,7 @@ from ..rivals import DATT_STEPS, RIVALS, check_rival, check_steps
 from ..run import Run
 from .beside import figures_table
 from .document import Document, TableSection
-from .kept import files_behind, keep, kept
+from .kept import files_behind, keep, kept, named_by, named_in
 from .study import Study, fly_all, refuse_misfits, train_all
 
 LEVELS = {"none": "no disturbance", "small": "small, 0.5 m/s² per axis", "large": "large, 2 m/s² per axis"}
@@ -122,11 +122,10 @@ def fly_levels(
 
 def _files_behind(section: Levels) -> dict[str, str]:
     """What is not in retrim and not in the preset."""
-    preset, named = section.preset, list[str | None](section.methods)
+    named = list[str | None](section.methods)
     for each in section.scenarios:
-        named += [each.plant, each.sensors, each.disturbance, each.reference]
-    trained_on = None if preset.track is None else preset.track.reference
-    return files_behind(*named, preset.task, preset.adapt.residual, trained_on)
+        named += named_by(each)
+    return files_behind(*named, *named_in(section.preset))
 
 
 def _level_section(

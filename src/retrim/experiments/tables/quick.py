@@ -1,7 +1,7 @@
 """A quick look at a table: one training seed, two starts, short flights."""
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from inspect import Parameter
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,8 @@ QUICK: dict[str, Options] = {
 """By table: options that are smaller."""
 ALONE = ("model", "efficiency", "buses", "tuning", "design", "scaling")
 """Tables that this process makes alone."""
+GO_ON = ("hover", "track", "phase", "vision", "fast", "transfer", "raptor", "ablation", "everything")
+"""Tables that are made in parts, and whose command goes on where it was killed."""
 REMARK = "A quick look, smaller than the table: figures to look at, not to quote."
 
 
@@ -55,15 +57,25 @@ def help_of(make: Callable[..., None]) -> str:
         text += (
             "\n    quick: One training seed, two starts, short flights, and less of all else that no option asks for."
         )
-    return f"{text}\n    out: Folder of what is made; a new one under runs/ by default."
+    where = "a new one under runs/" if (folder := folder_of(make)) is None else f"{folder}, where the command goes on"
+    return f"{text}\n    out: Folder of what is made; {where} by default."
 
 
-def looked(make: Callable[..., None], chosen: Mapping[str, Any]) -> tuple[Options, str]:
+def folder_of(make: Callable[..., None], *, quick: bool = False) -> Path | None:
+    """Return the folder of a table that nobody names: always the same where its command goes on; None for a new one."""
+    if make.__name__ not in GO_ON:
+        return None
+    whole = make.__name__ == "everything"  # it has a folder of its own for the quick look
+    return Path("runs") / f"reproduce-{'all' if whole else make.__name__}{'-quick' * (quick and not whole)}"
+
+
+def looked(make: Callable[..., None], chosen: Mapping[str, Any], words: Sequence[str] = ()) -> tuple[Options, str]:
     """Return the options of a table, and what its documents should say of them.
 
     Args:
         make: The function that makes it.
         chosen: Options as they were asked; with ``quick`` those that differ from their defaults stay.
+        words: The command's: an option that they name stays, too.
     """
     if make.__name__ not in QUICK:
         return dict(chosen), ""
@@ -71,5 +83,6 @@ def looked(make: Callable[..., None], chosen: Mapping[str, Any]) -> tuple[Option
     if not chosen["quick"]:
         return asked, ""
     defaults = inspect.signature(make).parameters
-    left = {name for name, value in asked.items() if value == defaults[name].default}
+    named = {word.partition("=")[0].removeprefix("--").replace("-", "_") for word in words if word.startswith("--")}
+    left = {name for name, value in asked.items() if value == defaults[name].default} - named
     return {**asked, **{name: value for name, value in QUICK[make.__name__].items() if name in left}}, REMARK

@@ -1,7 +1,8 @@
 """RAPTOR, the foundation policy, beside ours: hover and a figure-8, undisturbed and disturbed."""
 
-from ...config.loading import changed
+from ...config.loading import with_vehicle
 from ...config.scenario import Scenario
+from ...config.vehicles import name_of
 from ..reporter import Reporter
 from ..run import Run
 from .document import Document
@@ -53,8 +54,9 @@ def raptor(
     sections = list[Levels]()
     for vehicle in vehicles:
         for what, preset, reference in (("Hover", hover, None), ("Figure-8", track, "figure8")):
-            own = changed(preset, vehicle=vehicle)
-            title, stem = f"{what}, {vehicle}", f"raptor_{what.lower().replace('-', '')}_{vehicle}"
+            own = with_vehicle(preset, vehicle)
+            name = name_of(own.vehicle)
+            title, stem = f"{what}, {name}", f"raptor_{what.lower().replace('-', '')}_{name}"
             drawn = ("raptor", "full")
             sections.append(
                 Levels(title, own, Scenario(reference=reference), stem, methods, levels=DISTURBED, drawn=drawn)

@@ -81,7 +81,7 @@ def reversing(
     pictured = [f for f in flown if f.spec.method in ("base", "full")]
     drawn = picture(pictured, Setup.of(loaded), scenario, run.folder)
     document.more = {"moments_s": moments.tolist(), "errors_m": {m: np.array(e).tolist() for m, e in errors.items()}}
-    document.add(_section(errors, moments, updates, about, drawn[0]), found)
+    document.add(_section(errors, moments, updates, about, drawn[0] if drawn else None), found)
 
 
 def _peak(row: dict[str, Any]) -> str:
@@ -108,7 +108,7 @@ def _errors(flight: Flight, moments: np.ndarray, span: float = 1.0) -> np.ndarra
 
 
 def _section(
-    errors: dict[str, list[np.ndarray]], moments: np.ndarray, updates: list[int], about: str, drawn: Path
+    errors: dict[str, list[np.ndarray]], moments: np.ndarray, updates: list[int], about: str, drawn: Path | None
 ) -> TableSection:
     lines = list[tuple[str, ...]]()
     for i, reversal in enumerate(moments[:, 0]):

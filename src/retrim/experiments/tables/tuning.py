@@ -58,7 +58,7 @@ def tuning(
     """Settings of the classical baselines: the best of random candidates on pushes, starts and seeds of their own.
 
     Args:
-        run: Folder of tuning.md and tuning.json.
+        run: Folder of tuning.md and tuning.json; what they are shown is in the names where it is not the state.
         reporter: Receives progress and the sections.
         methods: Which baselines.
         shown: What they fly by: the measured state, or the pose that a filter estimates from keypoints.
@@ -90,7 +90,8 @@ def tuning(
         f"mean square of the error after {SETTLING:g} s, the mean over flights [m], a crash counting {CRASH:g} m. No "
         "table flies these conditions, starts or seeds."
     )
-    document = Document(run, "tuning", "Settings of the baselines", intro, [], reporter)
+    stem = "tuning" if shown == "state" else f"tuning_{shown}"
+    document = Document(run, stem, "Settings of the baselines", intro, [], reporter)
     setups = [Setup.of(load(preset), reference) for preset, *_, reference in conditions]
     for name in methods:
         if run.interrupted:
