@@ -8,7 +8,7 @@ import pytest
 from jax import random
 
 from retrim.estimation.disturbance_observer import DisturbanceObserver
-from retrim.physics import Command, PointMass, State
+from retrim.physics import Command, PointMass, State, so3
 from retrim.physics.actuators import lagged
 
 DT, D = 0.02, jnp.array([1.5, -1.0, 2.0])
@@ -34,7 +34,7 @@ def _observed(observer, key, ticks, noise, late, turning, d, thrust_tau):
 
     def tick(carry, xs):
         s, x, queue, thrust = carry
-        k, k_noise = xs
+        k, k_noise, t = xs
         u = command(k)
         s = observer.issued(s, u)
         queue = jax.tree.map(lambda old, new: jnp.concatenate([old[1:], new[None]]), queue, u)
@@ -42,13 +42,14 @@ def _observed(observer, key, ticks, noise, late, turning, d, thrust_tau):
         c, thrust = (acting.c, thrust) if thrust_tau is None else lagged(thrust, acting.c, DT, thrust_tau)
         x = model.step(x, Command(c, turning * acting.omega), d)
         seen = State(x.p, x.R, x.v + noise * random.normal(k_noise, (3,)))
-        s = observer(s, seen)
+        s = observer(s, t, seen)
         return (s, x, queue, thrust), (s.d_hat, s.noise)
 
     x = State.at(jnp.zeros(3))
     hover = jax.tree.map(lambda leaf: jnp.stack([leaf] * (late + 1)), Command.hover(jnp.float64))
-    start = (observer.init(x), x, hover, hover.c[0])
-    _, found = jax.lax.scan(tick, start, (keys, random.split(random.fold_in(key, 7), ticks)))
+    start = (observer(observer.init(x), jnp.array(0.0), x), x, hover, hover.c[0])
+    times = DT * jnp.arange(1.0, ticks + 1.0)
+    _, found = jax.lax.scan(tick, start, (keys, random.split(random.fold_in(key, 7), ticks), times))
     return found
 
 
@@ -82,18 +83,19 @@ def test_while_a_command_at_a_limit_acts_the_estimate_is_held(key):
     observer, model, hover = make(limits=limits), PointMass(DT), Command.hover(jnp.float64)
     idle = Command(jnp.array(0.3), jnp.array([9.9, 0.0, 0.0]))
 
-    def tick(carry, told):
-        s, x, acting = carry
+    def tick(carry, xs):
+        (s, x, acting), (told, t) = carry, xs
         at_limit = acting.c < 1.0
         lifted = jnp.where(at_limit, 1.0, 0.0) * 9.0 * x.R[:, 2]
         x = model.step(x, acting, D + lifted)
-        s = observer.issued(observer(s, x), told)
+        s = observer.issued(observer(s, t, x), told)
         return (s, x, told), (s.d_hat, at_limit)
 
     told = [hover] * 50 + [idle] * 20 + [hover] * 50
     x = State.at(jnp.zeros(3))
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *told)
-    _, (found, at_limit) = jax.lax.scan(tick, (observer.init(x), x, hover), stacked)
+    first = observer(observer.init(x), jnp.array(0.0), x), x, hover
+    _, (found, at_limit) = jax.lax.scan(tick, first, (stacked, DT * jnp.arange(1.0, len(told) + 1.0)))
     np.testing.assert_allclose(found[51:], jnp.broadcast_to(D, found[51:].shape), atol=0.02)
     assert int(at_limit.sum()) == 20
 
@@ -118,12 +120,33 @@ def test_it_follows_a_wandering_disturbance_about_as_well_as_the_best_constant_f
 
     @eqx.filter_jit
     def error(observer):
-        def tick(s, v):
-            s = observer.issued(observer(s, State(jnp.zeros(3), jnp.eye(3), v)), Command.hover(jnp.float64))
+        def tick(s, xs):
+            v, t = xs
+            s = observer.issued(observer(s, t, State(jnp.zeros(3), jnp.eye(3), v)), Command.hover(jnp.float64))
             return s, s.d_hat
 
-        _, found = jax.lax.scan(tick, observer.init(State.at(jnp.zeros(3))), seen)
+        first = observer.init(State.at(jnp.zeros(3)))
+        _, found = jax.lax.scan(tick, first, (seen, DT * jnp.arange(float(len(seen)))))
         return jnp.sqrt(jnp.mean((found - walk)[200:] ** 2))
 
     constant = min(error(make(tau=tau, wander=np.inf, limit=99.0)) for tau in (0.02, 0.05, 0.1, 0.2, 0.4))
     assert error(make(tau=1e-3, limit=99.0)) < 1.02 * constant
+
+
+def test_what_a_vehicle_gained_by_another_time_than_a_tick_is_no_disturbance():
+    """Not at the first measurement, of which nothing came before, and not over a tick that was missed."""
+    observer, model, u = make(wander=np.inf), PointMass(DT), Command(jnp.array(12.0), jnp.array([0.5, 0.0, 0.0]))
+    x = State(jnp.zeros(3), so3.exp(jnp.array([0.3, -0.3, 0.0])), jnp.array([1.0, 0.0, 0.0]))
+    step = jax.jit(lambda s, t, x: observer.issued(observer(s, t, x), u))
+    s = step(observer.init(x), jnp.array(0.0), x)
+    np.testing.assert_array_equal(s.d_hat, 0.0)
+    for k in range(1, 40):
+        x = model.step(x, u, D)
+        if k in (20, 21, 30):
+            continue
+        before, s = s, step(s, jnp.array(DT * k), x)
+        if k in (22, 31):
+            np.testing.assert_array_equal(s.d_hat, before.d_hat)
+        else:
+            assert float(jnp.abs(s.d_hat - D).max()) <= float(jnp.abs(before.d_hat - D).max()) + 1e-6
+    np.testing.assert_allclose(s.d_hat, D, atol=0.01)

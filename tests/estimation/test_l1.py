@@ -15,17 +15,18 @@ DT = 0.02
 def estimates(estimator, d, key, ticks=400):
     """Estimates of a vehicle that tumbles under random thrust and a disturbance ``d``, by tick."""
 
-    def tick(carry, k):
-        x, memory = carry
+    def tick(carry, xs):
+        (x, memory), (k, t) = carry, xs
         k_c, k_w = random.split(k)
         thrust = (9.81 + 3.0 * random.normal(k_c)) * x.R[:, 2]
         v = x.v + DT * (thrust + jnp.array([0.0, 0.0, -9.81]) + d)
         x = State(x.p + DT * x.v, x.R @ so3.exp(DT * random.normal(k_w, (3,))), v)
-        memory = estimator(memory, x, thrust)
+        memory = estimator(memory, t, x, thrust)
         return (x, memory), memory.d_hat
 
     x = State.at(jnp.zeros(3))
-    return lax.scan(tick, (x, L1State.start(x)), random.split(key, ticks))[1]
+    first = estimator(L1State.start(x), jnp.array(0.0), x, jnp.zeros(3))
+    return lax.scan(tick, (x, first), (random.split(key, ticks), DT * jnp.arange(1.0, ticks + 1.0)))[1]
 
 
 @pytest.mark.parametrize("pole", [-0.01, -0.2, -2.0])
@@ -45,3 +46,24 @@ def test_it_is_linear_in_the_disturbance(key):
     one, other = jnp.array([1.0, 0.0, -2.0]), jnp.array([0.0, 3.0, 0.5])
     a, b, both = (estimates(estimator, d, key, ticks=50) for d in (one, other, one + 2.0 * other))
     np.testing.assert_allclose(both, a + 2.0 * b, atol=1e-9)
+
+
+def test_what_a_vehicle_gained_by_another_time_than_a_tick_is_no_disturbance():
+    """Not at the first measurement, and not over ticks that were missed; then it goes on as its law says."""
+    d, thrust = jnp.array([1.0, -0.5, 0.3]), jnp.array([2.0, 0.0, 11.0])
+    estimator = L1Estimator(jnp.array(-0.2), jnp.exp(jnp.array(-DT / 0.1)), DT)
+    gained = DT * (thrust + jnp.array([0.0, 0.0, -9.81]) + d)
+
+    def after(ticks):
+        memory, found = L1State.start(State.at(jnp.zeros(3))), []
+        for k in ticks:
+            x = State(jnp.zeros(3), jnp.eye(3), jnp.array([3.0, 0.0, 0.0]) + k * gained)
+            memory = estimator(memory, jnp.array(DT * k), x, thrust)
+            found.append(np.asarray(memory.d_hat))
+        return np.stack(found)
+
+    whole, missed = after(range(40)), after([*range(20), *range(23, 40)])
+    np.testing.assert_array_equal(whole[0], 0.0)
+    np.testing.assert_array_equal(missed[20], missed[19])
+    np.testing.assert_allclose(missed[21:], whole[20:36], atol=0.02)
+    np.testing.assert_allclose(missed[-1], d, atol=0.03)

@@ -126,7 +126,7 @@ class Datt(AbstractController[DattState]):
     def __call__(self, memory: DattState, t: Float[Array, ""], x: State) -> tuple[Command, DattState]:
         """Evaluate the network once, for the state in which the command begins to act."""
         thrust = self.prediction.thrust(memory.underway, memory.last.R, x.R)
-        estimate = self.estimator(memory.estimate, x, thrust)
+        estimate = self.estimator(memory.estimate, t, x, thrust)
         d = jnp.clip(estimate.d_hat, -self.known, self.known)
         soon, acting = self.prediction(memory.underway, x, estimate.d_hat)
         times = t + self.prediction.delay_ticks * self.prediction.dt + APART * jnp.arange(AHEAD, dtype=t.dtype)

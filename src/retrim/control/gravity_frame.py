@@ -62,7 +62,7 @@ class GravityFrame(AbstractController[GravityFrameState]):
             unsteady = Unsteady(self.known)
             felt = unsteady(x, memory.observer.commands[-1])
             observer = dataclasses.replace(observer, nominal=Hybrid(observer.nominal, unsteady))
-        observed = observer(memory.observer, x)
+        observed = observer(memory.observer, t, x)
         frame = FeltFrame.of(capped(observed.d_hat + felt, observer.limit))
         bias, last = self.rate_bias.astype(x.p.dtype), memory.observer.commands[0]
         x = ahead(x, Command(last.c, last.omega + bias), frame.d, self.age.astype(x.p.dtype))

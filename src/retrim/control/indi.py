@@ -9,8 +9,9 @@ import dataclasses
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
+from ..estimation.latency import follows
 from ..estimation.prediction import Prediction, Underway
 from ..physics import so3
 from ..physics.state import Command, State
@@ -28,8 +29,8 @@ class IncrementalState(eqx.Module):
     """State measured one tick ago."""
     excess: Float[Array, "3"]
     """What the thrust that acts has beyond the measured acceleration and gravity, filtered, world [m/s^2]."""
-    ticks: Int[Array, ""]
-    """Ticks flown: before the first there is nothing to compare."""
+    t: Float[Array, ""]
+    """Time of the last measurement [s]; minus infinity before the first: then there is nothing to compare."""
 
 
 class Incremental(AbstractController[IncrementalState]):
@@ -56,7 +57,7 @@ class Incremental(AbstractController[IncrementalState]):
 
     def init(self, x: State) -> IncrementalState:
         """Return the memory at the start of a flight."""
-        return IncrementalState(self.prediction.init(x), x, jnp.zeros_like(x.p), jnp.array(0))
+        return IncrementalState(self.prediction.init(x), x, jnp.zeros_like(x.p), jnp.full_like(x.p[0], -jnp.inf))
 
     def __call__(self, memory: IncrementalState, t: Float[Array, ""], x: State) -> tuple[Command, IncrementalState]:
         """Decide for the state in which the command begins to act."""
@@ -67,13 +68,13 @@ class Incremental(AbstractController[IncrementalState]):
         late = self.prediction.age if self.a is not None else jnp.zeros_like(self.prediction.age)
         turned = so3.exp(late.astype(a.dtype) * (acted.omega if self.omega is None else self.omega))
         thrust = self.prediction.thrust(memory.underway, so3.mul(last.R, turned), so3.mul(x.R, turned))
-        share = jnp.where(memory.ticks > 0, 1.0 - jnp.exp(-dt / self.tau.astype(a.dtype)), 0.0)
+        share = jnp.where(follows(t, memory.t, dt), 1.0 - jnp.exp(-dt / self.tau.astype(a.dtype)), 0.0)
         excess = memory.excess + share * (thrust - thrust_of(a) - memory.excess)
         soon, _ = self.prediction(memory.underway, x, -excess, self.omega)
         wanted = self.task.wanted(t + self.prediction.delay_ticks * dt)
         acceleration = self.gains.acceleration(soon, wanted, jnp.zeros_like(x.p))
         u = command_for(soon, thrust_of(acceleration) + excess, wanted, self.gains.turning())
-        return u, IncrementalState(self.prediction.issued(memory.underway, u), x, excess, memory.ticks + 1)
+        return u, IncrementalState(self.prediction.issued(memory.underway, u), x, excess, t.astype(a.dtype))
 
     def accepted(self, memory: IncrementalState, u: Command) -> IncrementalState:
         """Remember the accepted command."""

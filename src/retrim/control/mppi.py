@@ -80,7 +80,7 @@ class Mppi(AbstractController[MppiState]):
         """Plan from the state in which the command begins to act, and return the first command of the plan."""
         dtype, underway, estimate = x.p.dtype, memory.underway, memory.estimate
         if self.estimator is not None:
-            estimate = self.estimator(estimate, x, self.prediction.thrust(underway, memory.last.R, x.R))
+            estimate = self.estimator(estimate, t, x, self.prediction.thrust(underway, memory.last.R, x.R))
         soon, acting = self.prediction(underway, x, estimate.d_hat)
         dt = self.prediction.dt
         times = t + dt * (self.prediction.delay_ticks + 1 + jnp.arange(self.horizon, dtype=dtype))

@@ -12,6 +12,7 @@ noise r per tick, (q / (r sqrt(dt)))^(1/2) [rad/s]; r is that of the last second
 observer is a first-order low-pass of what the model missed in each tick.
 
 While a command at a limit acts, what the vehicle does is no disturbance: d and r are held, and v is what is measured.
+So it is at the first measurement and after one that was missed, since what changed then is not of one tick.
 """
 
 import dataclasses
@@ -25,6 +26,7 @@ from ..physics import so3
 from ..physics.actuators import is_followed, lagged
 from ..physics.dynamics import AbstractDynamics
 from ..physics.state import Command, State, where
+from .latency import follows
 
 NOISE_TAU = 1.0  # [s], memory of the estimated noise
 SECOND_DIFFERENCE = 1.954  # mean magnitude of the second difference of white noise, in standard deviations
@@ -35,6 +37,8 @@ class ObserverState(eqx.Module):
 
     last: State
     """State measured one tick ago."""
+    t: Float[Array, ""]
+    """When [s]; minus infinity before the first measurement."""
     commands: tuple[Command, ...]
     """Commands of the last ticks, oldest first; the oldest acted during the tick that has just ended."""
     v: Float[Array, "3"]
@@ -70,12 +74,18 @@ class DisturbanceObserver(eqx.Module):
         """Return the memory of a vehicle that hovers at ``x`` undisturbed."""
         zero = jnp.zeros_like(x.p)
         commands = (Command.hover(x.p.dtype),) * (self.delay_ticks + 1)
-        return ObserverState(x, commands, x.v, zero, zero, jnp.zeros_like(x.p[0]), commands[0].c)
+        never = jnp.full_like(x.p[0], -jnp.inf)
+        return ObserverState(x, never, commands, x.v, zero, zero, jnp.zeros_like(x.p[0]), commands[0].c)
 
-    def __call__(self, s: ObserverState, x: State) -> ObserverState:
-        """Return the memory with the estimate corrected by the newly measured state ``x``.
+    def __call__(self, s: ObserverState, t: Float[Array, ""], x: State) -> ObserverState:
+        """Return the memory with the estimate corrected by what was newly measured.
 
         Call it once per tick, then :meth:`issued` with the command of the new tick.
+
+        Args:
+            s: Memory.
+            t: Time since the start of the flight [s].
+            x: Measured state.
         """
         nominal, dt, given = self.nominal, self.nominal.dt, s.commands[0]
         mean, thrust = given.c, given.c
@@ -93,11 +103,13 @@ class DisturbanceObserver(eqx.Module):
         d_hat = s.d_hat + (1.0 - z) * (1.0 - w) * innovation / dt
         norm = jnp.sqrt(jnp.sum(d_hat * d_hat) + 1e-12)
         d_hat = d_hat * jnp.minimum(1.0, self.limit / norm)
-        after = ObserverState(x, s.commands, predicted + (1.0 - z * w) * innovation, d_hat, missed, noise, thrust)
-        if self.limits is None:
-            return after
+        t = t.astype(x.p.dtype)
+        after = ObserverState(x, t, s.commands, predicted + (1.0 - z * w) * innovation, d_hat, missed, noise, thrust)
         held = dataclasses.replace(after, v=x.v, d_hat=s.d_hat, missed=s.missed, noise=s.noise)
-        return where(is_followed(given, self.limits), after, held)
+        comparable = follows(t, s.t, dt)
+        if self.limits is not None:
+            comparable &= is_followed(given, self.limits)
+        return where(comparable, after, held)
 
     def issued(self, s: ObserverState, u: Command) -> ObserverState:
         """Return the memory after the command ``u`` was issued for the tick that begins."""

@@ -9,14 +9,16 @@ that would take all of the prediction error away within a tick, and the filter m
 
 where f is the thrust that was commanded (Hovakimyan and Cao 2010; as flown with DATT, Huang et al. 2023). A constant
 disturbance d shows in -sigma from the second tick on, so that d_hat approaches it with the time constant
--dt / ln(alpha).
+-dt / ln(alpha). At the first measurement, and after one that was missed, the predictor starts from what is measured,
+and d_hat is held: what changed then is not of one tick.
 """
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..physics.state import STANDARD_GRAVITY, State
+from ..physics.state import STANDARD_GRAVITY, State, where
+from .latency import follows
 
 
 class L1State(eqx.Module):
@@ -28,11 +30,13 @@ class L1State(eqx.Module):
     """Correction of the last tick [m/s^2]."""
     d_hat: Float[Array, "3"]
     """Estimated disturbance [m/s^2]."""
+    t: Float[Array, ""]
+    """Time of the last measurement [s]; minus infinity before the first."""
 
     @classmethod
     def start(cls, x: State) -> "L1State":
         """Return the memory at the start of a flight in the state ``x``."""
-        return cls(x.v, jnp.zeros_like(x.v), jnp.zeros_like(x.v))
+        return cls(x.v, jnp.zeros_like(x.v), jnp.zeros_like(x.v), jnp.full_like(x.v[0], -jnp.inf))
 
 
 class L1Estimator(eqx.Module):
@@ -45,11 +49,12 @@ class L1Estimator(eqx.Module):
     dt: float = eqx.field(static=True)
     """Control tick [s]."""
 
-    def __call__(self, s: L1State, x: State, thrust: Float[Array, "3"]) -> L1State:
+    def __call__(self, s: L1State, t: Float[Array, ""], x: State, thrust: Float[Array, "3"]) -> L1State:
         """Return the memory after a tick.
 
         Args:
             s: Memory.
+            t: Time since the start of the flight [s].
             x: State measured at the end of the tick.
             thrust: Mass-normalised thrust that acted over the tick, world [m/s^2].
         """
@@ -61,4 +66,6 @@ class L1Estimator(eqx.Module):
         error = s.sigma * jnp.expm1(pole * self.dt) / pole / decay
         v_hat = s.v_hat + self.dt * (gravity + thrust - s.sigma + pole * error)
         sigma = decay * pole / jnp.expm1(pole * self.dt) * (v_hat - x.v)
-        return L1State(v_hat, sigma, alpha * s.d_hat - (1.0 - alpha) * sigma)
+        t = t.astype(dtype)
+        after = L1State(v_hat, sigma, alpha * s.d_hat - (1.0 - alpha) * sigma, t)
+        return where(follows(t, s.t, self.dt), after, L1State(x.v, jnp.zeros_like(x.v), s.d_hat, t))

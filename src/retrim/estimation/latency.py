@@ -1,10 +1,22 @@
-"""What an old measurement says of now."""
+"""What an old measurement says of now, and whether one is of the tick after another."""
 
-from jaxtyping import Array, Float
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
 
 from ..physics import so3
 from ..physics.dynamics import f_a
 from ..physics.state import Command, State
+
+
+def follows(t: Float[Array, ""], last: Float[Array, ""], dt: float) -> Bool[Array, ""]:
+    """Return whether a measurement is of the tick after another; what changed between others is not of one tick.
+
+    Args:
+        t: Time of the measurement [s].
+        last: Time of the one before [s]; minus infinity where there was none.
+        dt: Control tick [s].
+    """
+    return jnp.abs(t - last - dt) < 0.5 * dt
 
 
 def ahead(x: State, u: Command, d: Float[Array, "3"], age: Float[Array, ""]) -> State:
