@@ -197,6 +197,9 @@ def test_frames_are_60_ms_apart_at_every_rate(dt, depth, stride):
     for i, shown in enumerate(np.asarray(observation.stacked(frames)).reshape(5, 14)):
         then = replaced(near(), p=near().p - 0.06 * i * near().v)
         np.testing.assert_allclose(shown, np.reshape(observation.pixels(then)[0], 14), atol=1e-12)
+    # So they do at the first look of a flight.
+    _, memory = eqx.filter_jit(lambda o, x: o(o.init(x), jnp.array(0.0), x, Command.hover()))(observation, near())
+    np.testing.assert_allclose(memory.frames, frames, atol=1e-12)
 
 
 def test_impossible_rates():

@@ -179,7 +179,8 @@ def test_in_a_frame_the_camera_sees_level_ground(d):
     x = step(before, Command.hover())
     inside = full().in_frame(frame)
     hovering = frame.command(Command.hover())
-    expected, _ = see(inside, begin(inside, frame.state(before)), frame.state(x), hovering)
+    soon = replaced(before, p=before.p + 0.02 * before.v)  # a memory is that of a tick ago
+    expected, _ = see(inside, begin(inside, frame.state(soon)), frame.state(x), hovering)
     hidden = seen()
     found, after = see(hidden.in_frame(frame), sure(hidden, before), frame.state(x), hovering)
     np.testing.assert_allclose(found[:77], expected[:77], atol=1e-5)

@@ -33,11 +33,7 @@ class WorldView(AbstractView):
 
     def __call__(self, env: Env, residual: Residual) -> Env:
         """Add the residual to the model, which turns as the vehicle was seen to turn."""
-        found = turning_of(residual)
-        env = with_lag(env, found)
-        if found is not None:
-            env = dataclasses.replace(env, dynamics=RateBiased(env.dynamics, found.bias))
-        return env.with_residual(residual)
+        return as_it_turns(env, turning_of(residual)).with_residual(residual)
 
 
 class GravityView(AbstractView):
@@ -59,10 +55,10 @@ class RestView(AbstractView):
     """Largest norm of the disturbance that turns the frame [m/s^2]."""
 
     def __call__(self, env: Env, residual: Residual) -> Env:
-        """Add the residual to the model, and let the frame answer what it says at rest."""
+        """Add the residual to the model; the frame answers what it says at rest, and leaves a bias of the rates."""
         home = env.task.home()
         d = capped(residual(State.at(home), Command.hover(home.dtype)), self.limit)
-        env = with_lag(env, turning_of(residual))
+        env = as_it_turns(env, turning_of(residual))
         return dataclasses.replace(env.with_residual(residual), felt=Same(d))
 
 
@@ -79,6 +75,12 @@ def with_lag(env: Env, found: RateFit | None) -> Env:
     if found is None or not isinstance(env.dynamics, Lagged):
         return env
     return dataclasses.replace(env, dynamics=Lagged(env.dynamics.base, Command(found.tau[0], found.tau)))
+
+
+def as_it_turns(env: Env, found: RateFit | None) -> Env:
+    """Return the environment with the lag and the bias of the rates that were identified, if they were."""
+    env = with_lag(env, found)
+    return env if found is None else dataclasses.replace(env, dynamics=RateBiased(env.dynamics, found.bias))
 
 
 class Same(eqx.Module):

@@ -64,6 +64,8 @@ def _scan(env: Env, policy: Policy, start: Start, perturbations: Perturbations |
     dynamics, task = env.dynamics, env.task
     calm = jnp.zeros_like(start.x.p)
     hover = policy.u_hover
+    frame = env.frame(start.x, hover)  # what an observation remembers of before the start is of the same frame
+    seen, x_seen = (task, start.x) if frame is None else (task.in_frame(frame), frame.state(start.x))
 
     def tick(carry: Any, xs: Any) -> Any:
         s, memory, last, issued, pending, alive, worst = carry
@@ -91,7 +93,7 @@ def _scan(env: Env, policy: Policy, start: Start, perturbations: Perturbations |
 
     carry = (
         dynamics.init(start.x),
-        task.observation.init(start.x),
+        seen.observation.init(x_seen),
         hover,
         hover,
         (hover,) * env.delay_ticks,

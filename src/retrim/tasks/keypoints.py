@@ -95,9 +95,13 @@ class Keypoints(AbstractObservation[KeypointMemory]):
         return 14 * FRAMES + 7 + 4 * COMMANDS
 
     def init(self, x: State) -> KeypointMemory:
-        """Return the memory of a vehicle that came in a straight line, without turning, under hover commands."""
+        """Return the memory of a vehicle that came in a straight line, without turning, under hover commands.
+
+        It is that of a tick ago: the first call adds the frame of ``x``.
+        """
         commands = jnp.zeros((COMMANDS, 4), dtype=x.p.dtype)
-        return KeypointMemory(self.history(x, jnp.zeros_like(x.p)), commands, random.split(key_of(x))[0])
+        before = State(x.p - self.dt * x.v, x.R, x.v)
+        return KeypointMemory(self.history(before, jnp.zeros_like(x.p)), commands, random.split(key_of(x))[0])
 
     def history(self, x: State, omega: Float[Array, "3"]) -> Float[Array, "depth 14"]:
         """Return the frames of a motion with constant velocity and body rates that ends in ``x``, oldest first."""

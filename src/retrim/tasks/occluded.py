@@ -65,9 +65,12 @@ class OccludedKeypoints(AbstractObservation[OccludedMemory]):
         return dataclasses.replace(self, frame=frame)
 
     def init(self, x: State) -> OccludedMemory:
-        """Return the memory of a vehicle that came in a straight line, without turning, under hover commands."""
+        """Return the memory of a vehicle that came in a straight line, without turning, under hover commands.
+
+        It is that of a tick ago: the first call adds the frame of ``x``.
+        """
         key, k_pose = random.split(key_of(x))
-        pose = PoseFilter.near(x, k_pose)
+        pose = PoseFilter.near(State(x.p - self.full.dt * x.v, x.R, x.v), k_pose)
         poses = jax.vmap(lambda s: State(pose.x.p - s * pose.x.v, pose.x.R, pose.x.v))(self._ago(x))
         return OccludedMemory(jnp.zeros((COMMANDS, 4), dtype=x.p.dtype), pose, poses, key)
 
