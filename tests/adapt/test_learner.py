@@ -137,7 +137,25 @@ def test_a_carried_adam_has_a_constant_rate_and_goes_on():
     np.testing.assert_array_equal(after(gradients[:2], gradients[2:]), after(gradients))
     one = optimiser.transformation(1)
     change, _ = one.update(jnp.array([3.0, -0.2, 0.01]), one.init(params), params)
-    np.testing.assert_allclose(change, [-0.01, 0.01, -0.01], rtol=1e-5)
+    np.testing.assert_allclose(change, [-0.001, 0.001, -0.001], rtol=1e-5)  # whatever the scale of the gradient
+
+
+@pytest.mark.usefixtures("optax_promotion")
+def test_every_update_of_a_carried_adam_moves_as_far_as_the_first(setup):
+    """Along the same gradient: its momentum starts from rest, its scale is known from then on."""
+    policy = setup.new_policy(random.key(0))
+    optimiser, num = CarriedAdam(jnp.array(0.01), jnp.array(jnp.inf)), 5
+    state = PolicyState(policy, optimiser.transformation(num).init(policy.params))
+    steps = []
+    for _ in range(4):
+        state, far = optimiser.begin(state, num), []
+        for _ in range(num):
+            ones = jax.tree.map(jnp.ones_like, state.policy.params)
+            change, memory = optimiser.transformation(num).update(ones, state.optimiser, state.policy.params)
+            state = PolicyState(state.policy, memory)
+            far.append(-float(jax.tree.leaves(change)[0].ravel()[0]))
+        steps.append(far)
+    np.testing.assert_allclose(steps, np.tile(0.01 * (1.0 - 0.9 ** np.arange(1, num + 1)), (4, 1)), rtol=1e-4)
 
 
 def test_the_papers_update_is_untouched_by_the_levers(setup, window, key):

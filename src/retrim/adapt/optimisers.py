@@ -1,8 +1,11 @@
 """The optimiser of an update: what it remembers of the last one, and how its rate falls."""
 
 import abc
+from typing import Any
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float
 
@@ -47,10 +50,11 @@ class FreshAdam(AbstractPolicyOptimiser):
 
 
 class CarriedAdam(AbstractPolicyOptimiser):
-    """One Adam of constant rate for the whole flight, so that the steps of short updates have the right size.
+    """One Adam of constant rate for the whole flight, whose momentum starts from rest in each update.
 
     The scale of the gradients is carried over, their direction is not: an update that was refused, or learnt across a
-    change of the world, would push every later one the same way.
+    change of the world, would push every later one the same way. The first moment is not corrected for its start, so
+    that every update, the first too, begins gently: along a constant gradient five steps move 1.3 rates.
     """
 
     rate: Float[Array, ""]
@@ -61,9 +65,21 @@ class CarriedAdam(AbstractPolicyOptimiser):
     def transformation(self, num_updates: int) -> optax.GradientTransformation:
         """Return Adam; the number of steps does not matter."""
         clip = optax.clip_by_global_norm(self.max_grad_norm)
-        return optax.chain(clip, optax.scale_by_adam(), optax.scale_by_learning_rate(self.rate))
+        return optax.chain(clip, _scale_by_adam_from_rest(), optax.scale_by_learning_rate(self.rate))
 
     def begin(self, state: PolicyState, num_updates: int) -> PolicyState:
         """Keep the second moments; the first start at zero."""
         still = optax.tree.zeros_like(optax.tree.get(state.optimiser, "mu"))
         return PolicyState(state.policy, optax.tree.set(state.optimiser, mu=still))
+
+
+def _scale_by_adam_from_rest(b1: float = 0.9, b2: float = 0.999, eps: float = 1e-8) -> optax.GradientTransformation:
+    """Return ``optax.scale_by_adam`` without the correction of the first moment for its start."""
+    adam = optax.scale_by_adam(b1, b2, eps)
+
+    def update(grads: optax.Updates, state: Any, params: optax.Params | None = None) -> tuple[optax.Updates, Any]:
+        _, after = adam.update(grads, state, params)
+        nu = optax.tree.bias_correction(after.nu, b2, after.count)
+        return jax.tree.map(lambda m, v: m / (jnp.sqrt(v) + eps), after.mu, nu), after
+
+    return optax.GradientTransformation(adam.init, update)
