@@ -11,7 +11,7 @@ from helpers import GOAL, hover_task, random_command, random_state
 from retrim.control.datt import SIZE, Datt, DattNet, _along, datt_command, datt_observation
 from retrim.estimation.l1 import L1Estimator
 from retrim.estimation.prediction import Prediction
-from retrim.learn.datt import EPISODE, KNOWN, DattProblem, reference_bank
+from retrim.learn.datt import KNOWN, DattProblem, reference_bank, ticks_of
 from retrim.learn.ppo import PpoSettings, ppo
 from retrim.physics import Command, State, small
 from retrim.testing import check_controller
@@ -52,7 +52,7 @@ def test_commands_are_within_the_limits_and_zero_is_hover(key):
 
 def test_references_are_as_long_as_an_episode_and_go_nowhere_at_once():
     bank = reference_bank(3, 16)
-    assert bank.shape[1] > EPISODE
+    assert bank.shape[1] > ticks_of(0.02)
     assert np.isfinite(bank).all()
     assert (np.abs(bank).max(axis=(0, 1)) < 4.0).all()
     assert (bank[:, 0] == 0.0).all()
@@ -68,7 +68,7 @@ def test_an_episode_is_a_flight_of_the_lagged_model(key):
     step = eqx.filter_jit(made.step)
     s_far = s._replace(x=State(s.x.p + 1.0, s.x.R, s.x.v))
     assert float(step(s_far, jnp.zeros(4), key)[1].reward) < float(step(s, jnp.zeros(4), key)[1].reward)
-    s_end = s._replace(tick=jnp.array(EPISODE - 1))
+    s_end = s._replace(tick=jnp.array(ticks_of(0.02) - 1))
     after, outcome = step(s_end, jnp.zeros(4), key)
     assert bool(outcome.truncated)
     assert not bool(outcome.terminated)

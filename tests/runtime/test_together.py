@@ -14,7 +14,7 @@ from retrim.config import Setup, disturbance
 from retrim.learn import Window
 from retrim.physics import Command
 from retrim.plants import SensorModel, SimPlant
-from retrim.runtime import FlightStopped, FunctionPilot, LockstepLearner, fly
+from retrim.runtime import ControllerPilot, FlightStopped, FunctionPilot, LockstepLearner, fly
 from retrim.runtime.batch_learning import offers
 from retrim.runtime.together import can_fly_together, fly_together
 
@@ -109,6 +109,21 @@ def test_pilots_have_learnt_the_same(flown):
             for each in (pilot, other)
         )
         np.testing.assert_allclose(a, b, atol=0.05)
+
+
+def test_a_pilot_flies_on_with_what_it_learnt(flown):
+    """And its learners go on from there: nothing of it is left as it was before."""
+    _, pilots, _, _, _, setup = flown
+    pilot, start = pilots[0], setup.flight_starts(1)[0]
+    plain = [SimPlant(CheapModel(0.02), disturbance("none")) for _ in range(2)]
+    log = fly(plain[0], pilot, start, ticks=3)
+    learnt = fly(plain[1], ControllerPilot(pilot.controller_of(pilot.state)), start, ticks=3)
+    np.testing.assert_array_equal(log.u, learnt.u)
+    for scheduled in pilot.learners:
+        worker = scheduled.learner.worker
+        jax.tree.map(np.testing.assert_array_equal, worker._residual, pilot.state.residual)
+        if hasattr(worker, "_policy"):
+            jax.tree.map(np.testing.assert_array_equal, worker._policy, pilot.state.policy)
 
 
 def test_what_cannot_be_one_program_is_told(as_a_user):

@@ -6,6 +6,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
+from jax import random
 from jaxtyping import Array, Key
 
 from ..adapt.learner import LearnerState
@@ -151,8 +152,8 @@ def _full(request: MethodRequest) -> Pilot:
 
 
 def _lora(request: MethodRequest) -> Pilot:
-    key = request.needed_key()
-    policy = request.setup.low_rank(request.policy, key)
+    k_delta, key = random.split(request.needed_key())
+    policy = request.setup.low_rank(request.policy, k_delta)
     return request.setup.adaptive_pilot(policy, key, request.latency, request.state)
 
 

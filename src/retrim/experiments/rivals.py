@@ -13,7 +13,7 @@ from ..config.setup import Setup
 from ..control.datt import APART, DattNet
 from ..errors import ConfigError, MessageError
 from ..io.files import write_whole
-from ..learn.datt import DISCOUNT, DattProblem, reference_bank
+from ..learn.datt import DattProblem, discount, reference_bank
 from ..learn.ppo import PpoSettings, ppo
 from ..transport import wire
 from .provenance import section_key
@@ -87,7 +87,7 @@ def trained_datt(
                 reporter.say(f"{error}; trained again")
         low, high = setup.vehicle.command_min, setup.vehicle.command_max
         problem = DattProblem(jnp.asarray(reference_bank(seed, dt=preset.dt), low.c.dtype), tau, low, high, preset.dt)
-        settings = PpoSettings(discount=DISCOUNT, **DATT_PPO)
+        settings = PpoSettings(discount=discount(preset.dt), **DATT_PPO)
         with run.interruptible(), reporter.progress(f"DATT, seed {seed}, {steps:,} steps") as advance:
             for i, (after, told) in enumerate(ppo(problem, net, k_learn, settings, steps=steps)):
                 advance((i + 1) / settings.updates(steps), f"reward {told['reward']:.3f}")

@@ -15,7 +15,8 @@ from ..physics.dynamics import PointMass
 from ..physics.state import Command, State
 from .problem import Outcome
 
-EPISODE = 500  # ticks
+EPISODE = 10.0  # [s]
+TICK = 0.02  # [s], of what follows; with another tick the same happens in a second
 WALK = 0.02  # [m/s^2], standard deviation of a step of the disturbance, per axis
 DISCOUNT = 0.99
 KNOWN = 1.0  # [m/s^2], largest disturbance per axis
@@ -67,15 +68,26 @@ class DattProblem(eqx.Module):
         """Fly a tick; the reward is DATT's: minus the distance, half the heading, and a tenth of the speed."""
         mean, acting = lagged(s.acting, datt_command(action, self.low, self.high), self.dt, self.tau)
         x = PointMass(self.dt).step(s.x, mean, s.d)
-        d = jnp.clip(s.d + WALK * random.normal(key, (3,), s.d.dtype), -KNOWN, KNOWN)
+        walk = WALK * (self.dt / TICK) ** 0.5
+        d = jnp.clip(s.d + walk * random.normal(key, (3,), s.d.dtype), -KNOWN, KNOWN)
         after = DattEnv(x, acting, d, s.reference, s.tick + 1)
         away = jnp.sqrt(jnp.sum((x.p - self.bank[s.reference, s.tick + 1]) ** 2) + 1e-12)
         heading = jnp.arctan2(x.R[1, 0], x.R[0, 0])
         speed = jnp.sqrt(jnp.sum(x.v * x.v) + 1e-12)
         reward = -(jnp.minimum(away, 5.0) + 0.5 * jnp.abs(heading) + 0.1 * jnp.minimum(speed, 1.0))
         lost = away > 5.0
-        reward = jnp.where(lost, reward / (1.0 - DISCOUNT), reward)  # as if it stayed there for ever
-        return after, Outcome(reward, lost, after.tick >= EPISODE)
+        reward = jnp.where(lost, reward / (1.0 - discount(self.dt)), reward)  # as if it stayed there for ever
+        return after, Outcome(reward, lost, after.tick >= ticks_of(self.dt))
+
+
+def discount(dt: float) -> float:
+    """Return the discount of a tick of ``dt`` [s]."""
+    return float(DISCOUNT ** (dt / TICK))
+
+
+def ticks_of(dt: float) -> int:
+    """Return the length of an episode in ticks of ``dt`` [s]."""
+    return round(EPISODE / dt)
 
 
 def reference_bank(seed: int, n: int = 512, *, dt: float = 0.02) -> np.ndarray:
@@ -89,7 +101,7 @@ def reference_bank(seed: int, n: int = 512, *, dt: float = 0.02) -> np.ndarray:
     Returns:
         Positions around the origin, shape (n, ticks, 3) [m].
     """
-    draw, ticks = np.random.default_rng(seed), EPISODE + AHEAD * round(APART / dt) + 1
+    draw, ticks = np.random.default_rng(seed), ticks_of(dt) + AHEAD * round(APART / dt) + 1
     t = dt * np.arange(ticks)
     bank = np.zeros((n, ticks, 3))
     for i in range(n):

@@ -92,6 +92,16 @@ class AdaptivePilot(Pilot):
         self._buffer.accepted(u)
         self._pilot.accepted(u)
 
+    def learn(self, state: LearnerState, t: float) -> None:
+        """Fly what was learnt elsewhere from now on, and let the learners go on from it.
+
+        Args:
+            state: Policy and residual.
+            t: Time of the newest measurement behind them [s].
+        """
+        self._publish(ResidualUpdate(t, 0.0, state.residual))
+        self._publish(PolicyUpdate(t, 0.0, 0.0, state.policy))
+
     def take_events(self) -> list[Event]:
         """Return the events since the last call."""
         found, self._new_events = self._new_events, []

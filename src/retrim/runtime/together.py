@@ -69,7 +69,7 @@ def fly_together(
         plans, begun = [_plan(pilot) for pilot in learning], stacked([pilot.state for pilot in learning])
         states, events = fly_and_learn(batch, plans, begun, cold=cold)
         for i, pilot in enumerate(learning):
-            pilot.state = one(states, i)
+            pilot.learn(one(states, i), ticks * batch.dt)
     else:
         batch.controllers = stacked([pilot.controller for pilot in pilots if isinstance(pilot, ControllerPilot)])
         batch.fly_to(ticks)
