@@ -98,12 +98,7 @@ bench: setup
 	$(BIN)/retrim bench
 
 tables: dev
-	$(BIN)/retrim reproduce hover --out docs/results
-	$(BIN)/retrim reproduce reversing --out docs/results
-	$(BIN)/retrim reproduce track --out docs/results
-	$(BIN)/retrim reproduce vision --out docs/results
-	$(BIN)/retrim reproduce plants --out docs/results
-	$(BIN)/retrim reproduce model --out docs/results
+	$(BIN)/retrim reproduce all
 
 # uv, in a private folder where there is none.
 .uv/bin/uv:

@@ -67,8 +67,9 @@ def scaling(
     intro = (
         f"Made by `retrim reproduce scaling`: flights of {seconds:g} s on plant `bem` in gusts or "
         "with a load, half of them adapting twice a second, in lots of at most 64 on each core; flights are scored and "
-        "forgotten as they land. Compiling: what was not in the machine's compile cache. Memory: the most that the "
-        "process had until then."
+        "forgotten as they land. Compiling: what was not in the machine's compile cache; what another core flew "
+        "meanwhile counts as compiling, so that a second has fewer flights than it says where much was compiled. "
+        "Memory: the most that the process had until then."
     )
     document = Document(run, "scaling", "Flights by the thousand", intro, [0], reporter)
     study = train_all(loaded, (0,), run, reporter)
