@@ -26,7 +26,7 @@ from retrim.live.session import LiveRequest, live_spec
 from retrim.live.status import Status
 from retrim.live.supervisor import Supervisor
 from retrim.onboard.control import ControlLoop
-from retrim.onboard.messages import Parameters, Sample, last_note, unpack_note
+from retrim.onboard.messages import COLUMNS, FlightRows, Parameters, Sample, last_note, unpack_note
 from retrim.onboard.topics import REFERENCE
 from retrim.physics import State
 from retrim.tasks.shapes import circle, figure8
@@ -151,21 +151,28 @@ def test_the_learner_learns_on_it_without_compiling_again(made, table, tmp_path)
 
 
 class Told(Supervisor):
-    """Has a bus and no processes."""
+    """Has a bus and no processes; the plant's time, which is control's, is ``behind`` the wall's [s]."""
 
-    def __init__(self, spec):
+    def __init__(self, spec, behind):
         super().__init__(spec)
-        self.bus, self.epoch = InProcessBus(ROOM), time.monotonic() - 10.0
+        self.bus, self.epoch, self._behind = InProcessBus(ROOM), time.monotonic() - 10.0, behind
+        self.fly()
+
+    def fly(self):
+        t = time.monotonic() - self.epoch - self._behind
+        self.bus.publish("flight", FlightRows(np.eye(1, len(COLUMNS), COLUMNS.index("t")) * t).pack())
+        return t
 
 
-def asked(made, folder, fence=3.0):
+def asked(made, folder, fence=3.0, behind=0.0):
     setup, state, _ = made
     request = LiveRequest(setup, state.policy.policy, Scenario(reference="circle"), "full", 60.0, 0, fence, folder)
-    supervisor = Told(live_spec(request))
+    supervisor = Told(live_spec(request), behind)
     return Following(request, supervisor, ThreadPoolExecutor(1)), supervisor
 
 
 def status(supervisor, version=0):
+    supervisor.fly()
     t = time.monotonic() - supervisor.epoch
     return Status(t, {"versions": {REFERENCE: version}}, {}, {}, {}, None, [], False, 0, None)
 
@@ -206,6 +213,23 @@ def test_a_choice_becomes_a_table_and_counts_once_it_is_taken(made, tmp_path):
     x = State.at(wanted)
     assert float(whole.flown.error(jnp.array(t), x)) < 1e-3
     assert float(whole.flown.error(jnp.array(5.0), State.at(circle()(jnp.array(5.0)).p))) < 1e-9
+
+
+def test_a_plant_that_fell_behind_the_wall_goes_over_by_its_own_time(made, tmp_path):
+    """A table is made for the time of the plant; by the wall's it would be of a time to come, and then too late."""
+    follows, supervisor = asked(made, tmp_path, behind=5.0)
+    follows.ask("figure8", 10.0)
+    began = supervisor.fly()
+    bus = supervisor.bus
+    obeyed(follows, supervisor, lambda: bus.latest("parameters.reference") is not None)
+    controller = supervisor.spec.controller
+    data = bus.latest("parameters.reference").data
+    found = Parameters.unpack(data, controller.parameters[REFERENCE], half=REFERENCE, base=controller.base, after=0)
+    assert began <= found.computed_from <= supervisor.fly()
+    assert follows.obey(status(supervisor)) == []
+    assert follows._attempts == 1
+    obeyed(follows, supervisor, lambda: len(follows.pieces) > 1, 1)
+    assert follows.pieces[-1][0] == pytest.approx(found.computed_from + following.LEAD)
 
 
 def test_what_leaves_the_fence_or_is_not_taken_is_told(made, tmp_path, monkeypatch):

@@ -12,6 +12,7 @@ from live.test_faults import Drill, controller, spec_in, whole_log  # noqa: F401
 from live_processes import HOME, DrillPlan, level
 from retrim.errors import ConfigError, MessageError
 from retrim.experiments.latency import free_port as unused_port
+from retrim.live import ground
 from retrim.live.events import LiveEvents
 from retrim.live.ground import Ground, learn_for
 from retrim.live.mission import Mission
@@ -19,6 +20,7 @@ from retrim.live.page import free_port
 from retrim.live.spec import PageSpec
 from retrim.onboard.guard import Mode
 from retrim.onboard.launch import launch
+from retrim.onboard.messages import last_note, pack_note
 from retrim.onboard.topics import INTO, OUT
 from retrim.transport.bridge import EVERY, Bridge
 from retrim.transport.in_process import InProcessBus
@@ -151,6 +153,80 @@ def test_a_new_flight_has_new_learners_and_an_old_one_none(tmp_path, monkeypatch
         assert "compiling" in next(ground.learn())
         last = ground._bus.folder
     assert not last.exists()
+
+
+@pytest.fixture
+def joined(tmp_path, monkeypatch):
+    """A network, and a ground station at it whose learners do nothing."""
+    network = InProcessBus(dict.fromkeys((*OUT, *INTO), 100_000))
+    monkeypatch.setattr(Address, "join", lambda *_, **__: network)
+
+    class Idle(Ground):
+        def _start(self, layer):
+            self.processes[layer] = launch("live_processes:nothing", None, tmp_path / "log")
+
+    with Idle(Address("zenoh", "127.0.0.1", 1)) as ground:
+        yield network, ground
+
+
+def test_a_new_flight_gets_nothing_of_the_one_before_and_all_that_is_its_own(joined, tmp_path):
+    network, ground = joined
+    network.publish("learning", b"paused before anybody was here")
+    network.publish("mission", mission_in(tmp_path, "first"))
+    stands = ground.learn()
+    next(stands)
+    assert ground._bus.latest("learning").data == b"paused before anybody was here"
+    for topic in ("flight", "status", "parameters.reference"):
+        network.publish(topic, b"of the first")
+    next(stands)
+    assert ground._bus.latest("flight").data == b"of the first"
+    network.publish("learning", b"of the second")  # it may come before the mission is looked at
+    network.publish("mission", mission_in(tmp_path, "second"))
+    next(stands)
+    found = {topic: ground._bus.latest(topic) for topic in ("flight", "status", "parameters.reference")}
+    assert found == dict.fromkeys(found)
+    assert ground._bus.latest("learning").data == b"of the second"
+    network.publish("flight", b"of the second")
+    next(stands)
+    assert ground._bus.latest("flight").data == b"of the second"
+
+
+def test_a_flight_is_told_that_its_end_was_heard(joined, tmp_path):
+    network, ground = joined
+    network.publish("mission", mission_in(tmp_path, "first"))
+    stands = ground.learn()
+    next(stands)
+    said = last_note(network, "ground")
+    assert (said["base"], said["over"]) == ("first", False)
+    network.publish("ended", pack_note("ended", reason="landed"))
+    assert list(stands) == ["flight over: landed"]
+    said = last_note(network, "ground")
+    assert (said["base"], said["over"]) == ("first", True)
+
+
+def test_a_failure_is_told_while_the_other_flights_go_on_and_raised_at_the_end(monkeypatch):
+    monkeypatch.setattr(Address, "join", lambda *_, **__: InProcessBus({}))
+    told = threading.Event()
+
+    class Other(Ground):
+        def wait(self):
+            return iter(())
+
+        def learn(self):
+            if self.address.key == "a":
+                raise OSError("no room")
+            until = time.monotonic() + 10.0
+            while not told.is_set() and time.monotonic() < until:
+                yield "learnt: policy 7"
+
+    def tell(text):
+        if text == "zenoh:h:1/a: failed: OSError('no room'); zenoh:h:1/b: learnt: policy 7":
+            told.set()
+
+    monkeypatch.setattr(ground, "Ground", Other)
+    with pytest.raises(OSError, match="no room"):
+        learn_for([Address.of("zenoh:h:1/a"), Address.of("zenoh:h:1/b")], threading.Event(), tell)
+    assert told.is_set()
 
 
 def test_a_mission_survives_the_bus_and_nothing_else_is_one(tmp_path):

@@ -6,12 +6,14 @@ import signal
 import socket
 import time
 from contextlib import ExitStack
+from types import SimpleNamespace
 
 import pytest
 
 from bus_ends import LOCAL, NETWORK, arrived, network, two_ends
 from retrim.errors import ConfigError, MessageError
 from retrim.experiments.latency import free_port
+from retrim.transport import ros
 from retrim.transport.network import NetworkBus
 from retrim.transport.remote import Address
 from retrim.transport.shared_memory import SharedMemoryBus
@@ -148,6 +150,29 @@ def test_vehicles_at_one_place_do_not_hear_each_other():
         time.sleep(0.2)
         assert other.latest("a") is None
         assert none.latest("a") is None
+
+
+def test_what_an_end_of_ros_writes_has_readers_before_the_first_message(monkeypatch):
+    declared, sent = [], []
+
+    class Rospy:
+        def Subscriber(self, *_, **__):
+            pass
+
+        def Publisher(self, name, *_, latch, **__):
+            assert latch
+            declared.append(name)
+            return SimpleNamespace(publish=lambda data: sent.append((name, data[-4:])))
+
+    monkeypatch.setattr(ros, "join", lambda master: Rospy())
+    monkeypatch.setattr(ros, "system_module", lambda name: SimpleNamespace(UInt8MultiArray=None))
+    bus = Address("ros", "h", 1, "quad1").join(TOPICS, listen=True, writes=("a", "b.c"))
+    assert declared == ["/retrim/quad1/a", "/retrim/quad1/b/c"]
+    bus.publish("a", b"last")
+    assert declared == ["/retrim/quad1/a", "/retrim/quad1/b/c"]
+    bus.publish("there", b"also")
+    assert declared[2:] == ["/retrim/quad1/there"]
+    assert sent == [("/retrim/quad1/a", b"last"), ("/retrim/quad1/there", b"also")]
 
 
 def test_a_master_that_there_is_not_is_named():

@@ -1,17 +1,23 @@
 """The process that carries topics between a flight and its learners on another machine."""
 
+import signal
+import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from types import FrameType
 
 from ..onboard.messages import pack_note
 from ..onboard.realtime import Lifeline
 from ..onboard.topics import INTO, MOST, OUT, SLOWLY
 from ..transport.bridge import Bridge
+from ..transport.bus import Bus
 from ..transport.remote import Address
 from ..transport.shared_memory import SharedMemoryBus
 
 IDLE = 0.002  # [s]
+SILENCE = 10.0  # [s] without a measurement, after which a flight without a supervisor is over; an autopilot may land it
+LINGER = 2.0  # [s] after its end, for that to reach the learners
 
 
 @dataclass(frozen=True)
@@ -25,14 +31,29 @@ class BridgePlan:
 
 
 def carry(plan: BridgePlan) -> None:
-    """Carry until somebody ends the process: its main function."""
+    """Carry until somebody ends the process, or until a flight without a supervisor is over: its main function."""
+    signal.signal(signal.SIGTERM, _ended)  # the network is left in order all the same
     bus, parent = SharedMemoryBus(plan.folder), Lifeline(plan.parent)
-    network = plan.address.join(dict.fromkeys((*OUT, *INTO), MOST), listen=True)
+    network = plan.address.join(dict.fromkeys((*OUT, *INTO), MOST), listen=True, writes=OUT)
     try:
         bridge = Bridge(bus, network, out=OUT, into=INTO, slowly=SLOWLY)
         bus.publish("ready.bridge", pack_note("ready"))
-        while not parent.gone():
+        said, since = (0, 0), time.monotonic()
+        # A vehicle that has lost its supervisor still lands, and the learners wait until they are told.
+        while not (parent.gone() and time.monotonic() > since + (LINGER if said[1] else SILENCE)):
             if not bridge.step():
                 time.sleep(IDLE)
+            if (now := _said(bus)) != said:
+                said, since = now, time.monotonic()
     finally:
         network.close()  # its threads would keep the process alive
+
+
+def _said(bus: Bus) -> tuple[int, int]:
+    """Return the versions of the newest measurement and of the word that the flight is over."""
+    measured, ended = bus.latest("sample"), bus.latest("ended")
+    return 0 if measured is None else measured.version, 0 if ended is None else ended.version
+
+
+def _ended(number: int, frame: FrameType | None) -> None:
+    sys.exit(128 + number)

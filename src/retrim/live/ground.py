@@ -16,6 +16,7 @@ from ..onboard.launch import last_words, launch
 from ..onboard.messages import last_note, pack_note
 from ..onboard.topics import INTO, MOST, OUT
 from ..transport.bridge import Bridge
+from ..transport.network import FAREWELL
 from ..transport.remote import Address
 from ..transport.shared_memory import SharedMemoryBus
 from .fleet_process import FleetProcess, Seat
@@ -42,7 +43,7 @@ class Ground:
         Raises:
             ConfigError: It cannot be joined.
         """
-        self._network = address.join(dict.fromkeys((*OUT, *INTO), MOST), listen=False)
+        self._network = address.join(dict.fromkeys((*OUT, *INTO), MOST), listen=False, writes=INTO)
         self._place = tempfile.TemporaryDirectory(prefix="retrim-ground-")
         self.folder = Path(self._place.name)
         self.address, self._fleet = address, fleet
@@ -87,6 +88,8 @@ class Ground:
                 self._beaten = time.monotonic()
                 self._standing = self._beat()
             if ended := last_note(self._bus, "ended"):
+                self._tell(over=True)
+                time.sleep(FAREWELL)  # the flight waits for that word before it takes its bridge away
                 yield f"flight over: {ended.get('reason', '')}"
                 return
             yield self._standing
@@ -118,7 +121,10 @@ class Ground:
         self._bus = SharedMemoryBus.create(mission.capacities)
         topics = mission.capacities  # a controller without a fitted half has no topic for it
         out, into = ([topic for topic in carried if topic in topics] for carried in (OUT, INTO))
-        self._bridge = Bridge(self._network, self._bus, out=out, into=into)
+        # The network remembers the flight before this one, whose ticks, orders and reference are foreign here.
+        before = {} if self._bridge is None else self._bridge.known
+        known = {topic: before.get(topic, 0) for topic in out}
+        self._bridge = Bridge(self._network, self._bus, out=out, into=into, known=known)
         self._mission, self.restarts = mission, {}
         for layer in mission.layers:
             self._start(layer)
@@ -159,10 +165,15 @@ class Ground:
                 self._start(layer)
             else:
                 failed = f"the {layer} learner on the ground died: {last_words(self.folder / f'{layer}.log')}"
-        alive = {layer: process.poll() is None for layer, process in self.processes.items()}
-        note = pack_note("ground", base=self._mission.base, alive=alive, failed=failed)
-        self._network.publish("ground", note)
+        self._tell(failed)
         return failed or self._stands()
+
+    def _tell(self, failed: str = "", *, over: bool = False) -> None:
+        """Tell the flight who is alive, and whether it has been heard here that the flight is over."""
+        assert self._mission is not None
+        alive = {layer: process.poll() is None for layer, process in self.processes.items()}
+        note = pack_note("ground", base=self._mission.base, alive=alive, failed=failed, over=over)
+        self._network.publish("ground", note)
 
     def _stands(self) -> str:
         assert self._bus is not None
@@ -198,6 +209,7 @@ def learn_for(
 
     Raises:
         ConfigError: One of the buses cannot be joined, an address is there twice, or there are two rosmasters.
+        Exception: The first of what failed, once the other flights are over.
     """
     if twice := [str(each) for i, each in enumerate(addresses) if each in addresses[:i]]:
         raise ConfigError(f"address {twice[0]} is there twice; each vehicle has its own, or a key of its own")
@@ -212,9 +224,12 @@ def learn_for(
         stands = dict.fromkeys(grounds, "waiting for a flight")
         # A thread for each: a network that is slow to one vehicle keeps no other waiting.
         pool = stack.enter_context(ThreadPoolExecutor(len(grounds)))
-        flights = [pool.submit(_serve, ground, stands, stop) for ground in grounds]
+        flights = {pool.submit(_serve, ground, stands, stop): ground for ground in grounds}
         try:
-            while wait(flights, TOLD_EVERY).not_done:
+            while (now := wait(flights, TOLD_EVERY)).not_done:
+                for flight in now.done:  # the others may fly for long: a failure is told while they do
+                    if (error := flight.exception()) is not None:
+                        stands[flights[flight]] = f"failed: {error!r}"
                 told(_summary(stands))
         except BaseException:
             stop.set()  # the threads end, too

@@ -36,6 +36,7 @@ from .states import vector_of
 LAYERS: tuple[Layer, ...] = ("residual", "policy")
 LEARNING = ("full", "lora")
 PATH_S = 20.0  # [s] of the reference that the page draws
+STEP = 0.05  # [s] between two places of it
 BELOW_GROUND = 0.3  # [m], by which a fence lies below z = 0: starts may lie there, and a transient dips
 LONGEST = 3600.0  # [s]
 
@@ -102,7 +103,7 @@ def live_spec(request: LiveRequest) -> LiveSpec:
     """Return everything that the processes of a flight are started with; nothing is started.
 
     Raises:
-        ConfigError: The method cannot be flown live.
+        ConfigError: The method cannot be flown live, or the reference is not finite.
     """
     setup, preset = request.setup, request.setup.preset
     window = max(preset.adapt.window, round(3.0 / preset.dt))
@@ -216,6 +217,9 @@ def _limits(request: LiveRequest) -> Limits:
     setup, fence = request.setup, request.fence
     vehicle = request.scenario.make_vehicle(setup.preset.vehicle)
     places = _places(request, request.seconds)
+    if not (finite := np.isfinite(places).all(1)).all():  # no place would be outside
+        at = STEP * int(np.argmin(finite))
+        raise ConfigError(f"task {setup.preset.task!r}: its reference is not finite at {at:g} s; no fence can hold it")
     low, high = places.min(0) - fence, places.max(0) + fence
     low[2] = max(low[2], min(-BELOW_GROUND, float(places[:, 2].min()) - BELOW_GROUND))
     u_min, u_max = (as_numpy(u).astype(float) for u in (vehicle.command_min, vehicle.command_max))
@@ -225,5 +229,5 @@ def _limits(request: LiveRequest) -> Limits:
 def _places(request: LiveRequest, seconds: float) -> np.ndarray:
     """Places that the reference passes, world [m]."""
     setup = request.setup
-    times = jnp.arange(0.0, max(seconds, setup.preset.dt), 0.05)
+    times = jnp.arange(0.0, max(seconds, setup.preset.dt), STEP)
     return np.asarray(jax.jit(jax.vmap(setup.flown.target))(times), dtype=float)

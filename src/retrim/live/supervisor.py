@@ -15,6 +15,7 @@ from ..onboard.launch import last_words, launch
 from ..onboard.messages import Setpoint, last_note, pack_note
 from ..onboard.realtime import cores_of
 from ..transport.message import describe
+from ..transport.network import FAREWELL
 from ..transport.shared_memory import SharedMemoryBus
 from .plans import plan_of
 from .remote_learners import RemoteLearners
@@ -23,7 +24,8 @@ from .status import Status
 from .topics import topics
 
 LANDING = 60.0  # [s], after which processes are ended wherever the vehicle is
-FAREWELL = 0.3  # [s] for a message to leave the machine
+PARTING = 5.0  # [s] in which learners elsewhere may say that they have heard of the end
+LAST = 5  # ticks in which what control said last is written down, once it has nothing left to fly
 ATTEMPTS = 5  # to bring a process back
 LEARN = ("residual", "policy", "recorder", "page", "bridge")
 """Roles that stay off the core of those that must be on time."""
@@ -63,9 +65,10 @@ class Supervisor:
             until = time.monotonic() + LANDING
             while self._alive("plant") and not last_note(self.bus, "ended") and time.monotonic() < until:
                 time.sleep(0.05)
-        if self._remote is not None and not last_note(self.bus, "ended"):  # learners elsewhere wait for it
-            self.bus.publish("ended", pack_note("ended", reason="the flight did not come to its end"))
-            time.sleep(FAREWELL)
+        if self._remote is not None:
+            if not last_note(self.bus, "ended"):
+                self.bus.publish("ended", pack_note("ended", reason="the flight did not come to its end"))
+            self._part_from(self._remote)
         if self._cores:
             os.sched_setaffinity(0, self._cores)
         for process in self.processes.values():
@@ -184,10 +187,23 @@ class Supervisor:
 
     def finish(self, patience: float = 3.0) -> None:
         """Wait until the log is written."""
-        until = time.monotonic() + patience
+        until, flew = time.monotonic() + patience, time.monotonic()
         while self.processes["recorder"].poll() is None and time.monotonic() < until:
-            if self.processes["control"].poll() is None and self.processes["plant"].poll() is not None:
+            if self._alive("plant"):
+                flew = time.monotonic()
+            elif self._alive("control") and time.monotonic() > flew + LAST * self.spec.dt:
                 self.processes["control"].terminate()  # there is nothing left to fly
+            time.sleep(0.02)
+
+    def _part_from(self, remote: RemoteLearners) -> None:
+        """Wait until learners elsewhere have heard of the end, which they wait for, or are gone."""
+        base, began = self.spec.controller.base, time.monotonic()
+        while (waited := time.monotonic() - began) < PARTING:
+            said = last_note(self.bus, "ground")
+            if said.get("over") and said.get("base") == base:
+                return
+            if waited > FAREWELL and not any(remote.alive().values()):  # what they said last may be on its way
+                return
             time.sleep(0.02)
 
     def _not_ready(self) -> list[str]:

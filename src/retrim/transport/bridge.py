@@ -1,7 +1,7 @@
 """Carries topics between two buses, so that those who fly never touch a network."""
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 
 from ..errors import MessageError
 from .bus import Bus
@@ -20,6 +20,7 @@ class Bridge:
         out: Iterable[str],
         into: Iterable[str],
         slowly: Iterable[str] = (),
+        known: Mapping[str, int] | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Build a bridge.
@@ -30,11 +31,13 @@ class Bridge:
             out: Topics from here to there.
             into: Topics from there to here.
             slowly: Those of them that come more often than anybody needs; at most one in ``EVERY`` is carried.
+            known: Version of a topic up to which nothing is carried; None: whatever is there is carried.
             clock: Monotonic [s].
         """
         self._routes = [(here, there, topic) for topic in out] + [(there, here, topic) for topic in into]
         self._slowly, self._clock = frozenset(slowly), clock
-        self._known = {topic: 0 for _, _, topic in self._routes}
+        self.known = {topic: 0 for _, _, topic in self._routes} | dict(known or {})
+        """Version of each topic up to which it is carried."""
         self._carried = dict.fromkeys(self._slowly, float("-inf"))
         self.refused = 0
         """Messages that did not fit."""
@@ -45,10 +48,10 @@ class Bridge:
         for source, target, topic in self._routes:
             if topic in self._slowly and self._clock() - self._carried[topic] < EVERY:
                 continue
-            message = source.latest(topic, self._known[topic])
+            message = source.latest(topic, self.known[topic])
             if message is None:
                 continue
-            self._known[topic] = message.version
+            self.known[topic] = message.version
             self._carried[topic] = self._clock()
             try:
                 target.publish(topic, message.data)

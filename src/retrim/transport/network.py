@@ -16,6 +16,7 @@ from .in_process import check_fits, check_topic
 
 HEAD = struct.Struct("<QQ")
 """Writer and version, before each message."""
+FAREWELL = 0.3  # [s] for a message to leave the machine, after which a bus may be closed
 
 
 class NetworkBus(Bus):

@@ -1,7 +1,7 @@
 """Buses between machines by name: ``zenoh:192.168.1.5:7447``, ``ros:192.168.1.5:11311/quad1``."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from ..errors import ConfigError
@@ -46,12 +46,14 @@ class Address:
         """Whether it is on this machine only."""
         return self.host in LOOPBACK
 
-    def join(self, capacities: Mapping[str, int], *, listen: bool) -> NetworkBus:
+    def join(self, capacities: Mapping[str, int], *, listen: bool, writes: Iterable[str] = ()) -> NetworkBus:
         """Join the bus.
 
         Args:
             capacities: Longest message of each topic [bytes].
             listen: Wait for others there; ROS 1 has a master who does.
+            writes: Topics that this end writes. Readers are connected to them at once, and not with the first message,
+                which may be the last one, too.
 
         Raises:
             ConfigError: It cannot be joined.
@@ -59,7 +61,7 @@ class Address:
         if self.kind == "zenoh":
             from .zenoh import ZenohBus
 
-            return ZenohBus(capacities, f"tcp/{self.host}:{self.port}", listen=listen, key=self.key)
+            return ZenohBus(capacities, f"tcp/{self.host}:{self.port}", listen=listen, key=self.key, writes=writes)
         from .ros import RosBus
 
-        return RosBus(capacities, f"http://{self.host}:{self.port}", key=self.key)
+        return RosBus(capacities, f"http://{self.host}:{self.port}", key=self.key, writes=writes)

@@ -1,6 +1,6 @@
 """A bus by ROS 1, the paper's transport: latched topics of bytes, and a rosmaster that knows who is where."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from ..rospy_node import join, system_module
@@ -12,13 +12,16 @@ PREFIX = "/retrim"
 class RosBus(NetworkBus):
     """One end of the bus. Ends in one process share its node, which lives as long as the process."""
 
-    def __init__(self, capacities: Mapping[str, int], master: str, *, key: str = "") -> None:
+    def __init__(
+        self, capacities: Mapping[str, int], master: str, *, key: str = "", writes: Iterable[str] = ()
+    ) -> None:
         """Join a bus.
 
         Args:
             capacities: Longest message of each topic [bytes].
             master: Where the rosmaster is, as ``http://127.0.0.1:11311``.
             key: Of one vehicle among several.
+            writes: Topics that are written here; others are declared with their first message.
 
         Raises:
             ConfigError: rospy is not installed, or there is no master.
@@ -33,6 +36,8 @@ class RosBus(NetworkBus):
                              buff_size=64 + 2 * capacity)
             for topic, capacity in capacities.items()
         ]  # fmt: skip
+        for topic in writes:
+            self._declare(topic)
 
     def close(self) -> None:
         """Leave the bus."""
@@ -41,10 +46,13 @@ class RosBus(NetworkBus):
 
     def _send(self, topic: str, frame: bytes) -> None:
         if topic not in self._publishers:
-            self._publishers[topic] = self._rospy.Publisher(
-                self._name(topic), self._message, queue_size=1, latch=True, tcp_nodelay=True
-            )
+            self._declare(topic)
         self._publishers[topic].publish(data=frame)
+
+    def _declare(self, topic: str) -> None:
+        self._publishers[topic] = self._rospy.Publisher(
+            self._name(topic), self._message, queue_size=1, latch=True, tcp_nodelay=True
+        )
 
     def _listener(self, topic: str) -> Any:
         return lambda message: self._received(topic, bytes(message.data))

@@ -4,7 +4,7 @@ Needs the extra ``zenoh``.
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from ..errors import ConfigError
@@ -17,7 +17,15 @@ BUFFER = 1  # messages of a topic that its writer keeps for those who join late
 class ZenohBus(NetworkBus):
     """One end of the bus."""
 
-    def __init__(self, capacities: Mapping[str, int], endpoint: str, *, listen: bool, key: str = "") -> None:
+    def __init__(
+        self,
+        capacities: Mapping[str, int],
+        endpoint: str,
+        *,
+        listen: bool,
+        key: str = "",
+        writes: Iterable[str] = (),
+    ) -> None:
         """Join a bus.
 
         Args:
@@ -25,6 +33,7 @@ class ZenohBus(NetworkBus):
             endpoint: As ``tcp/192.168.1.5:7447``.
             listen: Wait there for others; if not, look for who does, for as long as it takes.
             key: Of one vehicle among several.
+            writes: Topics that are written here; others are declared with their first message.
 
         Raises:
             ConfigError: zenoh is not installed, or nobody can listen there.
@@ -56,16 +65,16 @@ class ZenohBus(NetworkBus):
             raise ConfigError(f"zenoh: cannot join at {endpoint!r} ({reason})") from error
         cache = ext.CacheConfig(BUFFER)
         history = ext.HistoryConfig(detect_late_publishers=True, max_samples=BUFFER)
-        self._publishers: dict[str, Any] = {}
         # Nothing is dropped where the network is slow: some topics have a single message.
         block, remote = zenoh.CongestionControl.BLOCK, zenoh.Locality.REMOTE
-        self._declare: Any = lambda key: ext.declare_advanced_publisher(
-            self._session, key, cache=cache, publisher_detection=True, congestion_control=block
+        prefix = f"{PREFIX}/{key}" if key else PREFIX
+        self._declare: Any = lambda topic: ext.declare_advanced_publisher(
+            self._session, f"{prefix}/{topic}", cache=cache, publisher_detection=True, congestion_control=block
         )
-        self._prefix = f"{PREFIX}/{key}" if key else PREFIX
+        self._publishers: dict[str, Any] = {topic: self._declare(topic) for topic in writes}
         self._subscribers = []
         for topic in capacities:
-            where, listener = f"{self._prefix}/{topic}", self._listener(topic)
+            where, listener = f"{prefix}/{topic}", self._listener(topic)
             found = ext.declare_advanced_subscriber(
                 self._session, where, listener, history=history, allowed_origin=remote
             )
@@ -77,7 +86,7 @@ class ZenohBus(NetworkBus):
 
     def _send(self, topic: str, frame: bytes) -> None:
         if topic not in self._publishers:  # only its writer declares one
-            self._publishers[topic] = self._declare(f"{self._prefix}/{topic}")
+            self._publishers[topic] = self._declare(topic)
         self._publishers[topic].put(frame)
 
     def _listener(self, topic: str) -> Any:

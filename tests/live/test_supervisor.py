@@ -1,0 +1,82 @@
+"""The end of a flight: who has something left to say is waited for, as long as it lives."""
+
+import threading
+import time
+
+import pytest
+
+from live.test_faults import controller, spec_in  # noqa: F401
+from live_processes import DT
+from retrim.live import supervisor
+from retrim.live.supervisor import Supervisor
+from retrim.onboard.messages import last_note, pack_note
+from retrim.transport.network import FAREWELL
+from retrim.transport.remote import Address
+from retrim.transport.shared_memory import SharedMemoryBus
+
+ADDRESS = Address("zenoh", "127.0.0.1", 1)
+
+
+def ground_of(folder, base, heard):
+    """Learners elsewhere, who take a while to hear of the end."""
+    bus = SharedMemoryBus(folder)
+    while not (ended := last_note(bus, "ended")):
+        bus.publish("ground", pack_note("ground", base=base, alive={"policy": True}))
+        time.sleep(0.02)
+    until = time.monotonic() + 3 * FAREWELL
+    while time.monotonic() < until:
+        bus.publish("ground", pack_note("ground", base="of another flight", alive={"policy": True}, over=True))
+        time.sleep(0.02)
+    if folder.exists():
+        heard.append(ended["reason"])
+    bus.publish("ground", pack_note("ground", base=base, alive={}, over=True))
+    bus.close()
+
+
+@pytest.mark.parametrize("reason", ["landed", None])
+def test_learners_elsewhere_hear_of_the_end_before_their_bridge_goes(tmp_path, controller, reason):  # noqa: F811
+    heard = list[str]()
+    with Supervisor(spec_in(tmp_path, controller, learners=ADDRESS)) as flight:
+        ground = threading.Thread(target=ground_of, args=(flight.bus.folder, controller.base, heard))
+        ground.start()
+        while flight.bus.latest("ground") is None:
+            time.sleep(0.01)
+        if reason:
+            flight.bus.publish("ended", pack_note("ended", reason=reason))
+    assert heard == [reason or "the flight did not come to its end"]
+    ground.join()
+
+
+def test_learners_elsewhere_that_are_gone_are_not_waited_for(tmp_path, controller, monkeypatch):  # noqa: F811
+    monkeypatch.setattr(supervisor, "PARTING", 1000.0)
+    with Supervisor(spec_in(tmp_path, controller, learners=ADDRESS)) as flight:
+        folder = flight.bus.folder
+        flight.bus.publish("ground", pack_note("ground", base=controller.base, alive={"policy": True}))
+        began = time.monotonic()
+    assert time.monotonic() > began + FAREWELL  # there is always time for a message to leave
+    assert not folder.exists()
+
+
+class Process:
+    """Runs until it is told to end."""
+
+    def __init__(self, runs=True):
+        self.told, self._code = None, None if runs else 0
+
+    def poll(self):
+        return self._code
+
+    def wait(self, patience=None):
+        return self._code
+
+    def terminate(self):
+        self.told, self._code = time.monotonic(), -15
+
+
+def test_control_that_has_nothing_left_to_fly_has_time_to_say_its_last_rows(tmp_path, controller):  # noqa: F811
+    with Supervisor(spec_in(tmp_path, controller)) as flight:
+        control = Process()
+        flight.processes = {"recorder": Process(), "control": control, "plant": Process(runs=False)}
+        began = time.monotonic()
+        flight.finish(patience=1.0)
+        assert began + 3 * DT < control.told < began + 1.0
