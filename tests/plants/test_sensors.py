@@ -81,6 +81,16 @@ def test_latency_between_ticks():
         np.testing.assert_allclose(coarse[i].x.vector(), fine[2 * i - 1].x.vector(), atol=1e-12)
 
 
+@pytest.mark.parametrize("latency", [0, 5, 10, 15, 20, 33])
+def test_a_sample_is_as_old_as_it_says(latency):
+    """Also where the latency is no whole number of periods: at the end of a tick the sample is older than it."""
+    fine, late = samples(plant(dt=0.001), ticks=200), samples(plant(SensorModel.of(latency=latency)), ticks=10)
+    for m in late[3:]:
+        assert m.age >= 1e-3 * latency
+        then = fine[round(1000 * (m.t - m.age))]
+        np.testing.assert_allclose(m.x.vector(), then.truth.vector(), atol=1e-12)
+
+
 def test_dropout_holds_the_last_sample():
     flight = samples(plant(SensorModel.of(dropout=0.5), seed=3), ticks=400)
     seen = np.stack([s.x.vector() for s in flight[1:]])

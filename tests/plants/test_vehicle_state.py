@@ -1,14 +1,23 @@
-"""A state that is carried on to the present: exact where what drives it is constant."""
+"""A state that is carried on to the present: exact where what drives it is constant, and made up for once."""
 
+from types import SimpleNamespace
+
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from made_up_vehicle import PointVehicle
+from retrim.estimation.prediction import Prediction, Underway
+from retrim.live.vehicle_process import _sample
+from retrim.onboard.guard import Limits
+from retrim.physics import Command, State
 from retrim.plants.bridges.vehicle_state import LONGEST_S, VehicleState
 
 ages = st.floats(0.0, LONGEST_S)
+LEANING, THRUST, SPIN = (0.3, -0.2, 1.0), 12.0, (0.0, 0.0, 1.5)  # about its thrust axis, so that the motion is known
 
 
 def state(age, omega=(0.0, 0.0, 0.0), turned=(0.3, -0.2, 1.0), v=(1.0, -2.0, 0.5)):
@@ -39,14 +48,78 @@ def test_it_falls_without_thrust_and_hovers_with_it(age):
     np.testing.assert_allclose(hovered.v - fallen.v, [0.0, 0.0, 9.81 * age], atol=1e-9)
 
 
-def test_the_age_of_the_news_is_kept_and_a_truth_is_carried_on_by_its_own():
+def test_no_age_is_left_the_news_keep_theirs_and_a_truth_is_carried_on_by_its_own():
     x = state(0.02)._replace(truth=state(0.01))
     found = x.carried_on(9.81)
-    assert (found.age, found.truth.age) == (0.02, 0.01)
+    assert (found.age, found.truth.age) == (0.0, 0.0)
+    assert (found.news, found.truth.news) == (0.02, 0.01)
     assert np.linalg.norm(found.p - found.truth.p) == pytest.approx(0.01 * np.linalg.norm(x.v), rel=0.1)
 
 
 def test_what_is_old_is_not_carried_on_for_long():
     old, older = state(LONGEST_S).carried_on(9.81), state(5.0).carried_on(9.81)
     np.testing.assert_allclose(older.p, old.p)
-    assert older.age == 5.0
+    assert (old.age, older.age) == (0.0, 5.0 - LONGEST_S)
+    assert older.news == 5.0
+
+
+# ---- what a controller makes of it
+
+
+class Spinning(PointVehicle):
+    """It spins about its thrust axis, under one thrust; what it says of itself is as old as ``late``."""
+
+    def __init__(self, late):
+        super().__init__(SimpleNamespace(dt=0.02))
+        self.late, self.flying = late, True
+
+    def read(self):
+        return at(-self.late)._replace(age=self.late)
+
+    def wait(self, until):
+        pass
+
+
+def at(t):
+    """The vehicle a while after ``state(0.0)``, in closed form."""
+    x = state(0.0, SPIN, LEANING)
+    a = THRUST * x.R[:, 2] - np.array([0.0, 0.0, 9.81])
+    R = x.R @ Rotation.from_rotvec(t * np.array(SPIN)).as_matrix()
+    return x._replace(p=x.p + t * x.v + 0.5 * t * t * a, R=R, v=x.v + t * a)
+
+
+def worked_with(x, age):
+    """What a controller that looks ahead takes for the present state."""
+    acting = Command(jnp.array(THRUST), jnp.array(SPIN))
+    prediction = Prediction(jnp.array(1e-6), 0.02).aged(age)
+    return prediction(Underway(acting, (acting,)), x, jnp.zeros(3))[0]
+
+
+def agrees(found, true):
+    for one, other in zip((found.p, found.R, found.v), true[:3], strict=True):
+        np.testing.assert_allclose(one, other, rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("late", [0.0, 0.005, 0.02, LONGEST_S, 0.08, 0.3])
+def test_a_controller_that_looks_ahead_works_with_the_present_state(late):
+    """However old the news are: a link and a controller make up for their age once, together."""
+    plant = Spinning(late)
+    plant.reset(None)
+    measurement, _ = plant.step(Command(jnp.array(THRUST), jnp.array(SPIN)))
+    agrees(worked_with(measurement.x, measurement.age), at(0.0))
+
+
+@pytest.mark.parametrize("late", [0.0, 0.02, 0.08, 0.099])
+def test_so_does_one_in_a_live_flight(late):
+    plant = Spinning(late)
+    plant.send(np.array([THRUST, *SPIN]))
+    sample = _sample(3, 0.02, plant.now(), np.zeros(4))
+    p, R, v = np.split(jnp.asarray(sample.state), [3, 12])
+    agrees(worked_with(State(p, R.reshape(3, 3), v), sample.age), at(0.0))
+    assert sample.age <= Limits.state_age
+
+
+@pytest.mark.parametrize("late", [0.101, 0.12, 1.0])
+def test_the_guard_is_told_how_old_the_news_are(late):
+    """It refuses a state by the age of what the vehicle said, not by what is left of it."""
+    assert _sample(3, 0.02, Spinning(late).now(), np.zeros(4)).age == pytest.approx(late)

@@ -22,7 +22,7 @@ class SensorModel(eqx.Module):
     dropout: Float[Array, ""]
     """Probability that a sample is lost; the last one then stands."""
     latency: int = eqx.field(static=True)
-    """Age of a sample when it arrives [ms]."""
+    """Age of a sample when it arrives [ms]; :attr:`age` says how old it is when it is looked at."""
     period: int = eqx.field(static=True, default=10)
     """Time between samples [ms]."""
     gyro: float = eqx.field(static=True, default=0.0)
@@ -82,6 +82,11 @@ class SensorModel(eqx.Module):
     def held(self) -> int:
         """Number of samples under way, and the one that has arrived."""
         return -(-self.latency // self.period) + 1
+
+    @property
+    def age(self) -> float:
+        """How old the newest sample that has arrived is at the end of a tick [s]: the latency, in whole periods."""
+        return 1e-3 * (self.period * (self.held - 1))
 
     def noisy(self, x: State, key: Key[Array, ""]) -> State:
         """One sample of ``x``."""

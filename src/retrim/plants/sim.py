@@ -64,7 +64,7 @@ class Simulation(eqx.Module):
     @property
     def age(self) -> float:
         """How old measurements are [s]."""
-        return 0.0 if self.sensors is None else 1e-3 * self.sensors.latency
+        return 0.0 if self.sensors is None else self.sensors.age
 
     def undisturbed(self) -> "Simulation":
         """Return the same without its disturbance."""

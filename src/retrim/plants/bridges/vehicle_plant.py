@@ -87,7 +87,7 @@ class VehiclePlant(Plant, abc.ABC):
         return taken
 
     def now(self) -> VehicleState:
-        """Return the newest state, carried on to the present; its age is that of the news.
+        """Return the newest state, carried on to the present; its age is what is left of that of the news.
 
         Raises:
             PlantError: As for :meth:`read`.

@@ -24,12 +24,20 @@ class VehicleState(NamedTuple):
     """Time since this was so [s]."""
     truth: "VehicleState | None" = None
     """As it is, where a simulator behind the autopilot tells it."""
+    carried: float = 0.0
+    """By how much it has been carried on [s]; what the vehicle said is older than ``age`` by that."""
+
+    @property
+    def news(self) -> float:
+        """Time since what the vehicle said of its state was so [s]."""
+        return self.age + self.carried
 
     def carried_on(self, c: float) -> "VehicleState":
-        """Return the state as it is now, by thrust, gravity and body rates, all constant; its age is kept.
+        """Return the state as it is now, by thrust, gravity and body rates, all constant; its age is what is left.
 
         States come at instants of the autopilot's, 5 to 20 ms old. Taken for the present they are a delay that no
-        model has, and the times between them are no ticks.
+        model has, and the times between them are no ticks. A controller makes up for the age that it is told, so none
+        of what is made up for here may be in it.
 
         Args:
             c: Thrust per mass that was commanded last [m/s^2].
@@ -41,7 +49,8 @@ class VehicleState(NamedTuple):
         turned = Rotation.from_rotvec(h * self.omega).as_matrix()
         truth = None if self.truth is None else self.truth.carried_on(c)
         return self._replace(
-            p=self.p + h * self.v + 0.5 * h * h * a, R=self.R @ turned, v=self.v + h * a, truth=truth
+            p=self.p + h * self.v + 0.5 * h * h * a, R=self.R @ turned, v=self.v + h * a, truth=truth,
+            age=self.age - h, carried=self.carried + h,
         )  # fmt: skip
 
 
