@@ -159,6 +159,56 @@ def test_interpolates_linearly_between_rows(tables):
     np.testing.assert_allclose(jnp.concatenate([jnp.atleast_1d(leaf) for leaf in here]), mixed, atol=1e-12)
 
 
+# ---- headings that wind
+
+
+def along(phase):
+    """A circle of 3 s whose nose points along the path, folded at the west or not; the phase is where it begins."""
+
+    def path(t, fold):
+        phi = 2.0 * math.pi * smooth_start(t) / 3.0
+        heading = phi - 0.5 * math.pi + phase
+        return [1.0 - math.cos(phi), -math.sin(phi), 1.0, math.atan2(math.sin(heading), math.cos(heading))
+                if fold else heading]  # fmt: skip
+
+    return path
+
+
+winding = pytest.mark.parametrize(("fold", "phase"), [(False, 0.0), (True, 0.0), (True, 1.0), (True, 4.0)])
+
+
+def made(fold, phase):
+    path = along(phase)
+    return Reference.of(lambda t: path(t, fold), seconds=6.0, lap=3.0)
+
+
+def turned_by(angle):
+    return np.remainder(angle + math.pi, 2.0 * math.pi) - math.pi
+
+
+def check_heading(reference, first, last):
+    """The nose turns steadily, and its rate is the derivative of its heading but for whole turns."""
+    step = 1e-3
+    times = np.arange(first, last, step)
+    points = at(reference, times)
+    turned = turned_by(np.diff(points.heading))
+    np.testing.assert_allclose(turned / step, 0.5 * (points.heading_rate[1:] + points.heading_rate[:-1]), atol=0.1)
+
+
+@winding
+def test_the_rate_of_a_heading_is_its_derivative(fold, phase):
+    reference = made(fold, phase)
+    assert np.abs(reference.rows[:, 17]).max() == pytest.approx(2.0 * math.pi / 3.0, rel=1e-3)
+    assert np.abs(np.diff(reference.rows[:, 10])).max() < 0.02  # it may be interpolated
+    assert float(reference.rows[-1, 10] - at_one(reference, 3.0).heading) == pytest.approx(2.0 * math.pi, abs=1e-4)
+    check_heading(reference, 0.0, 14.0)
+
+
+@winding
+def test_a_family_turns_as_its_members_do(fold, phase):
+    check_heading(joined([made(fold, phase), circle()]), 0.0, 19.9)
+
+
 # ---- flatness
 
 

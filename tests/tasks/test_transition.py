@@ -7,7 +7,7 @@ import pytest
 
 from helpers import at
 from retrim.physics import small
-from retrim.tasks import Reference
+from retrim.tasks import Reference, smooth_start
 from retrim.tasks.shapes import circle, figure8, figure8_at, star
 from retrim.tasks.transition import BEFORE, LASTING, spliced, transition_between
 
@@ -81,6 +81,30 @@ def test_the_shortest_way_round_is_taken_by_the_nose(made):
     table = transition_between(turning, circle(), 12.0, small())
     late = at(table, over(table) + np.array([0.0, 1.0]))
     np.testing.assert_allclose(late.heading, 2.0 * np.pi, rtol=1e-9)
+
+
+def nose_along(fold):
+    """A circle of 3 s, the nose along the path: its heading winds, and may be folded at the west."""
+
+    def path(t):
+        phi = 2.0 * np.pi * smooth_start(t) / 3.0
+        heading = phi - 0.5 * np.pi
+        return [1.0 - np.cos(phi), -np.sin(phi), 1.0, np.arctan2(np.sin(heading), np.cos(heading)) if fold else heading]
+
+    return Reference.of(path, seconds=6.0, lap=3.0)
+
+
+@pytest.mark.parametrize("begins", [7.3, 8.0, 9.1])
+@pytest.mark.parametrize("fold", [False, True])
+@pytest.mark.parametrize("winds", ["old", "new", "both"])
+def test_a_heading_that_winds_turns_steadily(made, winds, fold, begins):
+    """Whatever laps end meanwhile, the rate of the heading is its derivative but for whole turns."""
+    old, new = (nose_along(fold) if winds in (which, "both") else made["figure8"] for which in ("old", "new"))
+    table = transition_between(old, new, begins, small())
+    t = np.arange(begins - BEFORE, over(table) + 7.0, 1e-3)
+    found = at(table, t)
+    turned = np.remainder(np.diff(found.heading) + np.pi, 2.0 * np.pi) - np.pi
+    np.testing.assert_allclose(turned / 1e-3, 0.5 * (found.heading_rate[1:] + found.heading_rate[:-1]), atol=0.1)
 
 
 def test_roll_outs_start_on_the_new_lap(made, table):

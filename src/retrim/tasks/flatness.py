@@ -1,5 +1,6 @@
 """Differential flatness: from a path in space to the velocity, command and heading of a point mass that follows it."""
 
+import math
 from collections.abc import Callable, Sequence
 
 import jax.numpy as jnp
@@ -15,6 +16,7 @@ JUMP = 30.0  # [m/s^2]: an acceleration beyond is a jump of velocity, which no c
 STEP = 1e-3  # [s], of the differences that give velocity and acceleration
 NO_THRUST = 1e-3  # [m/s^2]: a smaller thrust has no direction, and the attitude is undefined
 UP = np.array([0.0, 0.0, STANDARD_GRAVITY])
+FULL_TURN = 2.0 * math.pi  # [rad]: headings that differ by it are the same
 
 
 def flat_rows(path: Path3, times: np.ndarray, last: float) -> np.ndarray:
@@ -24,14 +26,15 @@ def flat_rows(path: Path3, times: np.ndarray, last: float) -> np.ndarray:
     thrust), the command is that of hover.
 
     Args:
-        path: Position, world [m], and heading [rad] if wanted, by time [s].
+        path: Position, world [m], and heading [rad] if wanted, by time [s]; a heading may jump by whole turns.
         times: When [s], shape (n,).
         last: End of what may be evaluated [s]; infinite for a path that repeats.
 
     Returns:
         Eighteen numbers for each instant, shape (n, 18): position [m] and velocity [m/s] in the world frame, collective
-        thrust [m/s^2], body rates [rad/s] in the body frame, heading [rad], acceleration [m/s^2] and jerk [m/s^3] in
-        the world frame, rate of the heading [rad/s]. The last seven are zero where the command is that of hover.
+        thrust [m/s^2], body rates [rad/s] in the body frame, heading [rad], unwrapped, acceleration [m/s^2] and jerk
+        [m/s^3] in the world frame, rate of the heading [rad/s]. The last seven are zero where the command is that of
+        hover.
 
     Raises:
         ValueError: The path does not give 3 or 4 finite numbers.
@@ -55,9 +58,11 @@ def flat_rows(path: Path3, times: np.ndarray, last: float) -> np.ndarray:
     defined = (before & now & after & ~jumps)[:, None]
     u = np.where(defined, flown, hover)
     jerk = (accelerations[2] - accelerations[0]) / (2.0 * h)
-    heading_rate = (around[3] - around[1])[:, 3:] / (2.0 * h)
+    turned = (around[3] - around[1])[:, 3:]
+    heading_rate = (turned - FULL_TURN * np.round(turned / FULL_TURN)) / (2.0 * h)
     moving = np.where(defined, np.concatenate([accelerations[1], jerk, heading_rate], axis=1), 0.0)
-    return np.concatenate([here[:, :3], v, u, here[:, 3:], moving], axis=1)
+    # A table is interpolated, and a heading between two rows that differ by a turn would point anywhere.
+    return np.concatenate([here[:, :3], v, u, np.unwrap(here[:, 3:], axis=0), moving], axis=1)
 
 
 def flat_command(

@@ -43,8 +43,9 @@ class Reference(AbstractReference):
         """Sample a path.
 
         Args:
-            path: Function of the time since take-off [s]: x, y, z, world [m], and the heading [rad] if it is not 0.
-                It is evaluated in [0, ``seconds``], and a few milliseconds beyond where there is a lap.
+            path: Function of the time since take-off [s]: x, y, z, world [m], and the heading [rad] if it is not 0,
+                which may jump by whole turns. It is evaluated in [0, ``seconds``], and a few milliseconds beyond where
+                there is a lap.
             seconds: Where the table ends [s].
             lap: From here to the end the path repeats for ever [s]; None if the end is held.
             points: Number of rows. References of as many rows share one compiled program.
@@ -141,4 +142,5 @@ def joined(references: Sequence[AbstractReference], *, seconds: float = 20.0, ev
 @eqx.filter_jit
 def _sampled(reference: AbstractReference, times: Float[Array, " n"]) -> Float[Array, "n 18"]:
     points = jax.vmap(reference)(times)
+    points = points._replace(heading=jnp.unwrap(points.heading))  # from lap to lap it may jump by whole turns
     return jnp.concatenate([leaf.reshape(times.shape[0], -1) for leaf in points], axis=1)

@@ -1,6 +1,5 @@
 """From one reference to another in flight, without a jump of position, velocity, acceleration or jerk."""
 
-import math
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -14,7 +13,7 @@ from ..physics.state import STANDARD_GRAVITY
 from ..physics.vehicle import Vehicle
 from .abstract_reference import AbstractReference, Point, TurnedReference
 from .feasibility import beyond_limits
-from .flatness import flat_command
+from .flatness import FULL_TURN, flat_command
 from .reference import Reference
 
 BEFORE = 1.0  # [s] of the old reference in the table of a transition
@@ -113,11 +112,13 @@ def _table(old: Reference, new: Reference, at: float, lasting: float) -> Referen
 def _mixed(
     old: Reference, new: Reference, times: Float[Array, " n"], at: Float[Array, ""], lasting: Float[Array, ""]
 ) -> Float[Array, "n 18"]:
-    first, last = old(at), new(jnp.zeros_like(at))
-    turns = 2.0 * math.pi * jnp.round((first.heading - last.heading) / (2.0 * math.pi))  # the shortest way round
+    first, last = jax.vmap(old)(times), jax.vmap(new)(jnp.maximum(times - at, 0.0))
+    # From lap to lap a heading may jump by whole turns, and a share of such a jump is no turn.
+    first, last = (points._replace(heading=jnp.unwrap(points.heading)) for points in (first, last))
+    away = (first.heading - last.heading)[jnp.sum(times < at)]
+    turns = FULL_TURN * jnp.round(away / FULL_TURN)  # the shortest way round
 
-    def row(t: Float[Array, ""]) -> Float[Array, "18"]:
-        before, after = old(t), new(jnp.maximum(t - at, 0.0))
+    def row(t: Float[Array, ""], before: Point, after: Point) -> Float[Array, "18"]:
         s, s1, s2, s3 = _smooth_step(jnp.clip((t - at) / lasting, 0.0, 1.0))
         s1, s2, s3 = s1 / lasting, s2 / lasting**2, s3 / lasting**3
         p, v, a = after.p - before.p, after.v - before.v, after.a - before.a
@@ -137,7 +138,7 @@ def _mixed(
         )
         return jnp.concatenate([leaf.reshape(-1) for leaf in mixed])
 
-    return jax.vmap(row)(times)
+    return jax.vmap(row)(times, first, last)
 
 
 def _smooth_step(x: Float[Array, ""]) -> tuple[Float[Array, ""], ...]:
