@@ -187,6 +187,21 @@ def test_a_delay_is_that_of_the_plant(plant):
     assert Scenario(plant=plant).make().simulation.delay_s == 0.02
 
 
+@pytest.mark.parametrize(
+    ("options", "dt", "said"),
+    [
+        ({"sensors": "rough"}, 0.025, "plant 'bem' with sensors 'rough' at dt = 0.025 s: .* of SensorModel"),
+        ({"plant": "mujoco"}, 0.015, "plant 'mujoco' with sensors 'ideal' at dt = 0.015 s: .* the simulator's step"),
+    ],
+)
+def test_a_control_period_that_cannot_be_divided_is_named(options, dt, said):
+    if "plant" in options:
+        pytest.importorskip(options["plant"])
+    with pytest.raises(ConfigError, match=said) as error:
+        Scenario(**options).make(dt=dt)
+    assert "\n" not in str(error.value)
+
+
 def test_a_kick_gains_its_speed_within_a_tenth_of_a_second():
     gained = sum(0.001 * effects("kick=4", 7.95 + 0.001 * ms).push for ms in range(300))
     np.testing.assert_allclose(gained, [4.0 / 2**0.5, 4.0 / 2**0.5, 0.0], rtol=0.02)

@@ -384,3 +384,11 @@ def test_a_vehicle_whose_delay_is_known_is_trained_with_it(delay, ticks):
     made = Setup.of(changed(load("hover/retrim"), vehicle=VehicleSpec(*body, command_delay=delay)))
     assert made.env.delay_ticks == made.learner.plant_delay_ticks == made.preset.plant_delay_ticks == ticks
     assert Setup.of(made.preset).preset == made.preset
+
+
+def test_a_delay_of_too_many_ticks_is_one_line_that_says_why():
+    body = ("made_up", 1.0, (0.02, 0.02, 0.03), (0.2, 0.2), 20.0, (4.0, 4.0, 3.0), 0.05)
+    preset = changed(load("hover/retrim"), dt=0.005, vehicle=VehicleSpec(*body, command_delay=0.15))
+    with pytest.raises(ConfigError, match=r"'made_up': command_delay = 0.15 s is 30 ticks of dt = 0.005 s") as error:
+        Setup.of(preset)
+    assert "\n" not in str(error.value)

@@ -129,6 +129,9 @@ IMPOSSIBLE = [
     ({"motor_tau": "40.0"}, r"motor_tau: Input should be less than or equal to 0\.5"),  # ms
     ({"propeller": "'9 inch'"}, r"propeller: Input should be '3 inch' or '5 inch'"),
     ({"propeller_diameter": "-7.0"}, r"propeller_diameter: Input should be greater than 0"),
+    ({"propeller_diameter": "178.0"}, r"propeller_diameter = 178 does not fit .* is it in inches"),  # mm
+    ({"propeller_diameter": "17.8"}, r"propeller_diameter = 17\.8 does not fit rotors that are 8\.27 inches"),  # cm
+    ({"propeller_diameter": "0.178"}, r"propeller_diameter = 0\.178 does not fit"),  # m
     ({"drag_area": "[0.0, 0.1, 0.1]"}, r"drag_area\.0: Input should be greater than 0"),
     ({"propelller": "'5 inch'"}, r"propelller: unknown key; did you mean 'propeller'\?"),
     ({"name": "3"}, r"name: Input should be a valid string"),

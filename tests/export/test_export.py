@@ -187,6 +187,18 @@ def test_what_cannot_be_asked_is_named(to, out, delta, said, saved, tmp_path, mo
     assert not list(tmp_path.iterdir())
 
 
+def test_a_runner_of_somebody_else_is_left_alone(saved, tmp_path):
+    """One's own is written again."""
+    export(saved, "npz", tmp_path / "p.npz", None, Silent())
+    export(saved, "npz", tmp_path / "q.npz", None, Silent())
+    (tmp_path / "runner.py").write_text("print('mine')\n")
+    with pytest.raises(ConfigError, match=r"runner\.py is there already") as error:
+        export(saved, "npz", tmp_path / "r.npz", None, Silent())
+    assert "\n" not in str(error.value)
+    assert (tmp_path / "runner.py").read_text() == "print('mine')\n"
+    assert not (tmp_path / "r.npz").exists()
+
+
 def test_a_missing_policy_is_named(tmp_path):
     with pytest.raises(CheckpointError, match="no such file"):
         export(tmp_path / "nowhere.safetensors", "c", None, None, Silent())

@@ -42,6 +42,41 @@ def test_our_own_recording(recording, tmp_path):
     agrees(read_flight_log(tmp_path / "flight.mcap"))
 
 
+@pytest.mark.parametrize("write", [write_npz, write_mcap])
+@pytest.mark.parametrize(
+    ("ms", "ages"), [(20, (15,)), (20, (25,)), (20, (30,)), (10, (15,)), (10, (25,)), (10, (30,)), (10, (15, 25)),
+                     (20, (10, 30)), (10, (5, 30))]
+)  # fmt: skip
+def test_our_own_recordings_of_old_states(write, ms, ages, tmp_path):
+    """Older than a tick, logged twice, or come late; and what says how old is wrong by tenths of a millisecond."""
+    if write is write_mcap:
+        pytest.importorskip("rosbags")
+    fine, before = flown(6.0, dt=1e-3), 100  # ms of flight before the recording
+    ticks = np.arange(before, len(fine.t), ms)
+    age = np.resize(ages, len(ticks))
+    states = np.concatenate([fine.p, fine.R.reshape(-1, 9), fine.v], axis=1)
+    command = np.concatenate([fine.c[:, None], fine.omega], axis=1)[ticks]
+    jitter = np.random.default_rng(0).uniform(-3e-4, 3e-4, len(ticks))
+    t, shown = 1e-3 * (ticks - before), states[ticks - age]
+    path = tmp_path / ("flight.npz" if write is write_npz else "flight.mcap")
+    write(path, Recording(t, shown, states[ticks], 1e-3 * age + jitter, command, np.zeros(len(t))))
+    log = read_flight_log(path, dt=1e-3 * ms)
+    assert log.valid[3:-3].all()
+    assert any("not newer than the one before" in note for note in log.notes) == (len(ages) > 1)
+
+    def true(start):
+        """Position, velocity and thrust at the times of a log that begins then."""
+        columns = np.concatenate([fine.p, fine.v, fine.c[:, None]], axis=1).T
+        return np.stack([np.interp(start + log.t[5:-5], fine.t, column) for column in columns], axis=1)
+
+    # The log's clock begins with its first state, and nobody tells when that was.
+    found = np.concatenate([log.p, log.v, log.c[:, None]], axis=1)[5:-5]
+    missed = min((np.abs(found - true(1e-3 * start)).max(axis=0) for start in range(50, 200)), key=np.sum)
+    assert missed[:3].max() < 3e-3
+    assert missed[3:6].max() < 0.03
+    assert missed[6] < 0.1
+
+
 @pytest.mark.parametrize("name", ["flight.bag", "flight.db3", "flight"])
 def test_bags_of_ros(name, tmp_path):
     """Odometry as MAVROS publishes it, velocities in body axes, thrust as a share."""

@@ -222,6 +222,7 @@ DAMAGED_TABLES = {
     "too short": (lambda table: {n: x[:20] for n, x in table.items()}, "of flight are left, at least 1 s"),
     "one sample": (lambda table: {n: x[:1] for n, x in table.items()}, "1 samples, all at one time"),
     "too rare": (lambda table: {n: x[::20] for n, x in table.items()}, "every 0.4 s; accelerations need"),
+    "slower than any tick": (lambda table: columns(flown(12.0, dt=0.105)), "every 0.105 s; accelerations need.* 0.1 s"),
     "quaternions not of norm one": (scaled(0.7, "qx", "qy", "qz", "qw"), "not of norm one"),
     "quaternions in another order": (swapped, 'with attitude.form = "wxyz" they would'),
     "inverse attitudes": (inverse, 'attitude.turns = "world to body" they would'),

@@ -1,5 +1,6 @@
 """Replaying a log: what is foretold, by whom, and what a policy learns from it."""
 
+import dataclasses
 import importlib
 import json
 
@@ -12,6 +13,7 @@ from helpers import tiny_preset
 from made_up_log import MAP, columns, flown, write_csv, write_map
 from retrim.config.loading import load
 from retrim.config.setup import Setup
+from retrim.config.vehicle_file import read_vehicle
 from retrim.config.vehicles import make_vehicle
 from retrim.errors import ConfigError, LogError
 from retrim.experiments.reporter import Silent
@@ -20,6 +22,7 @@ from retrim.io.logs import read_flight_log, read_map
 from retrim.io.trained import save_policy
 from retrim.replay.adaptation import Adapted, adapt_to
 from retrim.replay.foretelling import Protocol, foretell
+from retrim.replay.identification import Identified
 from retrim.replay.predictors import learnt, mean_of, ridge, yardsticks
 from retrim.replay.replay import Replay, replay
 from retrim.replay.rows import rows_of
@@ -118,6 +121,46 @@ def test_a_slower_log_has_its_own_tick_and_no_policy_adapts_to_it(tmp_path):
     asked = Replay(map=str(chosen), buffer=2.0, horizon=1.0, adapt="full", policy=tmp_path / "p.safetensors")
     with pytest.raises(LogError, match=r"a sample every 33.3 ms, but the policy's tick is 20 ms"):
         replay(path, asked, Run("replay", tmp_path), Silent())
+
+
+def test_a_buffer_that_holds_too_few_samples_is_named(files, tmp_path, monkeypatch):
+    """0.2 s are ten samples at 50 Hz; what is enough is said, and is enough."""
+    path, chosen = files
+    with pytest.raises(ConfigError, match=r"--buffer 0\.2: must be 0\.26 to .* every 20 ms") as error:
+        replay(path, Replay(map=str(chosen), buffer=0.2, horizon=1.0), Run("replay", tmp_path), Silent())
+    assert "\n" not in str(error.value)
+    made = []
+    monkeypatch.setattr(replays, "foretell", lambda rows, dt, predictors, protocol: made.extend(predictors) or ())
+    replay(path, Replay(map=str(chosen), buffer=0.26, horizon=1.0), Run("replay", tmp_path), Silent())
+    assert "regression" in made
+
+
+HEAVY = """
+mass = 1.2
+inertia = [0.0075, 0.0075, 0.014]
+arm = [0.115, 0.12]
+thrust_max = 60.0
+rates_max = [8.0, 7.0, 4.0]
+motor_tau = 0.04
+rate_lag = [0.05, 0.06, 0.2]
+command_delay = 0.03
+propeller = "5 inch"
+propeller_diameter = 7.0
+drag_area = [0.01, 0.02, 0.03]
+"""
+
+
+def test_what_a_log_does_not_tell_is_that_of_the_vehicle_file(files, tmp_path, monkeypatch):
+    path, chosen = files
+    (tmp_path / "heavy.toml").write_text(HEAVY)
+    found = Identified(*[None] * 9, (None, None, None), 0.1)
+    monkeypatch.setattr(replays, "identify", lambda log, seed: found)
+    monkeypatch.setattr(replays, "_foretold", lambda *asked: [])
+    vehicle = str(tmp_path / "heavy.toml")
+    asked = Replay(map=str(chosen), buffer=2.0, horizon=1.0, identify=True, vehicle=vehicle)
+    replay(path, asked, Run("replay", tmp_path), Silent())
+    told, kept = read_vehicle(tmp_path / "vehicle.toml"), read_vehicle(tmp_path / "heavy.toml")
+    assert told == dataclasses.replace(kept, name="heavy-identified")
 
 
 def test_a_policy_learns_the_push_of_a_log(files, tmp_path):

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
-from ..errors import ConfigError
+from ..errors import ConfigError, RetrimError
 from ..physics.vehicle import Vehicle
 from ..plants.plant import Plant
 from .disturbances import disturbance
@@ -101,6 +101,7 @@ class Scenario:
 
         Raises:
             PlantError: A package that the plant needs is not installed.
+            ConfigError: The plant, or its sensors, cannot divide the control period.
         """
         entry = self.entry
         request = PlantRequest(
@@ -113,4 +114,11 @@ class Scenario:
             self.delay,
             find_plant(self.plant)[1],
         )
-        return entry.make(request)
+        try:
+            return entry.make(request)
+        except RetrimError:
+            raise
+        except ValueError as error:
+            raise ConfigError(
+                f"plant {self.plant!r} with sensors {self.sensors!r} at dt = {dt:g} s: {error}"
+            ) from error

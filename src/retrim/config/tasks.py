@@ -1,6 +1,5 @@
 """Tasks by name."""
 
-import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -20,6 +19,7 @@ from ..tasks.task import AbstractTask
 from ..tasks.track import AbstractTrack, L2Track, SharpTrack
 from ..tasks.track import Track as PaperTrack
 from ..tasks.view import ViewHover
+from .loading import changed
 from .presets import Preset
 from .presets import Track as TrackTable
 from .presets import Vision as VisionTable
@@ -101,12 +101,22 @@ def lag_of(preset: Preset, vehicle: Vehicle) -> Command | None:
 
 
 def delayed(preset: Preset) -> Preset:
-    """Return a preset with the command delay of its vehicle, where its file says one, in the model and declared."""
+    """Return a preset with the command delay of its vehicle, where its file says one, in the model and declared.
+
+    Raises:
+        ConfigError: It is more ticks than a preset may have.
+    """
     vehicle = preset.vehicle
     if not isinstance(vehicle, VehicleSpec) or vehicle.command_delay is None:
         return preset
     ticks = round(vehicle.command_delay / preset.dt)
-    return dataclasses.replace(preset, delay_ticks=ticks, plant_delay_ticks=ticks)
+    try:
+        return changed(preset, delay_ticks=ticks, plant_delay_ticks=ticks)
+    except ConfigError as error:
+        raise ConfigError(
+            f"vehicle {vehicle.name!r}: command_delay = {vehicle.command_delay:g} s is {ticks} ticks of "
+            f"dt = {preset.dt:g} s; {error}"
+        ) from error
 
 
 def _vision(request: TaskRequest) -> AbstractTask:

@@ -15,6 +15,7 @@ from .validation import read_toml, validated
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
 Three = tuple[Positive, Positive, Positive]
+INCH = 0.0254  # [m]
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -43,7 +44,7 @@ class VehicleSpec:
     propeller: Literal["3 inch", "5 inch"] | None = None
     """Blade geometry that is scaled to the vehicle; the nearer one by default."""
     propeller_diameter: Positive | None = None
-    """[inch]; by default 0.9 times the distance of neighbouring rotors."""
+    """[inch]; by default 0.9 times the distance of neighbouring rotors, and 0.3 to 1.3 times it."""
     drag_area: Three | None = None
     """c A of the body along its axes [m^2]; by default the kingfisher's, by arm squared."""
 
@@ -65,6 +66,12 @@ class VehicleSpec:
                 f"inertia = {self.inertia} kg m^2 is too large for {self.mass} kg within {reach:.3f} m of the centre; "
                 f"is it in g cm^2 or kg mm^2?"
             )
+        apart = 2.0 * min(self.arm) / INCH
+        if self.propeller_diameter is not None and not 0.3 * apart <= self.propeller_diameter <= 1.3 * apart:
+            raise ValueError(
+                f"propeller_diameter = {self.propeller_diameter:g} does not fit rotors that are {apart:.3g} inches "
+                f"apart; is it in inches, and arm in m?"
+            )
         return self
 
     def build(self) -> Vehicle:
@@ -75,7 +82,7 @@ class VehicleSpec:
         diameter (to the powers 1 and 5).
         """
         reach = math.hypot(*self.arm)
-        inches = self.propeller_diameter or 0.9 * 2.0 * min(self.arm) / 0.0254
+        inches = self.propeller_diameter or 0.9 * 2.0 * min(self.arm) / INCH
         kind = self.propeller or ("3 inch" if inches < 4.0 else "5 inch")
         like = small() if kind == "3 inch" else kingfisher()
         scale = inches / (3.07 if kind == "3 inch" else 5.1)

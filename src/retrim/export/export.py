@@ -51,7 +51,7 @@ def export(policy: Path, to: str, out: Path | None, delta: Path | None, reporter
         The files.
 
     Raises:
-        ConfigError: There is no such format, or the result does not compute what JAX does.
+        ConfigError: There is no such format, another file is in the way, or the result does not compute what JAX does.
         CheckpointError: A file cannot be used.
     """
     if to not in (*FORMATS, "delta"):

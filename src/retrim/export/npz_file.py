@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ..control.lora import LoraPolicy
+from ..errors import ConfigError
 from ..io.checkpoint import fingerprint
 from ..io.files import write_whole
 from .portable import Portable
@@ -16,15 +17,21 @@ RUNNER = "runner.py"
 
 
 def write_npz(path: Path, policy: Portable) -> list[Path]:
-    """Write a policy and, beside it, the runner; return both paths."""
+    """Write a policy and, beside it, the runner; return both paths.
+
+    Raises:
+        ConfigError: Another file has the name of the runner.
+    """
+    runner, code = path.with_name(RUNNER), files(__package__).joinpath(RUNNER).read_bytes()
+    if runner.exists() and (not runner.is_file() or runner.read_bytes() != code):
+        raise ConfigError(f"{runner} is there already, and is not the runner of this release: move it, or choose --out")
     about = {**policy.about, "layers": len(policy.layers), "observation": policy.observation}
     arrays = {f"w{i}": w for i, (w, _) in enumerate(policy.layers)} | {
         f"b{i}": b for i, (_, b) in enumerate(policy.layers)
     }
     arrays |= {name: getattr(policy, name) for name in ("low", "high", "y0", "test_observations", "test_commands")}
     _write(path, arrays, about)
-    runner = path.with_name(RUNNER)
-    write_whole(runner, files(__package__).joinpath(RUNNER).read_text())
+    write_whole(runner, code)
     return [path, runner]
 
 

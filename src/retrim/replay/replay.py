@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jax import tree
 
-from ..config.loading import changed, load
+from ..config.loading import changed, load, with_vehicle
 from ..config.setup import Setup
 from ..control.policy import Policy
 from ..errors import ConfigError, LogError
@@ -30,6 +30,7 @@ from .vehicle import vehicle_toml
 SHOWN = ("regression", "ensemble", "linear")  # residual models beside the yardsticks
 ENSEMBLE_RATE = 1e-3  # learning rate: with that of hover/paper an ensemble learns the noise of a real log
 DEFAULT = "hover/retrim"
+SAMPLES = (12, 100_000)  # that a residual model can be fitted to; at least so many beside those of a command delay
 LOST = 0.5  # [m]: an error in a model that has nothing to do with a flight any more
 SPANS = {"buffer": (0.2, 600.0), "horizon": (0.1, 600.0), "delay": (0.0, 1.0), "lag": (0.0, 5.0)}  # [s]
 
@@ -99,9 +100,15 @@ def replay(path: Path, asked: Replay, run: Run, reporter: Reporter) -> Document:
     """
     policy, preset = load_policy(asked.policy) if asked.policy else (None, load(DEFAULT))
     if asked.vehicle is not None:
-        preset = changed(preset, vehicle=asked.vehicle)
+        preset = with_vehicle(preset, asked.vehicle)
     setup = Setup.of(preset if asked.residual is None else changed(preset, adapt={"residual": asked.residual}))
     log = read_flight_log(path, None if asked.map is None else read_map(asked.map), dt=preset.dt)
+    least, most = setup.preset.plant_delay_ticks + SAMPLES[0], SAMPLES[1]
+    if not least <= round(asked.buffer / log.dt) <= most:
+        raise ConfigError(
+            f"--buffer {asked.buffer:g}: must be {least * log.dt:.2g} to {most * log.dt:.4g} s for a log that has a "
+            f"sample every {1000 * log.dt:.3g} ms"
+        )
     rows, protocol = rows_of(log, delay=asked.delay, lag=asked.lag), Protocol(asked.buffer, asked.horizon)
     late = f" Thrust acts {1000 * asked.delay:g} ms late, with a lag of {1000 * asked.lag:g} ms."
     intro = "Residual a - (c R e3 - g e3), world frame." + late * bool(asked.delay or asked.lag)

@@ -42,6 +42,7 @@ def vehicle_toml(found: Identified, setup: Setup, log: str) -> str:
     else:
         lag = found.thrust_lag
         lines.append(f"motor_tau = {_bounded(lag.value):.4g}  # [s], identified: {lag.text('ms', 1000.0)}")
+    known = None if base.rate_lag is None else base.rate_lag.tolist()
     if (level := found.rate_lag) is not None:
         yaw = found.yaw_lag
         said = (
@@ -49,9 +50,13 @@ def vehicle_toml(found: Identified, setup: Setup, log: str) -> str:
         )
         lags = [_bounded(each.value) for each in (level, level, yaw or level)]
         lines.append(f"rate_lag = {_row(lags)}  # [s], identified: {said}")
+    elif known is not None:
+        lines.append(f"rate_lag = {_row(known)}  # [s]")
     if (delay := found.delay) is not None:
         said = delay.text("ms", 1000.0)
         lines.append(f"command_delay = {min(max(delay.value, 0.0), MOST):.4g}  # [s], identified: {said}")
+    elif keep is not None and keep.command_delay is not None:
+        lines.append(f"command_delay = {keep.command_delay:.6g}  # [s]")
     if keep is not None:
         lines += [] if keep.propeller is None else [f'propeller = "{keep.propeller}"']
         lines += [] if keep.propeller_diameter is None else [f"propeller_diameter = {keep.propeller_diameter:.6g}"]

@@ -18,7 +18,7 @@ ENU_OF = {"ENU": np.eye(3), "NED": WORLD}
 FLU_OF = {"FLU": np.eye(3), "FRD": np.diag(BODY)}
 UP = np.array([0.0, 0.0, STANDARD_GRAVITY])
 STATES = ("position", "velocity", "attitude")
-SLOWEST = 0.11  # [s]: states that come more rarely say nothing of accelerations
+SLOWEST = 0.1  # [s]: states that come more rarely say nothing of accelerations, and no preset has such a tick
 ALIKE = 0.02  # share by which the periods of a log and of the control differ that count as the same
 COMMAND_HELD = 0.5  # [s]: some autopilots publish a command only when it changes
 
@@ -60,7 +60,7 @@ def grid_of(path: Path, series: dict[str, Series], part: maps.Part, dt: float) -
     """
     own = max(period(series[name]) for name in STATES)
     slowest = max(STATES, key=lambda name: period(series[name]))
-    if own > SLOWEST:
+    if round(own, 3) > SLOWEST:
         raise LogError(
             f"{path}: {slowest} comes every {own:.3g} s; accelerations need a sample every {SLOWEST:g} s at least"
             + ("; is time in ms or us?" if own > 5.0 else "")

@@ -82,7 +82,11 @@ def write_npz(path: Path, flight: Recording) -> None:
 
 
 def write_mcap(path: Path, flight: Recording) -> None:
-    """Write messages of ROS 2; the file appears when it is whole."""
+    """Write messages of ROS 2; the file appears when it is whole.
+
+    Times are those of the flight. Where the first states were true before it began, all are later, so that no stamp is
+    before zero; nor at zero, which to readers of ROS is no stamp.
+    """
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
     from scipy.spatial.transform import Rotation  # here: it takes as long to import as all of retrim
@@ -100,7 +104,9 @@ def write_mcap(path: Path, flight: Recording) -> None:
                     topics[topic] = writer.add_connection(topic, message.__msgtype__, typestore=types)
                 writer.write(topics[topic], _ns(t), types.serialize_cdr(message, message.__msgtype__))
 
-            for k, t in enumerate(flight.t.tolist()):
+            first = float(np.min(flight.t - flight.age, initial=0.0))
+            later = 0.0 if first == 0.0 else 1e-9 - first
+            for k, t in enumerate((flight.t + later).tolist()):
                 x, truth, u = flight.measured[k], flight.true[k], flight.command[k]
                 seen = t - float(flight.age[k])  # the header says when a state was true, the log when it came
                 add("/measured/pose", t, make.pose(seen, x, quaternions[0][k]))
@@ -116,7 +122,7 @@ def write_mcap(path: Path, flight: Recording) -> None:
                 if flight.policy_age is not None:
                     add("/age/policy", t, make.number(float(flight.policy_age[k])))
             for event in sorted(flight.events, key=lambda event: event.t):
-                add("/events", max(0.0, event.t), make.text(f"{event.kind}: {event.note}"))
+                add("/events", max(0.0, event.t) + later, make.text(f"{event.kind}: {event.note}"))
         next(bag.glob("*.mcap")).replace(path)
 
 
@@ -156,4 +162,4 @@ class _Messages:
 
 
 def _ns(t: float) -> int:
-    return round(1e9 * max(t, 0.0))
+    return round(1e9 * t)

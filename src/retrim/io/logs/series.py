@@ -10,6 +10,8 @@ import numpy as np
 from ...config.validation import suggestion
 from ...errors import LogError
 
+LATE_S = 0.5  # [s] by which a state may be older than the one before; more is of another flight
+
 
 @dataclass(frozen=True)
 class Series:
@@ -56,6 +58,21 @@ class Clock:
 def missing_field(path: Path, name: str, known: Sequence[str]) -> LogError:
     """Return the error for a field that is not there."""
     return LogError(f"{path}: no field {name!r}; {suggestion(name, known)}")
+
+
+def newer(series: Series, what: str) -> tuple[Series, list[str]]:
+    """Return the samples of a state that are newer than all before, and a note on those that were left out.
+
+    States are logged when they come. One is logged again while nothing newer comes, and a clock that is read with an
+    error makes it older then; another overtakes one before it. What goes back further is kept: :func:`in_order` refuses
+    it.
+    """
+    newest = np.concatenate([[-np.inf], np.fmax.accumulate(series.t)[:-1]])
+    late = (series.t <= newest) & (series.t > newest - LATE_S)
+    if not late.any():
+        return series, []
+    note = f"{what}: {np.sum(late)} of {len(late)} samples are not newer than the one before, and are left out"
+    return Series(series.t[~late], series.values[~late]), [note]
 
 
 def in_order(series: Series, what: str, path: Path) -> tuple[Series, list[str]]:
