@@ -54,11 +54,8 @@ def _lines(title: str) -> Advance:
 
 def started(run: Run) -> Run:
     """Return a run, after a line if it goes on from an earlier one of its folder, or replaces its results."""
-    if run.has_parts:
-        said = "what the same code has made there of the same things is kept, all else is made again"
-        console.print(f"results in {run.folder}: {said}", markup=False, soft_wrap=True)
-    elif run.replaces:
-        console.print(f"results in {run.folder} are replaced", markup=False, soft_wrap=True)
+    if said := run.of_earlier():
+        console.print(said, markup=False, soft_wrap=True)
     return run
 
 
