@@ -17,7 +17,7 @@ from retrim import ConfigError, PlantError, Setup, changed
 from retrim.cli.reproduce import COMMANDS
 from retrim.config import load, named_presets
 from retrim.config.baselines import BASELINES
-from retrim.experiments import Run, design, effort, tables
+from retrim.experiments import Run, design, effort, provenance, tables
 from retrim.experiments.reporter import Silent
 
 # The package has functions of these names.
@@ -153,9 +153,25 @@ def test_all_tables_go_on_where_they_were_killed(tmp_path, monkeypatch):
     assert made[3:] == [("one", 1), ("two", 1)]
     table(False)  # what a quick look made is no page of the whole
     assert made[5:] == []
+    assert "quick look" not in (tmp_path / "everything.md").read_text()  # it has an overview of its own
+    assert "quick look" in (tmp_path / "everything_quick.md").read_text()
     (tmp_path / "one" / "one.md").unlink()
     table(False)
     assert made[5:] == [("one", 9)]
+
+
+def test_a_page_that_other_code_made_since_is_made_again(tmp_path, monkeypatch):
+    """Also where this code once made the table: the folder holds one page."""
+    codes = iter(("a", "a", "b", "a"))
+
+    def one(run, reporter):
+        run.write_text("one.md", provenance.code())
+
+    monkeypatch.setattr(everything, "PLAN", ((one, "Table", {}),))
+    for code in codes:
+        monkeypatch.setattr(provenance, "code", lambda code=code: code)
+        everything.everything(Run("test", tmp_path), Silent())
+        assert (tmp_path / "one" / "one.md").read_text() == code
 
 
 def test_readings_of_the_papers_formulation_differ_as_they_say(tmp_path, monkeypatch):

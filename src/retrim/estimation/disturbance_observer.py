@@ -12,7 +12,7 @@ noise r per tick, (q / (r sqrt(dt)))^(1/2) [rad/s]; r is that of the last second
 observer is a first-order low-pass of what the model missed in each tick.
 
 While a command at a limit acts, what the vehicle does is no disturbance: d and r are held, and v is what is measured.
-So it is at the first measurement and after one that was missed, since what changed then is not of one tick.
+So it is at the first measurement and after a tick that was missed, since what changed then is not of one tick.
 """
 
 import dataclasses

@@ -9,7 +9,7 @@ that would take all of the prediction error away within a tick, and the filter m
 
 where f is the thrust that was commanded (Hovakimyan and Cao 2010; as flown with DATT, Huang et al. 2023). A constant
 disturbance d shows in -sigma from the second tick on, so that d_hat approaches it with the time constant
--dt / ln(alpha). At the first measurement, and after one that was missed, the predictor starts from what is measured,
+-dt / ln(alpha). At the first measurement, and after a tick that was missed, the predictor starts from what is measured,
 and d_hat is held: what changed then is not of one tick.
 """
 

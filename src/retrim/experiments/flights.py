@@ -98,7 +98,7 @@ class Flight:
         for k in shifts:
             errors.append(float(np.linalg.norm(self.log.p[rows] - self.target[rows - k], axis=1).mean()))
         best = int(np.argmax(np.array(errors) <= (1.0 + AS_GOOD) * min(errors) + AS_GOOD_M))
-        return shifts[best] * self.log.dt, errors[best]
+        return shifts[best] * self.log.dt, errors[best] if shifts[best] else self.steady
 
     @property
     def effort(self) -> tuple[float, float]:

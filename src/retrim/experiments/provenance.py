@@ -62,6 +62,12 @@ def describe_code() -> str:
 
 def versions() -> dict[str, str]:
     """Return the versions of Python, of the packages that compute, and of those extras that are installed."""
+    return dict(_versions())
+
+
+@functools.cache
+def _versions() -> dict[str, str]:
+    """What is looked up in files of every package, and asked for with every flight of a sweep."""
     found = {name: version(name) for name in PACKAGES}
     for name in EXTRAS:
         with contextlib.suppress(PackageNotFoundError):

@@ -55,7 +55,9 @@ class Run:
         self.executor, self.failed = executor, False
         self.pages: list[Path] = []  # that its documents have written
         self.watch = Stopwatch()
-        self.has_parts = any((self.folder / PARTS).glob("*"))
+        self.taken_over = 0
+        """Parts, and networks that take long to train, that an earlier run had made."""
+        self._has_parts = any((self.folder / PARTS).glob("*"))
         self._replaces = any(self.folder.glob("*.json"))
         self.stop = stop or threading.Event()
         commit(), code()  # as they are now: the run may last for hours
@@ -63,7 +65,7 @@ class Run:
 
     def of_earlier(self) -> str:
         """Return what becomes of the results of an earlier run of the folder, in a line; empty if there are none."""
-        if self.has_parts:
+        if self._has_parts:
             return f"results in {self.folder}: what the same code made there of the same things stays, the rest goes"
         return f"results in {self.folder} are replaced" if self._replaces else ""
 

@@ -12,7 +12,6 @@ from jax import random
 from jaxtyping import Array, Key
 
 from ..adapt.learner import LearnerState, OnlineLearner
-from ..adapt.optimisers import CarriedAdam
 from ..adapt.updates import PolicyUpdate, Update
 from ..adapt.workers import PolicyWorker, ResidualWorker, Worker, policy_update, residual_update
 from ..control.lora import LoraPolicy
@@ -116,8 +115,9 @@ def _base_step(
 
 
 def _optimiser(learner: OnlineLearner) -> optax.GradientTransformation:
-    """Return one Adam for the whole flight, with the rate of all weights."""
-    return CarriedAdam(learner.optimiser.rate, learner.optimiser.max_grad_norm).transformation(1)
+    """Return one Adam for the whole flight, with the rate of all weights: no update of the base begins anew."""
+    clip = optax.clip_by_global_norm(learner.optimiser.max_grad_norm)
+    return optax.chain(clip, optax.scale_by_adam(), optax.scale_by_learning_rate(learner.optimiser.rate))
 
 
 def _on(state: Any, base: PolicyState | None) -> Any:

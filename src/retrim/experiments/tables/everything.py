@@ -12,6 +12,7 @@ from .design import design
 from .document import Document, TableSection
 from .efficiency import efficiency
 from .hover import hover
+from .kept import digest_of
 from .levels import METHODS
 from .model import model
 from .phase import phase
@@ -49,14 +50,15 @@ def everything(run: Run, reporter: Reporter, *, quick: bool = False) -> None:
     """All tables of the paper: an overview, and a folder for each. The same command goes on where it was killed.
 
     Args:
-        run: Folder of everything.md and of a folder for each table.
+        run: Folder of everything.md, or everything_quick.md, and of a folder for each table.
         reporter: Receives progress and the sections.
         quick: One seed, two starts and short flights, in a folder quick/; other plants and the paper's
             formulation of tracking are left out.
     """
     run.remark = REMARK if quick else ""
     intro = f"Made by `retrim reproduce all{' --quick' if quick else ''}`."
-    document = Document(run, "everything", "The tables of the paper", intro, [], reporter)
+    overview = f"everything{'_quick' * quick}"
+    document = Document(run, overview, "The tables of the paper", intro, [], reporter)
     rows: list[dict[str, Any]] = []
     for make, what, options in PLAN:
         if run.interrupted:
@@ -72,20 +74,23 @@ def everything(run: Run, reporter: Reporter, *, quick: bool = False) -> None:
         place = run.folder / folder
         part = Run("reproduce", place, stop=run.stop, remark=remark, trained=run.folder, executor=run.executor)
         done = run.folder / PARTS / f"{section_key(table=name, options=options)}.done"
-        if done.is_file() and (run.folder / row["page"]).is_file():
+        page = run.folder / row["page"]
+        before = json.loads(done.read_text()) if done.is_file() and page.is_file() else {"page": None}
+        if before.pop("page") == (digest_of(page) if page.is_file() else ""):
             reporter.say(f"{name}: as an earlier run of this folder has made it")
             document.earlier += 1
-            row |= json.loads(done.read_text())
+            row |= before
         else:
             try:
                 make(part, reporter, **options)
             except PlantError as error:
                 rows.append({"table": name, "what": what, "left_out": str(error)})
                 continue
-            took = {"s": round(part.watch.total_s, 1), "at_least": part.has_parts}
+            took = {"s": round(part.watch.total_s, 1), "at_least": part.taken_over > 0}
             row |= took
-            if not run.interrupted:
-                run.write_text(str(done.relative_to(run.folder)), json.dumps(took) + "\n")
+            if not run.interrupted and page.is_file():
+                made = {**took, "page": digest_of(page)}  # of other code or options another page may be there one day
+                run.write_text(str(done.relative_to(run.folder)), json.dumps(made) + "\n")
         rows.append(row)
     lines = tuple(
         (row["what"], f"{row['table']}, left out: {row['left_out']}", "-")

@@ -15,7 +15,7 @@ from .document import TableSection
 
 def keep(run: Run, key: str, section: TableSection, rows: list[dict[str, Any]]) -> None:
     """Write a section and the rows behind it to the folder of the run."""
-    drawn = None if section.picture is None else {section.picture.name: _digest(section.picture)}
+    drawn = None if section.picture is None else {section.picture.name: digest_of(section.picture)}
     whole = dataclasses.asdict(section) | {"picture": drawn}
     run.write_text(f"{PARTS}/{key}.json", json.dumps({"section": whole, "rows": rows}) + "\n")
 
@@ -32,12 +32,13 @@ def kept(run: Run, key: str) -> tuple[TableSection, list[dict[str, Any]]] | None
         found = json.loads(path.read_text())
         whole, rows = found["section"], found["rows"]
         drawn = {run.folder / name: digest for name, digest in (whole["picture"] or {}).items()}
-        if any(_digest(path) != digest for path, digest in drawn.items()):
+        if any(digest_of(path) != digest for path, digest in drawn.items()):
             return None
         lines = tuple(tuple(row) for row in whole["rows"])
         section = TableSection(tuple(whole["columns"]), lines, whole["title"], whole["about"], next(iter(drawn), None))
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None  # it is made again
+    run.taken_over += 1
     return section, rows
 
 
@@ -52,7 +53,7 @@ def files_behind(*names: str | None) -> dict[str, str]:
         head = part.partition(":")[0].partition("=")[0]
         path = Path(getattr(sys.modules.get(head) if ":" in part else None, "__file__", None) or head)
         if path.is_file():
-            found[part] = _digest(path)
+            found[part] = digest_of(path)
     return found
 
 
@@ -69,5 +70,6 @@ def named_by(scenario: Scenario) -> list[str | None]:
     return [scenario.plant, scenario.sensors, scenario.disturbance, scenario.reference, vehicle]
 
 
-def _digest(path: Path) -> str:
+def digest_of(path: Path) -> str:
+    """Return a digest of a file."""
     return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
