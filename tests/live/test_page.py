@@ -4,6 +4,7 @@ import os
 import shutil
 import time
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,17 +13,19 @@ import pytest
 from live_processes import DT, HOME, level
 from retrim.errors import ConfigError
 from retrim.live.knobs import Knobs
-from retrim.live.page import PagePlan, free_port
+from retrim.live.page import PagePlan, _Page, free_port
 from retrim.live.scene import quaternion
 from retrim.live.spec import PageSpec
 from retrim.onboard.launch import launch
-from retrim.onboard.messages import Sample, pack_note, unpack_note
+from retrim.onboard.messages import Sample, Setpoint, pack_note, unpack_note
 from retrim.physics import so3
+from retrim.transport.in_process import InProcessBus
 from retrim.transport.shared_memory import SharedMemoryBus
 
 SMALL = (
     "sample",
     "status",
+    "setpoint",
     "fallback",
     "knobs",
     "wish",
@@ -85,6 +88,18 @@ def hover(bus, seconds, until=lambda: False):
         bus.publish("status", pack_note("status", mode="policy", **fields))
         tick += 1
         time.sleep(DT)
+
+
+def test_it_says_who_flies_now_and_not_who_once_did(monkeypatch):
+    pytest.importorskip("viser")
+    bus, texts = InProcessBus(dict.fromkeys(SMALL, 65536)), []
+    page = _Page(PageSpec("", 0, "hover", HOME[None].repeat(2, 0), (), 0.06, 0.19), bus, MagicMock())
+    monkeypatch.setattr(page._panel, "show", texts.append)
+    bus.publish("status", pack_note("status", mode="policy", error=0.0, missed=0))
+    for tick, topic in enumerate(("setpoint", "fallback", "setpoint")):
+        bus.publish(topic, Setpoint(tick, DT * tick, np.zeros(4), HOME).pack())
+        page.refresh(text=True)
+    assert [text.partition("**")[2].partition("**")[0] for text in texts] == ["policy", "watchdog", "policy"]
 
 
 def test_it_listens_on_the_loopback_address_only(flight):

@@ -58,6 +58,23 @@ def test_all_events_are_shown_once_and_the_end_too():
     assert times[-1] == "landed"
 
 
+def test_a_report_of_swaps_costs_no_look_at_those_before():
+    class Unread(list):
+        def __iter__(self):
+            raise AssertionError("all swaps so far are looked at")
+
+    def status(first):
+        swaps = [[0.1 * i, half, i, 0.1] for i in range(first, first + 50) for half in ("policy", "residual")]
+        return Status(1.0, {"swaps": swaps}, {}, {}, {}, None, [], False, 0, None)
+
+    events = LiveEvents()
+    events.swaps = Unread()
+    for first in (1, 1, 11, 41):
+        events.take(status(first))
+    assert [event.kind for event in events.all] == ["policy", "residual"] * 90
+    assert len(events.swaps) == 180
+
+
 def test_a_terminal_that_stands_still_stops_nobody():
     blocked, stop = threading.Event(), threading.Event()
     threading.Timer(0.3, stop.set).start()

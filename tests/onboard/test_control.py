@@ -17,7 +17,19 @@ from retrim.adapt.learner import LearnerState
 from retrim.live.controllers import adaptive_source, plain_source
 from retrim.onboard.control import ControlLoop
 from retrim.onboard.guard import Mode
-from retrim.onboard.messages import COLUMNS, COMMAND, FlightRows, Parameters, Sample, pack_note, unpack_note
+from retrim.onboard.messages import (
+    COLUMNS,
+    COMMAND,
+    TRUE,
+    FlightRows,
+    Parameters,
+    Sample,
+    Setpoint,
+    Stamp,
+    pack_note,
+    unpack_note,
+)
+from retrim.onboard.shares import PHASE, SHARE
 from retrim.physics import Command, State
 from retrim.physics.disturbance import Constant
 from retrim.plants.sim import SimPlant
@@ -35,11 +47,13 @@ class Flight:
         self.acting = self.accepted = np.array([9.81, 0.0, 0.0, 0.0])
         self.issued = []
 
+    def measured(self, now):
+        return Sample(self.tick, self.tick * DT, now, 0.0, self.x, self.x, self.accepted)
+
     def step(self, ticks=1, *, late=0.0, change=lambda sample: sample):
         for _ in range(ticks):
             now = time.monotonic()
-            sample = Sample(self.tick, self.tick * DT, now - late, 0.0, self.x, self.x, self.accepted)
-            self.bus.publish("sample", change(sample).pack())
+            self.bus.publish("sample", change(self.measured(now - late)).pack())
             setpoint = self.loop.tick(now)
             self.loop.idle()
             self.issued.append(setpoint.u)
@@ -328,6 +342,85 @@ def test_a_command_that_is_not_finite_is_never_issued():
     assert flight.status["reason"] == "the policy's command is not finite"
 
 
+def test_a_target_that_is_not_finite_is_never_told_and_the_last_one_is_held(monkeypatch):
+    flight = Flight(holding())
+    flight.step(20)
+    monkeypatch.setattr(flight.loop.pilot, "target", lambda t: np.array([0.0, np.nan, 1.0]))
+    flight.x = level(x=0.4)
+    for _ in range(60):
+        flight.step()
+        said = Setpoint.unpack(flight.bus.latest("setpoint").data)
+        assert said.tick == flight.tick - 1
+        np.testing.assert_array_equal(said.target, HOME)
+    assert flight.loop.mode == Mode.HOLD
+    assert flight.status["reason"] == "the target is not finite"
+    assert np.linalg.norm(flight.x[:3] - HOME) < 0.2
+
+
+def test_without_any_target_it_holds_where_it_is(monkeypatch):
+    flight = Flight(holding(), x=level(x=0.4))
+    monkeypatch.setattr(flight.loop.pilot, "target", lambda t: np.full(3, np.inf))
+    flight.step(50)
+    np.testing.assert_array_equal(Setpoint.unpack(flight.bus.latest("setpoint").data).target, level(x=0.4)[:3])
+    np.testing.assert_allclose(flight.x[:3], level(x=0.4)[:3], atol=1e-6)
+
+
+def test_a_measurement_that_is_refused_is_answered_by_level_and_sink():
+    flight = Flight(holding(), x=level(x=0.4))
+    flight.step(20)
+    now, modes = time.monotonic(), []
+    for tick in range(20, 130):
+        flight.tick, now = tick, now + DT
+        sample = dataclasses.replace(flight.measured(now), state=np.full(15, np.nan))
+        flight.bus.publish("sample", sample.pack())
+        setpoint = flight.loop.tick(now)
+        flight.loop.idle()
+        modes.append(flight.loop.mode)
+        assert setpoint.tick == tick  # the plant takes no other
+        assert flight.loop.stamp == Stamp(tick, sample.sent)
+        if setpoint.landed:
+            break
+    assert modes[:4] == [Mode.POLICY] * 4
+    assert 95 <= modes.count(Mode.BLIND) <= 105
+    assert modes[-1] == Mode.LANDED
+    assert flight.status["refused"] == {"sample": len(modes)}
+    assert np.isfinite(FlightRows.unpack(flight.bus.latest("flight").data).rows).all()
+
+
+def test_the_last_tick_of_a_crash_is_reported():
+    flight = Flight(holding())
+    flight.step(20)
+    flight.x = level(np.array([0.0, 0.0, -1.0]))
+    flight.bus.publish("sample", flight.measured(time.monotonic()).pack())
+    flight.bus.publish("ended", pack_note("ended", reason="crashed"))
+    flight.loop.idle()  # the sample and the end came while it was busy
+    assert not flight.loop.over
+    flight.loop.tick(time.monotonic())
+    flight.loop.idle()
+    assert flight.loop.over
+    rows = FlightRows.unpack(flight.bus.latest("flight").data).rows
+    np.testing.assert_array_equal(rows[:, 0], np.arange(21))
+    assert rows[-1, TRUE][2] == -1.0
+
+
+def test_all_ticks_are_reported_before_the_command_that_ends_the_flight(monkeypatch):
+    flight, last = Flight(holding()), []
+    flight.step(20)
+    flight.loop.land("landing")
+    publish = flight.bus.publish
+
+    def noted(topic, data):
+        if topic == "setpoint" and Setpoint.unpack(data).landed:
+            last.append(FlightRows.unpack(flight.bus.latest("flight").data).rows[-1])
+        publish(topic, data)
+
+    monkeypatch.setattr(flight.bus, "publish", noted)
+    while not last:
+        flight.step()
+    assert last[0][0] == flight.tick - 1
+    assert last[0][-1] == Mode.LANDED
+
+
 def test_without_measurements_it_levels_then_lands_by_the_clock():
     flight = Flight(holding(), state_age=0.1)
     flight.step(20)
@@ -357,11 +450,12 @@ def test_the_report_has_the_last_ticks_and_what_the_plant_accepted():
     assert rows[10, COMMAND][0] == pytest.approx(flight.issued[19][0] + 0.5)
 
 
-def test_a_controller_that_is_too_slow_for_its_tick_never_takes_off(monkeypatch):
+@pytest.mark.parametrize("slow", ["act", "target"])
+def test_a_controller_that_is_too_slow_for_its_tick_never_takes_off(monkeypatch, slow):
     flight = Flight(holding())
     flight.loop.warm_up()
-    act = flight.loop.pilot.act
-    monkeypatch.setattr(flight.loop.pilot, "act", lambda *given: time.sleep(0.8 * DT) or act(*given))
+    part = getattr(flight.loop.pilot, slow)
+    monkeypatch.setattr(flight.loop.pilot, slow, lambda *given: time.sleep((SHARE - PHASE) * DT) or part(*given))
     with pytest.raises(PlantError, match=r"takes \d+ ms to decide, here and in NumPy, of a tick of 20 ms"):
         flight.loop.warm_up()
 

@@ -4,6 +4,8 @@ import os
 import signal
 import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -11,14 +13,16 @@ import pytest
 
 from live_helpers import HIGH, LOW, TOPICS
 from live_processes import DT, HOME, level, moved
-from retrim.onboard.accounts import summary
-from retrim.onboard.control_process import PATIENCE, PHASE, Schedule
+from retrim.onboard.accounts import accounted, summary
+from retrim.onboard.control_process import PATIENCE, Schedule
 from retrim.onboard.guard import G, Limits, Mode
-from retrim.onboard.messages import COLUMNS, FlightRows, Sample, Setpoint
+from retrim.onboard.messages import ACCOUNTS, COLUMNS, COMMAND, FlightRows, Sample, Setpoint, Stamp, pack_note
 from retrim.onboard.realtime import Lifeline, cores_of
-from retrim.onboard.recorder import Recorder, read_log
+from retrim.onboard.recorder import Recorder, RecorderPlan, read_log, record
+from retrim.onboard.shares import MARGIN, PHASE, ROOM, SHARE
 from retrim.onboard.watchdog import Watchdog, WatchdogPlan
 from retrim.transport.in_process import InProcessBus
+from retrim.transport.shared_memory import SharedMemoryBus
 
 LIMITS = Limits(np.full(3, -5.0), np.full(3, 5.0), LOW, HIGH)
 
@@ -37,7 +41,7 @@ def steps(sent, work=0.001, ticks=60):
         until, last = now + PATIENCE * DT, -1 if seen is None else seen.tick
         coming = [k for k in range(last + 1, last + 40) if sent(k) <= until]
         if coming:
-            seen = sample(coming[-1], sent(coming[-1]))
+            seen = Stamp(coming[-1], sent(coming[-1]))
             now = max(now, seen.sent)
         found.append((now, None if seen is None else seen.tick))
         now += work
@@ -81,6 +85,13 @@ def test_a_step_that_ends_in_the_next_tick_leaves_nothing_out():
     np.testing.assert_array_equal(short[:, 1], np.arange(60))
 
 
+def test_a_decision_that_takes_all_its_room_is_there_while_it_is_waited_for():
+    assert PHASE + ROOM + MARGIN <= SHARE + 1e-9
+    found = steps(lambda k: k * DT, work=ROOM * DT)
+    np.testing.assert_array_equal(found[:, 1], np.arange(60))
+    assert (found[:, 0] + ROOM * DT - found[:, 1] * DT <= (SHARE - MARGIN) * DT + 1e-9).all()
+
+
 class Watched:
     def __init__(self):
         self.bus = InProcessBus(TOPICS)
@@ -115,6 +126,33 @@ def test_it_commands_soon_after_control_is_gone_or_silent(gone, within):
     np.testing.assert_allclose(found.u, [G, 0.0, 0.0, 0.0], atol=1e-6)  # it holds where the vehicle should be
 
 
+def test_what_is_no_command_is_silence():
+    watched, found = Watched(), []
+    watched.bus.publish("sample", sample(0, 0.0).pack())
+    watched.says(0, 0.0)
+    watched.watchdog.check(0.0, gone=False)
+    for k in range(1, 20):
+        watched.bus.publish("sample", sample(k, k * DT).pack())
+        watched.says(k, k * DT, target=(0.0, np.nan, 1.0))
+        found.append(watched.watchdog.check(k * DT, gone=False))
+    assert all(each is not None for each in found[1:])
+    np.testing.assert_array_equal(found[-1].target, HOME)
+
+
+def test_it_answers_measurements_whose_state_is_refused():
+    watched = Watched()
+    watched.bus.publish("sample", sample(0, 0.0).pack())
+    found = [watched.watchdog.check(0.0, gone=True)]
+    for k in range(1, 20):
+        watched.bus.publish("sample", sample(k, k * DT, np.full(15, np.nan)).pack())
+        found.append(watched.watchdog.check(k * DT, gone=True))
+    assert [each.tick for each in found] == [*range(20)]  # the plant takes no other
+    assert found[-1].u[0] < found[0].u[0]  # it sinks
+    told = FlightRows.unpack(watched.bus.latest("fallback.flight").data).rows
+    np.testing.assert_array_equal(told[:, 0], [0])
+    np.testing.assert_array_equal(told[0, COMMAND], found[0].u)
+
+
 def test_it_commands_if_control_never_spoke():
     watched, found = Watched(), []
     for k in range(20):
@@ -138,9 +176,9 @@ def test_it_lands_the_vehicle_and_is_done():
     assert 0.0 < x[2] < 0.15
 
 
-def rows(first, n, mode=Mode.POLICY):
+def rows(first, n, mode=Mode.POLICY, step=1e-3):
     made = np.zeros((n, len(COLUMNS)))
-    made[:, 0] = np.arange(first, first + n)
+    made[:, 0], made[:, ACCOUNTS["step"]] = np.arange(first, first + n), step
     made[:, -1] = mode
     return FlightRows(made).pack()
 
@@ -183,16 +221,51 @@ def test_what_control_says_after_the_watchdog_has_spoken_is_written_too(tmp_path
     bus, path = InProcessBus(TOPICS), tmp_path / "flight.csv"
     recorder = Recorder(path, bus)
     bus.publish("flight", rows(0, 2))
-    bus.publish(
-        "fallback.flight", rows(4, 3, Mode.WATCHDOG)
-    )  # control was late, and the watchdog had not seen two ticks
+    # control was late, and the watchdog had not seen two ticks
+    bus.publish("fallback.flight", rows(4, 3, Mode.WATCHDOG, 0.0))
     assert recorder.step() == 5
     bus.publish("flight", rows(0, 5))
-    assert recorder.step() == 2
+    assert recorder.step() == 3
     assert Recorder(path, bus).step() == 0
     found = read_log(path)
     np.testing.assert_array_equal(found[:, 0], np.arange(7))
     np.testing.assert_array_equal(found[:, -1], [Mode.POLICY] * 4 + [Mode.WATCHDOG] * 3)
+
+
+@pytest.mark.parametrize("first", ["flight", "fallback.flight"])
+def test_the_account_of_a_hang_is_in_the_log_beside_who_flew(tmp_path, first):
+    bus, path = InProcessBus(TOPICS), tmp_path / "flight.csv"
+    own, seen = (FlightRows.unpack(rows(0, n, step=step)).rows for n, step in ((4, 1e-3), (6, 0.0)))
+    own[3, [ACCOUNTS["step"], ACCOUNTS["policy_age"]]] = 0.06, 2.0  # control hung in its fourth tick
+    seen[3:, -1] = Mode.WATCHDOG
+    told = {"flight": own, "fallback.flight": seen}
+    for topic in sorted(told, key=lambda topic: topic != first):
+        bus.publish(topic, FlightRows(told[topic]).pack())
+        assert Recorder(path, bus).step()
+    assert Recorder(path, bus).step() == 0
+    found = read_log(path)
+    np.testing.assert_array_equal(found[:, 0], np.arange(6))
+    np.testing.assert_array_equal(found[:, -1], [Mode.POLICY] * 3 + [Mode.WATCHDOG] * 3)
+    np.testing.assert_allclose(found[:, ACCOUNTS["step"]], [1e-3, 1e-3, 1e-3, 0.06, 0.0, 0.0])
+    assert found[3, ACCOUNTS["policy_age"]] == 2.0
+    np.testing.assert_array_equal(accounted(found), [True] * 4 + [False] * 2)
+
+
+def test_what_is_reported_just_after_the_end_is_written(tmp_path):
+    bus = SharedMemoryBus.create(TOPICS | {"ready.recorder": 4096})
+    try:
+        bus.publish("ended", pack_note("ended", reason="crashed"))
+        plan = RecorderPlan(bus.folder, tmp_path / "flight.csv", 0.1, os.getpid())
+        thread = threading.Thread(target=record, args=(plan,))
+        thread.start()
+        while bus.latest("ready.recorder") is None:
+            time.sleep(1e-3)
+        time.sleep(plan.dt)
+        bus.publish("flight", rows(0, 3))
+        thread.join(20.0)
+    finally:
+        bus.remove()
+    np.testing.assert_array_equal(read_log(tmp_path / "flight.csv")[:, 0], np.arange(3))
 
 
 def test_a_full_disk_ends_the_log_and_nothing_else(tmp_path):

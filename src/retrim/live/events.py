@@ -15,6 +15,7 @@ class LiveEvents:
         self.all: list[Event] = []
         self.swaps: list[tuple[float, str, int, float]] = []
         """Time [s], half, version, and how old the flight was that it was learnt from [s]."""
+        self._newest: dict[str, int] = {}
         self._mode, self._watchdog, self._log_failed = "policy", False, False
         self._watchdog_ticks = 0
         self._restarts: dict[str, int] = {}
@@ -27,7 +28,8 @@ class LiveEvents:
         t, control = status.t, status.control
         new = list(others)
         for at, half, version, age in control.get("swaps", []):
-            if version > max((v for _, h, v, _ in self.swaps if h == half), default=0):
+            if version > self._newest.get(half, 0):
+                self._newest[half] = version
                 self.swaps.append((at, half, version, age))
                 new.append(Event(at, half, f"version {version}, learnt from flight until {age:.2f} s before"))
         for version in control.get("given_up", []):

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import ConfigError, MessageError
-from ..onboard.messages import Sample, last_note, pack_note
+from ..onboard.messages import Sample, last_note, last_sent, pack_note
 from ..onboard.realtime import Lifeline
 from ..transport.bus import Bus
 from ..transport.remote import LOOPBACK
@@ -130,7 +130,7 @@ class _Page:
             self._followed = followed
             self._scene.follow(self._paths[followed])
         if text and status:
-            if self._bus.latest("fallback") is not None:
+            if last_sent(self._bus, "fallback") > last_sent(self._bus, "setpoint"):
                 status["mode"], status["reason"] = "watchdog", "the process that flew is gone or hangs"
             self._panel.show(
                 _text(status, last_note(self._bus, "ended"), self._learners(), last_note(self._bus, "world"))

@@ -17,6 +17,7 @@ from ..experiments.flying import FLOOR
 from ..onboard.messages import Sample, Setpoint, pack_note
 from ..onboard.orders import wait_for_take_off
 from ..onboard.realtime import Lifeline, be_punctual, sleep_until
+from ..onboard.shares import SHARE
 from ..physics.state import Command
 from ..plants.plant import Measurement, as_numpy
 from ..transport.bus import Bus
@@ -24,8 +25,9 @@ from ..transport.shared_memory import SharedMemoryBus
 from .knobs import KnobbedPlant, Knobs
 from .states import state_of, vector_of
 
-SHARE = 0.6  # of a tick, for which a command is waited for; the rest is for the simulation
 ALONE = 5.0  # [s] without a command, after which a plant without a supervisor ends
+CRASHED = "crashed"
+"""Why a flight ended that nobody landed."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +94,7 @@ def _flown(
         )
         bus.publish("sample", sample.pack())
         if not np.isfinite(sample.truth).all() or sample.truth[2] < FLOOR:
-            return "crashed"
+            return CRASHED
         setpoint = answer(bus, tick, epoch + (tick + SHARE) * plan.dt)
         unanswered = 0 if setpoint is not None else unanswered + 1
         if setpoint is None:

@@ -13,7 +13,7 @@ from ..experiments.flights import Flight
 from ..experiments.flying import scored, until_terminated
 from ..experiments.recovery import change_times, recoveries
 from ..io.trained import load_learnt
-from ..onboard.accounts import EDGES_MS, summary
+from ..onboard.accounts import EDGES_MS, accounted, summary
 from ..onboard.guard import HOVER, Mode
 from ..onboard.messages import ACCOUNTS, COMMAND, MEASURED, TRUE
 from ..onboard.recorder import read_log
@@ -22,6 +22,7 @@ from ..runtime.events import Event
 from ..runtime.flight import Log, States
 from ..transport.bus import Bus
 from .events import LiveEvents
+from .plant_process import CRASHED
 from .published import flown_update
 from .session import LiveRequest
 from .status import Status
@@ -78,9 +79,11 @@ def results(
     scenario, log = request.scenario, flight.log
     end = float(log.t[-1])
     changes = change_times(scenario.disturbance, request.setup.flown.home(), end)
-    back = recoveries(log.t, flight.error, changes, 0.05, terminated=log.terminated)
+    # The state of a crash may be none that is written down.
+    crashed = log.terminated or (status.ended == CRASHED and status.control.get("reason") != "landing")
+    back = recoveries(log.t, flight.error, changes, 0.05, terminated=crashed)
     flown = rows[rows[:, 1] <= end]
-    by = {name: summary(flown[flown[:, -1] != Mode.WATCHDOG, column]) for name, column in ACCOUNTS.items()}
+    by = {name: summary(flown[accounted(flown), column]) for name, column in ACCOUNTS.items()}
     policies = [swap for swap in events.swaps if swap[1] == "policy" and swap[0] <= end]
     given_up = status.control.get("given_up", [])
     values = {
@@ -88,7 +91,7 @@ def results(
         **{f"{name}_{q}_ms": by[name][q] for name in ("lateness", "step", "idle") for q in ("p50", "p99", "max")},
         "state_age_p99_ms": by["state_age"]["p99"],
         "policy_age_p50_s": None if by["policy_age"]["p50"] is None else 1e-3 * by["policy_age"]["p50"],
-        "steady": None if log.terminated else flight.steady,
+        "steady": None if crashed else flight.steady,
         "recovery_5cm": float(np.mean(back)),
         "policies": len(policies),
         "flight_to_swap_s": float(np.median([swap[3] for swap in policies])) if policies else None,
@@ -101,13 +104,13 @@ def results(
         "fallback_ticks": int(np.sum(flown[:, -1] != Mode.POLICY)),
     }
     about = {"scenario": scenario.disturbance, "method": request.method, "plant": scenario.plant, "n": 1,
-             "crashes": int(log.terminated)}  # fmt: skip
+             "crashes": int(crashed)}  # fmt: skip
     return [{**about, "metric": metric, "value": _finite(value)} for metric, value in values.items()]
 
 
 def histograms(rows: np.ndarray) -> dict[str, Any]:
     """Return how late steps began and how long they took, as histograms [ms]."""
-    flown = rows[rows[:, -1] != Mode.WATCHDOG]
+    flown = rows[accounted(rows)]
     return {"edges_ms": list(EDGES_MS)} | {
         name: summary(flown[:, ACCOUNTS[name]])["histogram"] for name in ("lateness", "step", "idle")
     }

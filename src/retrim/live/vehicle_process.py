@@ -9,15 +9,16 @@ from types import FrameType
 import numpy as np
 
 from ..errors import PlantError
-from ..onboard.guard import HOVER
+from ..onboard.guard import HOVER, Limits
 from ..onboard.messages import Sample, last_note, pack_note
 from ..onboard.realtime import Lifeline, be_punctual
+from ..onboard.shares import SHARE
 from ..plants.bridges.frames import heading_of
 from ..plants.bridges.vehicle_plant import VehiclePlant
 from ..plants.bridges.vehicle_state import VehicleState
 from ..transport.bus import Bus
 from ..transport.shared_memory import SharedMemoryBus
-from .plant_process import ALONE, SHARE, PlantPlan, answer
+from .plant_process import ALONE, PlantPlan, answer
 
 HOLD_S = 0.05  # [s] for which the autopilot holds before the order to begin is looked for again
 
@@ -84,7 +85,9 @@ def _carried(plan: PlantPlan, plant: VehiclePlant, bus: Bus, parent: Lifeline, e
 
 def _sample(tick: int, dt: float, now: VehicleState, accepted: np.ndarray) -> Sample:
     state, truth = (np.concatenate([x.p, x.R.ravel(), x.v]) for x in (now, now.truth or now))
-    return Sample(tick, tick * dt, time.monotonic(), now.age, state, truth, accepted)
+    # Of news that the guard refuses the age is told, so that it does; until then what a controller has to make up for.
+    age = now.age if now.news <= Limits.state_age else now.news
+    return Sample(tick, tick * dt, time.monotonic(), age, state, truth, accepted)
 
 
 def _ended(number: int, frame: FrameType | None) -> None:

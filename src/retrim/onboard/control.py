@@ -1,5 +1,6 @@
 """What the process that flies does each tick, and what is not urgent in the time that is left."""
 
+import contextlib
 import time
 from collections import deque
 from typing import Any
@@ -10,13 +11,13 @@ from ..errors import MessageError, PlantError
 from ..transport.bus import Bus
 from .guard import UP, Fallback, G, GeometricHover, Mode
 from .intake import Intake
-from .messages import ACCOUNTS, COMMAND, FlightRows, Sample, Setpoint, pack_note, unpack_note
+from .messages import ACCOUNTS, COMMAND, FlightRows, Sample, Setpoint, Stamp, pack_note, unpack_note
 from .pilot import LivePilot
 from .plan import ControlPlan
+from .shares import ROOM
 
 REPORT_EVERY = 5  # ticks
 LANDING = "landing"
-ROOM = 0.7  # share of a tick that a decision may take
 FELT = 0.1  # share of a tick in the mean of what is felt
 
 
@@ -31,6 +32,10 @@ class ControlLoop:
         self.rows: deque[np.ndarray] = deque(maxlen=plan.window)
         self.sample: Sample | None = None
         """The newest measurement."""
+        self.stamp: Stamp | None = None
+        """Of the newest measurement, even if its state was refused: the plant waits for an answer all the same."""
+        self.over = False
+        """The flight has ended, and all its ticks are reported."""
         self.error = 0.0
         self.missed, self.late_samples = 0, 0
         self.felt, self.estimate = np.zeros(3), np.zeros(3)
@@ -57,25 +62,25 @@ class ControlLoop:
         x, took = np.concatenate([np.zeros(3), np.eye(3).ravel(), np.zeros(3)]), list[float]()
         self.pilot.reset(x)
         for i in range(20):
-            began = time.monotonic()
-            u = self.pilot.act(self.plan.dt * i, 0.0, x)
+            t, began = self.plan.dt * i, time.monotonic()
+            u = self.pilot.act(t, 0.0, x)
+            Setpoint(i, began, u, self.pilot.target(t)).pack()
             took.append(time.monotonic() - began)
             self.pilot.accepted(u)
             self.pilot.predicted(x, u)
-            self.pilot.target(0.0)
             self._fallback.hover.command(x, x[:3])
         self._fallback.rest()
         if (usual := float(np.median(took))) > ROOM * self.plan.dt:
             raise PlantError(
                 f"this controller takes {1e3 * usual:.0f} ms to decide, here and in NumPy, of a tick of "
-                f"{1e3 * self.plan.dt:.0f} ms"
+                f"{1e3 * self.plan.dt:.0f} ms, and {1e3 * ROOM * self.plan.dt:.1f} ms is the most"
             )
 
     def tick(self, now: float, lateness: float = 0.0) -> Setpoint | None:
         """Take the newest sample, decide, and return what was published; None before the first sample."""
         began, new = time.monotonic(), self._receive()
-        sample = self.sample
-        if sample is None:
+        sample, stamp = self.sample, self.stamp
+        if sample is None or stamp is None:
             return None
         t, age = sample.t - self._start, sample.age + now - sample.sent
         fresh = age <= self.plan.limits.state_age
@@ -83,12 +88,17 @@ class ControlLoop:
         if u is None:
             u, self.mode = self._fallback.step(sample.state, fresh, self._target, land=bool(self._landing))
             self._issued = u if self.mode == Mode.LANDED else self.plan.limits.within(u)
-        setpoint = Setpoint(sample.tick, time.monotonic(), self._issued, self._target, self.mode == Mode.LANDED)
-        self.bus.publish("setpoint", setpoint.pack())
+        setpoint = Setpoint(stamp.tick, time.monotonic(), self._issued, self._target, self.mode == Mode.LANDED)
+        if not setpoint.landed:
+            self.bus.publish("setpoint", setpoint.pack())
         if new:
             accounts = [lateness, time.monotonic() - began, 0.0, age, t - self.intake.learnt, self.mode]
             head = [sample.tick, t, sample.age]
             self._row = np.concatenate([head, sample.state, sample.truth, self._issued, accounts])
+        if setpoint.landed:  # the plant ends the flight at this command, and the recorder the log: the ticks go first
+            self._finish_row(None)
+            self._publish_rows()
+            self.bus.publish("setpoint", setpoint.pack())
         return setpoint
 
     def idle(self) -> None:
@@ -105,11 +115,12 @@ class ControlLoop:
         if self.mode == Mode.POLICY:
             self.intake.poll(t)
         self._ticks += 1
-        if self.mode == Mode.LANDED:
+        ended = self.bus.latest("ended") is not None and not self.new_sample()
+        self.over = self.mode == Mode.LANDED or ended
+        if self.over:  # no measurement will come that says what the plant took
             self._finish_row(None)
-        if self.rows:  # each tick, so that the log has the last one, whenever this process dies
-            self.bus.publish("flight", FlightRows(np.stack(self.rows)).pack())
-        if self._ticks % REPORT_EVERY == 1 or self.mode == Mode.LANDED:
+        self._publish_rows()  # each tick, so that the log has the last one, whenever this process dies
+        if self._ticks % REPORT_EVERY == 1 or self.over:
             self.report()
         if self._row is not None:
             self._row[ACCOUNTS["idle"]] += time.monotonic() - began
@@ -140,17 +151,23 @@ class ControlLoop:
         if not wrong and not new and len(self._issued):
             return self._issued
         if not wrong:
-            u = self.pilot.act(t, sample.age, sample.state)
-            self._target = self.pilot.target(t)
-            if np.isfinite(u).all():
+            u, aimed = self.pilot.act(t, sample.age, sample.state), self._aim(t)
+            if aimed and np.isfinite(u).all():
                 self._issued = self.plan.limits.within(u)
                 if (self._issued != u).any():
                     self.pilot.accepted(self._issued)
                 self.error = float(np.linalg.norm(sample.state[:3] - self._target))
                 return self._issued
-            wrong = "the policy's command is not finite"
+            wrong = "the policy's command is not finite" if aimed else "the target is not finite"
         self.mode, self.reason = Mode.HOLD, wrong
         return None
+
+    def _aim(self, t: float) -> bool:
+        """Take note of where the vehicle should be, and return whether that is a place; if not, the last one stays."""
+        target = self.pilot.target(t)
+        if finite := bool(np.isfinite(target).all()):
+            self._target = target
+        return finite
 
     def _receive(self) -> bool:
         message = self.bus.latest("sample", self._known["sample"])
@@ -161,18 +178,21 @@ class ControlLoop:
             sample = Sample.unpack(message.data)
         except MessageError:
             self.intake.refuse("sample")
+            with contextlib.suppress(MessageError):
+                self.stamp = Stamp.unpack(message.data)
             return False
         before = self.sample
         if before is None:
             self._start = sample.t
             self.pilot.reset(sample.state)
-            self._target = self.pilot.target(0.0)
+            self._target = sample.state[:3]
+            self._aim(0.0)
         elif sample.tick <= before.tick:
             self.intake.refuse("stale sample")
             return False
         else:
             self._follow(before, sample)
-        self.sample = sample
+        self.sample, self.stamp = sample, Stamp(sample.tick, sample.sent)
         return True
 
     def _follow(self, before: Sample, sample: Sample) -> None:
@@ -211,6 +231,10 @@ class ControlLoop:
             self._row[COMMAND] = accepted
         self.rows.append(self._row)
         self._row = None
+
+    def _publish_rows(self) -> None:
+        if self.rows:
+            self.bus.publish("flight", FlightRows(np.stack(self.rows)).pack())
 
     def _new(self, topic: str) -> dict[str, Any] | None:
         message = self.bus.latest(topic, self._known[topic])

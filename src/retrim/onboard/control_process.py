@@ -5,13 +5,12 @@ import time
 
 from ..transport.shared_memory import SharedMemoryBus
 from .control import ControlLoop
-from .guard import Mode
-from .messages import Sample, pack_note
+from .messages import Stamp, pack_note
 from .orders import wait_for_take_off
 from .plan import ControlPlan
 from .realtime import Lifeline, be_punctual, sleep_until
+from .shares import PHASE
 
-PHASE = 0.1  # of a tick, after that of the plant
 PATIENCE = 0.25  # of a tick, for which a late sample is waited for
 LATE = 0.5  # of a tick, after which a step is left out
 
@@ -27,7 +26,7 @@ class Schedule:
         """Return when the next step is due [s]."""
         return self._epoch + (self._tick + PHASE) * self._dt
 
-    def done(self, now: float, sample: Sample | None) -> None:
+    def done(self, now: float, sample: Stamp | None) -> None:
         """Take note of the sample that the step answered, and of how late it is."""
         answered = self._tick
         if sample is not None:
@@ -52,7 +51,7 @@ def fly(plan: ControlPlan) -> None:
     if epoch is None:
         return
     schedule = Schedule(epoch, plan.dt)
-    while loop.mode != Mode.LANDED:
+    while not loop.over:
         scheduled = schedule.next()
         sleep_until(scheduled)
         woke = time.monotonic()
@@ -63,5 +62,5 @@ def fly(plan: ControlPlan) -> None:
         if parent.gone():
             loop.land("the supervisor is gone")
         loop.idle()
-        schedule.done(time.monotonic(), loop.sample)
+        schedule.done(time.monotonic(), loop.stamp)
     time.sleep(2 * plan.dt)  # the last command is taken

@@ -19,6 +19,28 @@ class StaleError(MessageError):
 
 
 @dataclass(frozen=True)
+class Stamp:
+    """What an answer to a sample needs to know of it, whether or not its state is finite."""
+
+    tick: int
+    """Ticks since the start of the flight."""
+    sent: float
+    """When it was sent, by the monotonic clock of the machine [s]."""
+
+    @classmethod
+    def unpack(cls, data: bytes) -> "Stamp":
+        """Read the stamp of a sample, whose other numbers may be anything.
+
+        Raises:
+            MessageError: The bytes are no sample, or the stamp is not finite.
+        """
+        row = _numbers(data)
+        if not np.isfinite(row[[0, 2]]).all():
+            raise MessageError("sample: its stamp is not finite")
+        return cls(int(row[0]), float(row[2]))
+
+
+@dataclass(frozen=True)
 class Sample:
     """What the plant measured at the end of a tick."""
 
@@ -40,7 +62,8 @@ class Sample:
     def pack(self) -> bytes:
         """Return the bytes; the inverse of :meth:`unpack`."""
         row = np.concatenate([[self.tick, self.t, self.sent, self.age], self.state, self.truth, self.accepted])
-        return pack_arrays({"row": row}, kind="sample", about={})
+        # as bits, so that the checksum proves the stamp of a sample whose state is not finite, too
+        return pack_arrays({"row": row.view(np.int64)}, kind="sample", about={})
 
     @classmethod
     def unpack(cls, data: bytes) -> "Sample":
@@ -49,9 +72,17 @@ class Sample:
         Raises:
             MessageError: The bytes are not one, or a number is not finite.
         """
-        row = unpack_arrays(data, {"row": np.empty(8 + 2 * STATE)}, kind="sample", source="sample")["row"]
+        row = _numbers(data)
+        if wrong := np.sum(~np.isfinite(row)):
+            raise MessageError(f"sample: {wrong} numbers are not finite")
         state, truth, accepted = np.split(row[4:], [STATE, 2 * STATE])
         return cls(int(row[0]), float(row[1]), float(row[2]), float(row[3]), state, truth, accepted)
+
+
+def _numbers(data: bytes) -> np.ndarray:
+    """Return the numbers of a whole sample, which may not be finite."""
+    expected = {"row": np.empty(8 + 2 * STATE, dtype=np.int64)}
+    return unpack_arrays(data, expected, kind="sample", source="sample")["row"].view(float)
 
 
 @dataclass(frozen=True)
@@ -212,3 +243,17 @@ def last_note(bus: Bus, topic: str, kind: str | None = None) -> dict[str, Any]:
         return {} if message is None else unpack_note(message.data, kind or topic)
     except MessageError:
         return {}
+
+
+def last_sent(bus: Bus, topic: str) -> float:
+    """Return when the newest command of a topic was sent, monotonic clock [s]; minus infinity if there is none.
+
+    Args:
+        bus: Where it was published.
+        topic: ``setpoint`` or ``fallback``.
+    """
+    message = bus.latest(topic)
+    try:
+        return float("-inf") if message is None else Setpoint.unpack(message.data).sent
+    except MessageError:
+        return float("-inf")

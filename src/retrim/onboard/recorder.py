@@ -1,7 +1,7 @@
 """The process that writes the flight down as it goes. What it has written is readable whatever happens to it.
 
 Two processes report ticks: the one that flies, and the watchdog when it takes over. What one of them says late is
-written late; :func:`read_log` puts it in order.
+written late, and a tick that both of them have flown is written twice; :func:`read_log` puts it in order.
 """
 
 import time
@@ -13,10 +13,13 @@ import numpy as np
 from ..errors import MessageError
 from ..transport.bus import Bus
 from ..transport.shared_memory import SharedMemoryBus
-from .messages import COLUMNS, FlightRows, last_note, pack_note
+from .accounts import accounted
+from .guard import Mode
+from .messages import ACCOUNTS, COLUMNS, FlightRows, last_note, pack_note
 from .realtime import Lifeline
 
 SILENCE = 2.0  # [s] without a tick, after which a flight without a supervisor is over
+LINGER = 5  # ticks after the end of a flight, in which those who flew may still report their last ones
 
 
 @dataclass(frozen=True)
@@ -39,9 +42,9 @@ class Recorder:
         self._path, self._bus = path, bus
         self._versions = {"flight": 0, "fallback.flight": 0}
         self.failed: str | None = None
-        self._written: set[int] = set()
+        self._written: set[tuple[int, bool, bool]] = set()
         try:
-            self._written = _mended(path)
+            self._note(_mended(path))
         except OSError as error:
             self.failed = str(error)
 
@@ -58,7 +61,7 @@ class Recorder:
             rows = FlightRows.unpack(message.data).rows
         except MessageError:
             return 0
-        return self._append(rows[[int(tick) not in self._written for tick in rows[:, 0]]])
+        return self._append(rows[[each not in self._written for each in _authors(rows)]])
 
     def _append(self, new: np.ndarray) -> int:
         try:
@@ -68,33 +71,56 @@ class Recorder:
             self.failed = str(error)
             self._bus.publish("ready.recorder", pack_note("ready", failed=self.failed))
             return 0
-        self._written.update(int(tick) for tick in new[:, 0])
+        self._note(new)
         return len(new)
+
+    def _note(self, rows: np.ndarray) -> None:
+        """Take note of what is written; after any row of a tick nobody needs what the watchdog has only seen of it."""
+        for tick, has, flew in _authors(rows):
+            self._written |= {(tick, has, flew), (tick, False, False)}
 
 
 def read_log(path: Path) -> np.ndarray:
     """Return the ticks of a log in their order, in the columns of :data:`retrim.onboard.messages.COLUMNS`.
 
-    A torn last line is left out.
+    A tick that the watchdog flew has its row, with the accounts of the process that was late if there are any. A torn
+    last line is left out.
 
     Raises:
         OSError: There is no such file.
     """
+    rows = _lines(path)
+    has, flew = accounted(rows), rows[:, -1] == Mode.WATCHDOG
+    order = np.lexsort((~has, ~flew, rows[:, 0]))
+    ticks, first = np.unique(rows[order, 0], return_index=True)
+    found: np.ndarray = rows[order[first]]
+    for column in ACCOUNTS.values():
+        found[np.searchsorted(ticks, rows[has, 0]), column] = rows[has, column]
+    return found
+
+
+def _lines(path: Path) -> np.ndarray:
+    """Return the whole lines of a log as they were written."""
     lines = path.read_text().splitlines(keepends=True)[1:]
     whole = [line.split(",") for line in lines if line.endswith("\n") and line.count(",") == len(COLUMNS) - 1]
-    rows = np.array(whole, dtype=float).reshape(-1, len(COLUMNS))
-    return rows[np.argsort(rows[:, 0], kind="stable")]
+    return np.array(whole, dtype=float).reshape(-1, len(COLUMNS))
 
 
-def _mended(path: Path) -> set[int]:
-    """Write the header, or take away a torn last line; return the ticks that are written."""
+def _authors(rows: np.ndarray) -> list[tuple[int, bool, bool]]:
+    """Return of each row its tick, whether the process that flies reported it, and whether the watchdog flew it."""
+    flew = rows[:, -1] == Mode.WATCHDOG
+    return list(zip(rows[:, 0].astype(int).tolist(), accounted(rows).tolist(), flew.tolist(), strict=True))
+
+
+def _mended(path: Path) -> np.ndarray:
+    """Write the header, or take away a torn last line; return the rows that are written."""
     if not path.exists() or path.stat().st_size == 0:
         path.write_text(",".join(COLUMNS) + "\n")
-        return set()
+        return _lines(path)
     with path.open("r+b") as file:
         data = file.read()
         file.truncate(data.rfind(b"\n") + 1)
-    return {int(tick) for tick in read_log(path)[:, 0]}
+    return _lines(path)
 
 
 def record(plan: RecorderPlan) -> None:
@@ -102,15 +128,16 @@ def record(plan: RecorderPlan) -> None:
     bus = SharedMemoryBus(plan.folder)
     recorder = Recorder(plan.path, bus)
     bus.publish("ready.recorder", pack_note("ready", failed=recorder.failed))
-    parent, heard = Lifeline(plan.parent), time.monotonic()
-    while not (_landed(bus) or bus.latest("ended") or (parent.gone() and time.monotonic() > heard + SILENCE)):
+    parent, heard, left = Lifeline(plan.parent), time.monotonic(), LINGER
+    while left and not (parent.gone() and time.monotonic() > heard + SILENCE):
         if recorder.step() or (bus.latest("sample") is None and not parent.gone()):
             heard = time.monotonic()
+        left -= _over(bus)
         time.sleep(plan.dt)
     recorder.step()
     if parent.gone():
         bus.remove()
 
 
-def _landed(bus: Bus) -> bool:
-    return last_note(bus, "status").get("mode") == "landed"
+def _over(bus: Bus) -> bool:
+    return last_note(bus, "status").get("mode") == "landed" or bus.latest("ended") is not None

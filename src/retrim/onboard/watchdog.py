@@ -11,7 +11,7 @@ from ..errors import MessageError
 from ..transport.bus import Bus
 from ..transport.shared_memory import SharedMemoryBus
 from .guard import Fallback, GeometricHover, Limits, Mode
-from .messages import COMMAND, FlightRows, Sample, Setpoint, pack_note
+from .messages import COMMAND, FlightRows, Sample, Setpoint, Stamp, pack_note
 from .realtime import Lifeline, be_punctual
 
 PATIENCE = 1.6  # ticks without a command
@@ -46,6 +46,7 @@ class Watchdog:
         self.done = False
         self._version = 0
         self._sample: Sample | None = None
+        self._stamp: Stamp | None = None
         self._seen = 0
         self._next = 0.0
         self._target = plan.home
@@ -60,35 +61,39 @@ class Watchdog:
             gone: The process that flies has ended.
         """
         if (message := self.bus.latest("setpoint", self._version)) is not None:
-            self._version, self.heard = message.version, now
-            self._fallback.rest()
-            self._hear(message.data)
+            self._version = message.version
+            self._hear(message.data, now)
         new = self._look()
         if self.heard is None and self._sample is not None:
             self.heard = now  # from the first measurement on, somebody has to answer
         silent = self.heard is not None and (gone or now - self.heard > PATIENCE * self.plan.dt)
-        if not silent or self.done or self._sample is None or not (new or now >= self._next):
+        if not silent or self.done or not (new or now >= self._next):
+            return None
+        if self._sample is None or self._stamp is None:
             return None
         self._next = now + 1.5 * self.plan.dt  # at the latest, should no sample come
         fresh = self._sample.age + now - self._sample.sent <= self.plan.limits.state_age
         u, mode = self._fallback.step(self._sample.state, fresh, self._target, land=False)
         self.done = mode == Mode.LANDED
-        setpoint = Setpoint(self._sample.tick, now, u, self._target, self.done)
+        setpoint = Setpoint(self._stamp.tick, now, u, self._target, self.done)
         self.bus.publish("fallback", setpoint.pack())
-        self._rows[-1][COMMAND], self._rows[-1][-1] = u, Mode.WATCHDOG
+        if self._sample.tick == self._stamp.tick:  # a tick whose state was refused has no row
+            self._rows[-1][COMMAND], self._rows[-1][-1] = u, Mode.WATCHDOG
         self.bus.publish("fallback.flight", FlightRows(np.stack(self._rows)).pack())
         return setpoint
 
-    def _hear(self, data: bytes) -> None:
-        """Take note of where the vehicle should be, and whether it has landed."""
+    def _hear(self, data: bytes, now: float) -> None:
+        """Take note that somebody flies, where the vehicle should be, and whether it has landed."""
         try:
             said = Setpoint.unpack(data)
         except MessageError:
             return
+        self.heard = now  # what nobody can fly by is silence
+        self._fallback.rest()
         self._target, self.done = said.target, self.done or said.landed
 
     def _look(self) -> bool:
-        """Take a new sample, if there is one."""
+        """Take a new sample, if there is one; return whether there is one to answer."""
         message = self.bus.latest("sample", self._seen)
         if message is None:
             return False
@@ -96,7 +101,7 @@ class Watchdog:
         try:
             sample = Sample.unpack(message.data)
         except MessageError:
-            return False
+            return self._look_at_stamp(message.data)
         if self._sample is not None and sample.tick == self._sample.tick + 1:
             self._fallback.hover.feel(self._sample.state, sample.state, sample.accepted)
             self._rows[-1][COMMAND] = sample.accepted
@@ -105,7 +110,15 @@ class Watchdog:
         accounts = [0.0, 0.0, 0.0, sample.age, 0.0, Mode.POLICY]
         head = [sample.tick, sample.t - self._start, sample.age]
         self._rows.append(np.concatenate([head, sample.state, sample.truth, sample.accepted, accounts]))
-        self._sample = sample
+        self._sample, self._stamp = sample, Stamp(sample.tick, sample.sent)
+        return True
+
+    def _look_at_stamp(self, data: bytes) -> bool:
+        """Take what can be taken of a sample whose state is refused."""
+        try:
+            self._stamp = Stamp.unpack(data)
+        except MessageError:
+            return False
         return True
 
 

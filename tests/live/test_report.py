@@ -1,0 +1,69 @@
+"""What a live flight leaves says of it what happened, and nothing of ticks that nobody accounted for."""
+
+import jax
+import numpy as np
+import pytest
+from jax import random
+
+from helpers import tiny_preset
+from live_processes import DT, level
+from retrim.config.scenario import Scenario
+from retrim.config.setup import Setup
+from retrim.live.events import LiveEvents
+from retrim.live.plant_process import CRASHED
+from retrim.live.report import flight_of, histograms, results
+from retrim.live.session import LiveRequest
+from retrim.live.status import Status
+from retrim.onboard.guard import HOVER, Mode
+from retrim.onboard.messages import ACCOUNTS, COLUMNS, COMMAND, MEASURED, TRUE
+
+pytestmark = pytest.mark.usefixtures("optax_promotion")
+
+
+@pytest.fixture
+def asked(tmp_path):
+    with jax.numpy_dtype_promotion("standard"):
+        setup = Setup.of(tiny_preset())
+        return LiveRequest(setup, setup.new_policy(random.key(0)), Scenario(), "full", 10.0, 0, 3.0, tmp_path)
+
+
+def flown(asked, ticks=30):
+    """Rows of a vehicle that hovers where it should, each step a millisecond long."""
+    rows = np.zeros((ticks, len(COLUMNS)))
+    rows[:, 0] = np.arange(ticks)
+    rows[:, 1] = DT * rows[:, 0]
+    rows[:, MEASURED] = rows[:, TRUE] = level(np.asarray(asked.setup.flown.home()))
+    rows[:, COMMAND], rows[:, ACCOUNTS["step"]] = HOVER, 1e-3
+    return rows
+
+
+def reported(asked, rows, ended, **control):
+    lines = [",".join(COLUMNS), *(",".join(map(repr, row)) for row in rows.tolist())]
+    (asked.folder / "flight.csv").write_text("\n".join(lines) + "\n")
+    status, events = Status(1.0, control, {}, {}, {}, ended, [], False, 0, None), LiveEvents()
+    flight, found = flight_of(asked, (), status, None)
+    return {row["metric"]: row for row in results(asked, flight, found, status, events)}
+
+
+def test_a_crash_is_counted_with_its_last_row_and_without(asked):
+    rows = flown(asked)
+    assert reported(asked, rows, "landed")["steady"]["crashes"] == 0
+    without = reported(asked, rows, CRASHED)
+    assert without["steady"]["crashes"] == 1
+    assert without["steady"]["value"] is None
+    assert without["recovery_5cm"]["value"] is None
+    assert reported(asked, rows, CRASHED, reason="landing")["steady"]["crashes"] == 0
+    rows[-1, TRUE] = rows[-1, MEASURED] = level((0.0, 0.0, -1.0))
+    assert reported(asked, rows, CRASHED)["steady"]["crashes"] == 1
+
+
+def test_a_hang_is_in_the_statistics_and_what_nobody_timed_is_not(asked):
+    rows = flown(asked)
+    rows[20, ACCOUNTS["step"]] = 0.06
+    rows[20:23, -1] = Mode.WATCHDOG
+    rows[21:24, ACCOUNTS["step"]] = 0.0  # the watchdog's own, which it flew or has seen
+    found = reported(asked, rows, "landed")
+    assert found["step_max_ms"]["value"] == pytest.approx(60.0)
+    assert found["step_p50_ms"]["value"] == pytest.approx(1.0)
+    assert found["fallback_ticks"]["value"] == 3
+    assert [ticks for ticks in histograms(rows)["step"] if ticks] == [26, 1]
