@@ -36,8 +36,8 @@ def test_while_training_keeps_what_was_trained(folder):
 
 
 def test_while_compiling_leaves_nothing(folder):
-    # Without the cache, where another test has left this program, there is time to interrupt it.
-    setup = "import os; os.environ['RETRIM_COMPILE_CACHE'] = '0'"
+    # A program that takes a minute to compile, so that there is time to interrupt it on any machine.
+    setup = "import time; from retrim import Setup; Setup.pretraining = lambda *_: (time.sleep(60) for _ in range(2))"
     code, out = interrupted((*PRETRAIN, "--out", "never"), folder, after=b"compiling", setup=setup)
     assert code == 130, out
     assert "Traceback" not in out
