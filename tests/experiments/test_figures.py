@@ -43,6 +43,8 @@ def test_a_picture_calls_methods_what_they_are(tmp_path):
     text = picture(shown, setup, scenario, tmp_path)[1].read_text()
     assert "base policy: 30.0 cm over the last 2 s" in text
     assert "INDI: 10.0 cm over the last 2 s" in text
+    exact = [flight(2e-5, spec=FlightSpec(scenario, "indi", 0))]
+    assert "INDI: below 0.1 cm over the last 2 s" in picture(exact, setup, scenario, tmp_path)[1].read_text()
     assert "adapted" not in text
     assert _colours(["base", "indi", "full", "lora"]) == {"base": 0, "indi": 2, "full": 1, "lora": 3}
     assert _colours(["indi"]) == {"indi": 1}

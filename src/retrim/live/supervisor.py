@@ -12,7 +12,7 @@ from typing import Any
 
 from ..errors import MessageError, PlantError
 from ..onboard.launch import last_words, launch
-from ..onboard.messages import Setpoint, last_note, pack_note
+from ..onboard.messages import last_note, last_sent, pack_note
 from ..onboard.realtime import cores_of
 from ..transport.message import describe
 from ..transport.network import FAREWELL
@@ -180,7 +180,7 @@ class Supervisor:
         control, world = last_note(self.bus, "status"), last_note(self.bus, "world")
         failed = last_note(self.bus, "ready.recorder", "ready").get("failed")
         t, fallback = time.monotonic() - self.epoch, self.bus.latest("fallback")
-        by_watchdog = self._sent("fallback") > self._sent("setpoint")
+        by_watchdog = last_sent(self.bus, "fallback") > last_sent(self.bus, "setpoint")
         ticks = 0 if fallback is None else fallback.version
         said = self._rejections()
         return Status(t, control, world, alive, dict(self.restarts), ended, said, by_watchdog, ticks, failed)
@@ -223,14 +223,6 @@ class Supervisor:
         for role in self.processes:
             if not self._alive(role):
                 raise PlantError(f"the {role} process ended before take-off: {last_words(self._complaints(role))}")
-
-    def _sent(self, topic: str) -> float:
-        """Return when the newest command of a topic was sent, monotonic clock [s]."""
-        message = self.bus.latest(topic)
-        try:
-            return float("-inf") if message is None else Setpoint.unpack(message.data).sent
-        except MessageError:
-            return float("-inf")
 
     def _rejections(self) -> list[str]:
         found = []

@@ -69,12 +69,7 @@ class Replay:
 
     def __post_init__(self) -> None:
         """Raise ``ConfigError`` for what cannot be."""
-        for name, least, most in (
-            ("buffer", 0.2, 600.0),
-            ("horizon", 0.1, 600.0),
-            ("delay", 0.0, 1.0),
-            ("lag", 0.0, 5.0),
-        ):
+        for name, (least, most) in SPANS.items():
             if not least <= getattr(self, name) <= most:
                 raise ConfigError(f"--{name} {getattr(self, name):g}: must be {least:g} to {most:g} s")
         if self.adapt not in ("none", "full", "lora"):

@@ -134,7 +134,9 @@ def _errors(axes: Axes, groups: Sequence[Group[Track]], spans: Sequence[Span]) -
         if whole:
             mean, first = np.mean([track.error for track in whole], axis=0), whole[0]
             late = first.t > first.t[-1] - first.last_s
-            final = f"{100 * mean[late].mean():.1f} cm over the last {first.last_s:g} s"
+            centimetres = 100 * mean[late].mean()
+            shown = f"{centimetres:.1f}" if centimetres >= 0.05 else "below 0.1"
+            final = f"{shown} cm over the last {first.last_s:g} s"
             axes.plot(first.t, mean, color=color, linewidth=2.4, label=f"{name}: {final}")
     axes.set(xlabel="time [s]", ylabel="distance from where it should be [m]", ylim=(0, top))
     axes.margins(x=0)
