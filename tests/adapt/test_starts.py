@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from jax import random
 
-from helpers import hover_task, random_starts, random_state
+from helpers import hover_task, random_starts, random_state, replaced
 from retrim.adapt.starts import FlownStarts, TaskStarts
 from retrim.learn import Window
 
@@ -51,3 +51,11 @@ def test_their_noise_has_the_stated_size(window, key):
         assert moved.std() == pytest.approx(0.1, rel=0.05)
     np.testing.assert_array_equal(noisy.x.R, exact.x.R)
     np.testing.assert_array_equal(noisy.t, exact.t)
+
+
+def test_a_start_is_of_the_time_at_which_its_state_was_so(window, key):
+    """Of an old measurement that is earlier, or a start would be behind the reference."""
+    old = replaced(window, age=jnp.full_like(window.t, 0.03))
+    now, then = (drawn(FlownStarts(jnp.array(0.0), 0), hover_task(), each, key, 3, 4) for each in (window, old))
+    np.testing.assert_array_equal(now.x.p, then.x.p)
+    np.testing.assert_allclose(then.t, now.t - 0.03, atol=1e-12)

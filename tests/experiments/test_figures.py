@@ -3,6 +3,7 @@
 import dataclasses
 
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
@@ -11,6 +12,7 @@ from made_up import flight
 from retrim import Event, Scenario, Setup
 from retrim.experiments import FlightSpec
 from retrim.experiments.figures import _colours, picture, spans
+from retrim.viz.panels import bars
 
 pytestmark = pytest.mark.usefixtures("optax_promotion")
 
@@ -64,3 +66,19 @@ def test_spans_of_disturbances():
     assert found("gusts") == [(0.0, 30.0, "gusts")]
     strong = [span.strong for span in spans("reversing", jnp.array([0.0, 0.0, 1.0]), 40.0)]
     np.testing.assert_array_equal(strong, [False, True, False])
+
+
+@pytest.mark.parametrize("methods", [["base", "full", "lora"], ["full", "lora"], ["indi", "base", "base-do", "full"]])
+def test_bars_of_methods_have_colours_of_their_own(methods):
+    figure = bars("Error", {"none": dict.fromkeys(methods, [0.1]), "large": dict.fromkeys(methods, [np.inf])})
+    drawn = [handle.patches[0].get_facecolor() for handle in figure.axes[0].containers]
+    assert len(set(drawn)) == len(methods)
+    plt.close(figure)
+
+
+@pytest.mark.parametrize("last", [np.nan, np.inf])
+def test_a_crash_into_nowhere_is_marked_where_the_vehicle_was_last_seen(tmp_path, last):
+    scenario, setup = Scenario("large"), Setup.of(tiny_preset())
+    error = np.append(np.full(500, 0.5), last)
+    shown = [flight(error, spec=FlightSpec(scenario, "base", 0), terminated=True)]
+    assert "crashed" in picture(shown, setup, scenario, tmp_path)[1].read_text()

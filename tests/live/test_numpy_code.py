@@ -72,6 +72,16 @@ OPERATIONS = {
         x.at[:, jnp.array([2])].set(7.0), lax.dynamic_slice(x, (0, jnp.int64(p + 5.0), 1), (2, 2, 2)), x[jnp.int32(-1)],
         lax.dynamic_update_slice(x, jnp.ones((1, 2, 2)), (jnp.int64(p), 2, 1)), 7 // jnp.int32(2 + p), x.astype(int),
     ],
+    "integers": lambda p, x: [
+        ~x.astype(jnp.int32), (1e9 * x).astype(jnp.int32), jnp.array([jnp.nan, 3e9, -3e9, jnp.inf, -jnp.inf, -1.7])
+        .astype(jnp.int32) + (0 * p).astype(jnp.int32), (2e9 * jnp.abs(x)).astype(jnp.int32).sum(1),
+        (2e9 * jnp.abs(x)).astype(jnp.int32).cumsum(2), (9e5 * x).astype(jnp.int32).prod(0), (300 * x).astype(jnp.int8),
+        jnp.arange(5.0)[jnp.clip((1e30 * x).astype(jnp.int32), 0, 4)], (4e9 * jnp.abs(x)).astype(jnp.uint32) >> 3,
+        jnp.take(jnp.arange(4, dtype=jnp.uint32), jnp.array([1, 9]) + (0 * p).astype(int), mode="fill"),
+        jnp.take(x > 0, jnp.array([1, 9]) + (0 * p).astype(int), axis=1, mode="fill"),
+        jnp.take(x, jnp.array([1, 9]) + (0 * p).astype(int), axis=1, mode="fill", fill_value=-2.5),
+        jnp.take(x.astype(int), jnp.array([1, 9]) + (0 * p).astype(int), axis=1, mode="fill", fill_value=7),
+    ],
     "loops": lambda p, x: [
         lax.scan(lambda c, row: (c * p + row.sum(), c), x[0, 0, 0], x),
         lax.scan(lambda c, row: (c + row, (c, row[0])), x[0], (x + p), reverse=True),
@@ -118,6 +128,20 @@ def test_what_has_no_numpy_form_is_named_before_take_off():
         numpy_program(lambda p, x: jnp.sort(x), jnp.array(0.0), X)
     with pytest.raises(ConfigError, match="rounding away from zero in this controller has no NumPy form"):
         numpy_program(lambda p, x: lax.round(x), jnp.array(0.0), X)
+    many = random.split(random.key(0), 4)
+    for function in (
+        lambda p, x: jax.vmap(lambda k: random.normal(k, (2,)))(random.split(random.key(x), 64)).mean(0),
+        lambda p, x: jax.vmap(lambda k: random.split(k, 2))(random.split(random.key(x), 4)),
+        lambda p, x: random.key_data(jnp.where(jnp.arange(4) > x, many, random.key(x))),
+    ):
+        with pytest.raises(ConfigError, match="a batch of random keys in this controller has no NumPy form"):
+            numpy_program(function, jnp.array(0.0), jnp.array(3))
+    for function, what in (
+        (lambda p, x: lax.shift_right_logical(x, jnp.array(1)), "a logical shift of signed integers"),
+        (lambda p, x: lax.reduce_and_p.bind(x[None], axes=(0,)), "a bitwise reduction"),
+    ):
+        with pytest.raises(ConfigError, match=f"{what} in this controller has no NumPy form"):
+            numpy_program(function, jnp.array(0.0), jnp.array(3))
     with pytest.raises(ConfigError, match="a loop of 101 steps, not of 1 to 100, in this controller has no NumPy form"):
         numpy_program(lambda p, x: lax.fori_loop(0, 101, lambda i, c: c + p, x), jnp.array(0.0), X)
 

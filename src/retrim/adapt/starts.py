@@ -57,13 +57,14 @@ class FlownStarts(AbstractStarts):
 
 
 def drawn(window: Window, key: Key[Array, ""], shape: tuple[int, ...]) -> Start:
-    """Draw states, with their times, from the valid part of the window; the key is consumed."""
+    """Draw states, with the times at which they were so, from the valid part of the window; the key is consumed."""
     weight = window.valid.astype(window.x.p.dtype)
     row = random.choice(key, window.valid.shape[0], shape, p=weight / jnp.sum(weight))
     make: Callable[..., Start] = Start
     for _ in shape:
         make = jax.vmap(make)
-    return make(window.t[row], jax.tree.map(lambda leaf: leaf[row], window.x))
+    t = window.t if window.age is None else window.t - window.age
+    return make(t[row], jax.tree.map(lambda leaf: leaf[row], window.x))
 
 
 def _shifted(start: Start, dp: Float[Array, "3"], dv: Float[Array, "3"]) -> Start:

@@ -25,6 +25,7 @@ from ..live.session import LAYERS, LiveRequest, live_spec
 from ..live.spec import LiveSpec
 from ..live.topics import topics
 from ..onboard.control import ControlLoop
+from ..onboard.guard import Mode
 from ..onboard.messages import Sample, last_note
 from ..onboard.realtime import sleep_until
 from ..physics.state import Command, State
@@ -135,10 +136,12 @@ def _step(simulations: Simulation, flown: SimState, u: Array, tick: Array) -> tu
 
 def main() -> None:
     """Fly as many vehicles as the command line says, and print how it went."""
-    n = int(sys.argv[1])
+    n, learning = int(sys.argv[1]), last_core()
+    on_core(0)  # before JAX begins: the threads that it has then stay where they are
+    jax.config.update("jax_cpu_enable_async_dispatch", False)
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
-        air, fleet = Air(n, place), FleetProcess(place, {last_core()})
+        air, fleet = Air(n, place), FleetProcess(place, {learning})
         try:
             print(json.dumps(_flown(air, fleet, place)))
         finally:
@@ -158,7 +161,6 @@ def _flown(air: Air, fleet: FleetProcess, place: Path) -> dict[str, Any]:
             raise OSError("the process of the learners died")
         time.sleep(0.1)
     warm_s = time.monotonic() - began
-    on_core(0)
     epoch, late, ages, known = time.monotonic(), 0, list[float](), [0] * len(air.loops)
     before = 0
     while air.tick * air.dt < SECONDS:
@@ -174,6 +176,8 @@ def _flown(air: Air, fleet: FleetProcess, place: Path) -> dict[str, Any]:
         behind = time.monotonic() - (epoch + air.tick * air.dt)
         late += behind > 0.0
         epoch += max(0.0, behind - air.dt)  # the world waits rather than jump
+    if fallen := sum(loop.mode != Mode.POLICY for loop in air.loops):
+        raise OSError(f"{fallen} of {len(air.loops)} vehicles were taken over by the guard: this machine is too busy")
     return {
         "warm_s": warm_s,
         "updates_per_s": (air.updates() - before) / (SECONDS - SETTLES_S),

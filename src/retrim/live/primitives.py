@@ -18,6 +18,19 @@ def no_form(operation: str) -> ConfigError:
     return ConfigError(f"{operation} in this controller has no NumPy form, so it cannot fly live")
 
 
+def _is_key(variable: Any) -> bool:
+    return bool(jnp.issubdtype(variable.aval.dtype, jax.dtypes.prng_key))
+
+
+def _of_one_key(expression: Expression) -> Expression:
+    def checked(eqn: Any, *operands: str) -> str:
+        if eqn.invars[0].aval.ndim:
+            raise no_form("a batch of random keys")
+        return expression(eqn, *operands)
+
+    return checked
+
+
 def _infix(symbol: str) -> Expression:
     return lambda eqn, a, b: f"{a} {symbol} {b}"
 
@@ -28,14 +41,18 @@ def _call(function: str) -> Expression:
 
 def _reduced(ufunc: str) -> Expression:
     def expression(eqn: Any, x: str) -> str:
-        axes = tuple(eqn.params["axes"])  # the ufunc's own method: half of the time of NumPy's function
-        return f"np.{ufunc}.reduce({x}, {axes[0] if len(axes) == 1 else axes})"
+        axes, dtype = tuple(eqn.params["axes"]), np.dtype(eqn.outvars[0].aval.dtype)
+        if ufunc.startswith("logical") and dtype.kind != "b":
+            raise no_form("a bitwise reduction")
+        whole = f", dtype={dtype.name!r}" if ufunc in ("add", "multiply") and dtype.kind in "iu" else ""  # it wraps
+        # the ufunc's own method: half of the time of NumPy's function
+        return f"np.{ufunc}.reduce({x}, {axes[0] if len(axes) == 1 else axes}{whole})"
 
     return expression
 
 
 def _stack(eqn: Any, *xs: str) -> str:
-    if eqn.invars[0].aval.ndim == 0 and not jnp.issubdtype(eqn.invars[0].aval.dtype, jax.dtypes.prng_key):
+    if eqn.invars[0].aval.ndim == 0 and not _is_key(eqn.invars[0]):
         return f"np.array(({', '.join(xs)},), {np.dtype(eqn.outvars[0].aval.dtype).name!r})"
     return f"np.stack(({', '.join(xs)},), axis={eqn.params['axis']})"
 
@@ -46,7 +63,7 @@ def _same(eqn: Any, x: str) -> str:
 
 def _shape(eqn: Any) -> tuple[int, ...]:
     aval = eqn.outvars[0].aval
-    return (*aval.shape, 2) if jnp.issubdtype(aval.dtype, jax.dtypes.prng_key) else tuple(aval.shape)
+    return (*aval.shape, 2) if _is_key(eqn.outvars[0]) else tuple(aval.shape)
 
 
 def _reshape(eqn: Any, x: str) -> str:
@@ -55,8 +72,10 @@ def _reshape(eqn: Any, x: str) -> str:
 
 def _broadcast(eqn: Any, x: str) -> str:
     shape, before = _shape(eqn), eqn.invars[0].aval.shape
-    if tuple(before) == shape:
+    if tuple(before) == tuple(eqn.outvars[0].aval.shape):
         return x
+    if _is_key(eqn.invars[0]):
+        raise no_form("a batch of random keys")
     spread = [1] * len(shape)
     for axis, n in zip(eqn.params["broadcast_dimensions"], before, strict=True):
         spread[axis] = n
@@ -65,8 +84,10 @@ def _broadcast(eqn: Any, x: str) -> str:
 
 
 def _convert(eqn: Any, x: str) -> str:
-    dtype = np.dtype(eqn.params["new_dtype"])
-    return x if eqn.invars[0].aval.dtype == dtype else f"{x}.astype({dtype.name!r})"
+    dtype, before = np.dtype(eqn.params["new_dtype"]), np.dtype(eqn.invars[0].aval.dtype)
+    if dtype.kind in "iu" and before.kind == "f":
+        return f"lax.to_integer({x}, {dtype.name!r})"
+    return x if before == dtype else f"{x}.astype({dtype.name!r})"
 
 
 def _slice(eqn: Any, x: str) -> str:
@@ -80,6 +101,8 @@ def _slice(eqn: Any, x: str) -> str:
 
 
 def _select(eqn: Any, which: str, *cases: str) -> str:
+    if _is_key(eqn.invars[1]) and eqn.invars[0].aval.ndim:
+        raise no_form("a batch of random keys")
     if len(cases) == 2 and eqn.invars[0].aval.dtype == bool:
         return f"np.where({which}, {cases[1]}, {cases[0]})"
     return f"np.choose({which}, ({', '.join(cases)},))"
@@ -117,7 +140,11 @@ def _gather(eqn: Any, x: str, at: str) -> str:
         raise no_form("gather with batches")
     axes = (d.offset_dims, d.collapsed_slice_dims, d.start_index_map, eqn.params["slice_sizes"])
     mode = GatherScatterMode.from_any(eqn.params["mode"])
-    return f"lax.gather({x}, {at}, {', '.join(str(tuple(each)) for each in axes)}, fill={mode == fill})"
+    value, shown = eqn.params["fill_value"], ""
+    if mode == fill and value is not None:  # a float's own text may be "nan", which is no name
+        value = np.asarray(value).item()
+        shown = f", value=float({str(value)!r})" if isinstance(value, float) else f", value={value}"
+    return f"lax.gather({x}, {at}, {', '.join(str(tuple(each)) for each in axes)}, fill={mode == fill}{shown})"
 
 
 def _scatter(eqn: Any, x: str, at: str, updates: str) -> str:
@@ -135,12 +162,16 @@ def _round(eqn: Any, x: str) -> str:
 
 
 def _cumsum(eqn: Any, x: str) -> str:
-    axis = eqn.params["axis"]
-    return (
-        f"np.flip(np.cumsum(np.flip({x}, {axis}), {axis}), {axis})"
-        if eqn.params["reverse"]
-        else f"np.cumsum({x}, {axis})"
-    )
+    axis, dtype = eqn.params["axis"], np.dtype(eqn.outvars[0].aval.dtype).name
+    if eqn.params["reverse"]:
+        return f"np.flip(np.cumsum(np.flip({x}, {axis}), {axis}, {dtype!r}), {axis})"
+    return f"np.cumsum({x}, {axis}, {dtype!r})"
+
+
+def _shift_right(eqn: Any, x: str, by: str) -> str:
+    if np.dtype(eqn.invars[0].aval.dtype).kind != "u":
+        raise no_form("a logical shift of signed integers")
+    return f"{x} >> {by}"
 
 
 def _split(eqn: Any, x: str) -> str:
@@ -172,7 +203,7 @@ EXPRESSIONS: dict[str, Expression] = {
         "sqrt": "sqrt", "exp": "exp", "log": "log", "log1p": "log1p", "expm1": "expm1", "sin": "sin", "cos": "cos",
         "tan": "tan", "tanh": "tanh", "atan2": "arctan2", "asin": "arcsin", "acos": "arccos", "atan": "arctan",
         "abs": "abs", "sign": "sign", "floor": "floor", "ceil": "ceil", "max": "maximum", "min": "minimum",
-        "is_finite": "isfinite", "not": "logical_not", "square": "square", "rem": "fmod", "nextafter": "nextafter",
+        "is_finite": "isfinite", "not": "invert", "square": "square", "rem": "fmod", "nextafter": "nextafter",
     }.items()},
     **{name: _reduced(f) for name, f in {
         "reduce_sum": "add", "reduce_max": "maximum", "reduce_min": "minimum", "reduce_and": "logical_and",
@@ -205,13 +236,15 @@ EXPRESSIONS: dict[str, Expression] = {
     "argmin": _index("np.argmin"),
     "argmax": _index("np.argmax"),
     "erf_inv": _call("lax.erf_inv"),
-    "shift_right_logical": _infix(">>"),
+    "shift_right_logical": _shift_right,
     "shift_left": _infix("<<"),
     "bitcast_convert_type": lambda eqn, x: f"np.asarray({x}).view({np.dtype(eqn.params['new_dtype']).name!r})",
-    "random_seed": _call("threefry.seed"),
-    "random_fold_in": _call("threefry.fold_in"),
-    "random_split": lambda eqn, key: f"threefry.split({key}, {tuple(eqn.params['shape'])})",
-    "random_bits": lambda eqn, key: f"threefry.bits({key}, {tuple(eqn.params['shape'])}, {eqn.params['bit_width']})",
+    "random_seed": _of_one_key(_call("threefry.seed")),
+    "random_fold_in": _of_one_key(_call("threefry.fold_in")),
+    "random_split": _of_one_key(lambda eqn, key: f"threefry.split({key}, {tuple(eqn.params['shape'])})"),
+    "random_bits": _of_one_key(
+        lambda eqn, key: f"threefry.bits({key}, {tuple(eqn.params['shape'])}, {eqn.params['bit_width']})"
+    ),
     "dot_general": _dot,
     "gather": _gather,
     "scatter": _scatter,

@@ -24,6 +24,14 @@ def integer_div(a: Any, b: Any) -> Any:
     return (np.sign(a) * np.sign(b) * (np.abs(a) // np.abs(b))).astype(np.asarray(a).dtype)
 
 
+def to_integer(x: Any, dtype: str) -> Any:
+    """Return floats as integers, rounded towards zero: beyond the range its end, and 0 for what is no number."""
+    x, range_ = np.asarray(x, dtype=float), np.iinfo(dtype)
+    inside = np.where((x > range_.min) & (x < range_.max), x, 0.0).astype(dtype)
+    low, high = np.array(range_.min, dtype), np.array(range_.max, dtype)
+    return np.where(x >= range_.max, high, np.where(x <= range_.min, low, inside))
+
+
 def pad(x: Any, value: Any, config: Sequence[tuple[int, int, int]]) -> Any:
     """Pad with (low, high, interior) per axis; negative values cut."""
     x = np.asarray(x)
@@ -55,7 +63,17 @@ def dynamic_update_slice(x: Any, block: Any, starts: Sequence[Any]) -> Any:
     return out
 
 
-def gather(x: Any, indices: Any, offset: Index, collapsed: Index, start_map: Index, sizes: Index, *, fill: bool) -> Any:
+def gather(
+    x: Any,
+    indices: Any,
+    offset: Index,
+    collapsed: Index,
+    start_map: Index,
+    sizes: Index,
+    *,
+    fill: bool,
+    value: float | int | None = None,
+) -> Any:
     """Return slices of ``x`` at ``indices``, whose last axis is one index vector each.
 
     Args:
@@ -65,20 +83,23 @@ def gather(x: Any, indices: Any, offset: Index, collapsed: Index, start_map: Ind
         collapsed: Axes of a slice that are dropped.
         start_map: Which axis of ``x`` each number of an index vector is for.
         sizes: Size of a slice.
-        fill: A slice that does not lie inside is not a number (the smallest one, for integers); else it is moved in.
+        fill: A slice that does not lie inside is full of ``value``; else it is moved in.
+        value: By default not a number, or the smallest signed or largest unsigned integer, or true.
     """
     x, indices = np.asarray(x), np.asarray(indices)
     batch = indices.shape[:-1]
     kept = tuple(n for axis, n in enumerate(sizes) if axis not in collapsed)
     out = np.empty((*batch, *kept), dtype=x.dtype)
-    bad = np.nan if np.issubdtype(x.dtype, np.floating) else np.iinfo(x.dtype).min
+    kind = x.dtype.kind
+    if value is None:
+        value = np.nan if kind == "f" else kind == "b" or getattr(np.iinfo(x.dtype), "max" if kind == "u" else "min")
     for row in np.ndindex(*batch):
         starts = [0] * x.ndim
         for axis, i in zip(start_map, indices[row], strict=True):
             starts[axis] = int(i)
         at = _clamped(x.shape, starts, sizes)
         block = x[tuple(slice(i, i + n) for i, n in zip(at, sizes, strict=True))].reshape(kept)
-        out[row] = bad if fill and list(at) != starts else block
+        out[row] = value if fill and list(at) != starts else block
     order, rows, inner = [], iter(range(len(batch))), iter(range(len(batch), out.ndim))
     for axis in range(out.ndim):
         order.append(next(inner if axis in offset else rows))

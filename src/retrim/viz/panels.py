@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import cycle
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -109,9 +110,10 @@ def bars(title: str, groups: dict[str, dict[str, list[float]]]) -> Figure:
             figsize=(max(6.0, 1.1 * len(groups) * len(methods)), 4.5), layout="constrained", facecolor="white"
         )
         width = 0.8 / len(methods)
+        others = cycle(color for color in COLORS if color != BASE)
         for k, method in enumerate(methods):
             places = np.arange(len(groups)) + (k - (len(methods) - 1) / 2) * width
-            color = BASE if method == "base" else COLORS[(k - 1) % len(COLORS) if k else 0]
+            color = BASE if method == "base" else next(others)
             finite = [[v for v in group.get(method, []) if np.isfinite(v)] for group in groups.values()]
             means = [float(np.mean(found)) if found else 0.0 for found in finite]
             axes.bar(places, means, 0.9 * width, color=color, alpha=0.5, label=method)

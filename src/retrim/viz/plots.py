@@ -108,7 +108,8 @@ def _coloured(groups: Sequence[Group[T]]) -> Iterator[tuple[Sequence[T], str, st
 
 def _errors(axes: Axes, groups: Sequence[Group[Track]], spans: Sequence[Span]) -> None:
     every = [track for group in groups for track in group.tracks]
-    top = 1.15 * max((float(np.nanmax(track.error)) for track in every), default=1.0)
+    finite = [track.error[np.isfinite(track.error)] for track in every]  # a flight may end where nothing is a number
+    top = 1.15 * max((float(error.max()) for error in finite if len(error)), default=1.0)
     for span in spans:
         axes.axvspan(span.start, span.end, color=PUSH, alpha=0.28 if span.strong else 0.13, linewidth=0)
         axes.text(
@@ -128,8 +129,10 @@ def _errors(axes: Axes, groups: Sequence[Group[Track]], spans: Sequence[Span]) -
             label = f"{name}: single flights" if len(tracks) > 1 and i == 0 else None
             axes.plot(track.t, track.error, color=color, alpha=0.35, linewidth=0.8, label=label)
             if track.crashed:
-                axes.plot(track.t[-1], track.error[-1], "x", color=color, markersize=10, clip_on=False)
-                axes.annotate("crashed", (track.t[-1], track.error[-1]), color=color, fontsize=9, ha="right")
+                known = np.flatnonzero(np.isfinite(track.error))
+                end = track.t[-1], track.error[known[-1]] if len(known) else 0.0
+                axes.plot(*end, "x", color=color, markersize=10, clip_on=False)
+                axes.annotate("crashed", end, color=color, fontsize=9, ha="right")
         whole = [track for track in tracks if not track.crashed]
         if whole:
             mean, first = np.mean([track.error for track in whole], axis=0), whole[0]

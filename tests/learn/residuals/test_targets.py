@@ -109,6 +109,25 @@ def test_a_window_of_columns_and_back(key):
     jax.tree.map(np.testing.assert_array_equal, again, window)
 
 
+@pytest.mark.parametrize("age", [0.0, 0.01, 0.04])
+@pytest.mark.parametrize("delay", [0, 1])
+def test_a_row_whose_command_lies_beyond_a_gap_does_not_count(age, delay, key):
+    """A tick is missing: whatever counts is true, and what does not reach over the gap counts."""
+    n, whole = 40, math.ceil(age / DT)
+    u = jax.vmap(Command)(9.81 + 2.0 * jax.random.normal(key, (n,)), jnp.zeros((n, 3)))
+    v = jnp.cumsum(DT * (jnp.roll(u.c, delay).at[:delay].set(9.81) - 9.81))
+    # States of the beginning of each tick, as far back as they are old; between two of them thrust is constant.
+    t = DT * np.arange(n)
+    seen = np.interp(t - age, t, np.concatenate([[0.0], v[:-1]]))
+    x = jax.vmap(lambda v: State(jnp.zeros(3), jnp.eye(3), v * jnp.array([0.0, 0.0, 1.0])))(jnp.asarray(seen))
+    window = Window(jnp.asarray(t), x, u, jnp.ones(n, dtype=bool), jnp.full(n, age))
+    gone = jax.tree.map(lambda leaf: jnp.delete(leaf, 20, axis=0), window)
+    rows = residual_targets(gone, PointMass(DT), delay_ticks=delay)
+    assert float(jnp.abs(rows.a_res[np.asarray(rows.valid)]).max()) < 1e-9
+    every = residual_targets(window, PointMass(DT), delay_ticks=delay)
+    assert int(every.valid.sum()) - int(rows.valid.sum()) == 2 + delay + whole
+
+
 @pytest.mark.parametrize("age", [0.0, 0.005, 0.01, 0.02, 0.03])
 @pytest.mark.parametrize("delay", [0, 1])
 def test_a_late_measurement_is_paired_with_the_command_that_acted_then(age, delay, key):

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from ...physics import so3
 from ...physics.dynamics import AbstractDynamics
@@ -64,7 +64,7 @@ def residual_targets(
         raise ValueError(f"a window of {n} ticks is too short for a delay of {delay_ticks} ticks")
     x = jax.tree.map(lambda leaf: leaf[delay_ticks : delay_ticks + rows], window.x)
     v_next = window.x.v[delay_ticks + 1 :]
-    u, known = _acting(window, rows, delay_ticks, nominal.dt)
+    u, before, known = _acting(window, rows, delay_ticks, nominal.dt)
 
     def tick(s: Any, row: tuple[State, Command, Float[Array, "3"]]) -> tuple[Any, Float[Array, "3"]]:
         x, u, v_next = row
@@ -77,17 +77,19 @@ def residual_targets(
     _, a_res = lax.scan(tick, first, (x, u, v_next))
     omega = jax.vmap(_turned)(x.R, window.x.R[delay_ticks + 1 :]) / nominal.dt
     settled = _settled(window, nominal.settling_ticks)[:rows]
-    return Targets(x, u, a_res, omega, known & _regular(window, nominal.dt, delay_ticks) & settled)
+    return Targets(x, u, a_res, omega, known & _regular(window, nominal.dt, delay_ticks, before) & settled)
 
 
-def _acting(window: Window, rows: int, delay_ticks: int, dt: float) -> tuple[Command, Bool[Array, " rows"]]:
-    """The mean command over the tick that each measurement describes, and whether it lies in the window.
+def _acting(
+    window: Window, rows: int, delay_ticks: int, dt: float
+) -> tuple[Command, Int[Array, " rows"], Bool[Array, " rows"]]:
+    """The mean command over the tick that each measurement describes, its first row, and whether the window has it.
 
     Two commands share a tick of measurements whose age is no whole number of ticks.
     """
     if window.age is None:
         first: Command = jax.tree.map(lambda leaf: leaf[:rows], window.u)
-        return first, window.valid[:rows]
+        return first, jnp.arange(rows), window.valid[:rows]
     ticks = jnp.arange(rows, dtype=window.t.dtype)
     at = ticks - window.age[delay_ticks : delay_ticks + rows] / dt
     since = jnp.maximum(at, 0.0)
@@ -99,7 +101,7 @@ def _acting(window: Window, rows: int, delay_ticks: int, dt: float) -> tuple[Com
         return (1.0 - weight) * leaf[before] + weight * leaf[before + 1]
 
     acting: Command = jax.tree.map(mixed, window.u)
-    return acting, (at > -ROUNDING) & window.valid[before]
+    return acting, before, (at > -ROUNDING) & window.valid[before]
 
 
 def _turned(before: Float[Array, "3 3"], after: Float[Array, "3 3"]) -> Float[Array, "3"]:
@@ -107,16 +109,17 @@ def _turned(before: Float[Array, "3 3"], after: Float[Array, "3 3"]) -> Float[Ar
     return so3.log(so3.mul(before.T, after))
 
 
-def _regular(window: Window, dt: float, delay_ticks: int) -> Bool[Array, " rows"]:
+def _regular(window: Window, dt: float, delay_ticks: int, before: Int[Array, " rows"]) -> Bool[Array, " rows"]:
     """Whether all steps from the row's command to its next velocity are one tick long, to a quarter of it.
 
-    By the clock of commands, and by the times at which the states were true.
+    By the clock of commands, and by the times at which the states were true. The command of an old measurement is
+    looked for ``before``, by rows, so that no step from there on may be another.
     """
     one_tick = jnp.abs(jnp.diff(window.t) - dt) < 0.25 * dt
     if window.age is not None:
         one_tick &= jnp.abs(jnp.diff(window.t - window.age) - dt) < 0.25 * dt
-    rows = one_tick.shape[0] - delay_ticks
-    return jnp.all(jnp.stack([one_tick[k : k + rows] for k in range(delay_ticks + 1)]), axis=0)
+    others = jnp.concatenate([jnp.zeros(1, int), jnp.cumsum((~one_tick).astype(int))])
+    return others[delay_ticks + 1 :] == others[before]
 
 
 def _settled(window: Window, ticks: int | Float[Array, ""]) -> Bool[Array, " n"]:
