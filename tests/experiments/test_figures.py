@@ -70,7 +70,7 @@ def test_spans_of_disturbances():
 
 @pytest.mark.parametrize("methods", [["base", "full", "lora"], ["full", "lora"], ["indi", "base", "base-do", "full"]])
 def test_bars_of_methods_have_colours_of_their_own(methods):
-    figure = bars("Error", {"none": dict.fromkeys(methods, [0.1]), "large": dict.fromkeys(methods, [np.inf])})
+    figure = bars("Error", {"none": {name: [0.1] for name in methods}, "large": {name: [np.inf] for name in methods}})
     drawn = [handle.patches[0].get_facecolor() for handle in figure.axes[0].containers]
     assert len(set(drawn)) == len(methods)
     plt.close(figure)
