@@ -8,8 +8,9 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from ..control.policy import Inputs, Perturbations, Policy
+from ..physics.felt_frame import FeltFrame
 from ..physics.state import Command, State, where
-from ..tasks.task import Start
+from ..tasks.task import AbstractTask, Start
 from .env import Env
 
 
@@ -64,17 +65,18 @@ def _scan(env: Env, policy: Policy, start: Start, perturbations: Perturbations |
     dynamics, task = env.dynamics, env.task
     calm = jnp.zeros_like(start.x.p)
     hover = policy.u_hover
-    frame = env.frame(start.x, hover)  # what an observation remembers of before the start is of the same frame
-    seen, x_seen = (task, start.x) if frame is None else (task.in_frame(frame), frame.state(start.x))
+
+    def framed(x: State, issued: Command) -> tuple[FeltFrame | None, AbstractTask, State]:
+        """The frame that is flown in, and task and state in it."""
+        frame = env.frame(x, issued)
+        return (None, task, x) if frame is None else (frame, task.in_frame(frame), frame.state(x))
 
     def tick(carry: Any, xs: Any) -> Any:
         s, memory, last, issued, pending, alive, worst = carry
         k, perturbation = xs
         t = start.t + k * task.dt
         x = dynamics.state(s)
-        frame = env.frame(x, issued)
-        seen = task if frame is None else task.in_frame(frame)
-        x_seen = x if frame is None else frame.state(x)
+        frame, seen, x_seen = framed(x, issued)
         o, memory = seen.observation(memory, t, x_seen, last)
         before = last
         last, inputs = (policy(o), ()) if perturbation is None else policy.perturbed(o, perturbation)
@@ -91,6 +93,7 @@ def _scan(env: Env, policy: Policy, start: Start, perturbations: Perturbations |
         worst = jnp.minimum(worst, lax.stop_gradient(reward))
         return (s, memory, last, issued, waiting, survived, worst), ((x, acting, reward, ~alive), inputs)
 
+    _, seen, x_seen = framed(start.x, hover)  # what is remembered of before the start is of the same frame
     carry = (
         dynamics.init(start.x),
         seen.observation.init(x_seen),

@@ -30,8 +30,6 @@ class SimState(eqx.Module):
     """Commands issued, oldest first; those that the delay still holds back, and the one acting."""
     samples: State
     """Samples of the state, oldest first: the one that has arrived, and those that the latency still holds back."""
-    t: Float[Array, ""]
-    """Time since the reset [s]."""
     a: Float[Array, "3"]
     """Mean acceleration over the last tick, world [m/s^2]."""
 
@@ -77,7 +75,7 @@ class Simulation(eqx.Module):
         held = 1 if self.sensors is None else self.sensors.held
         sample = x0 if self.sensors is None else self.sensors.noisy(x0, random.fold_in(self.key, FIRST_SAMPLE))
         samples = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (held, *leaf.shape)), sample)
-        return SimState(self.model.init(x0), queue, samples, jnp.zeros_like(x0.p[0]), jnp.zeros_like(x0.p))
+        return SimState(self.model.init(x0), queue, samples, jnp.zeros_like(x0.p))
 
     def advance(self, s: SimState, u: Command, tick: Int[ArrayLike, ""]) -> SimState:
         """Return the state one control tick later, in steps of 1 ms; ``u`` acts :attr:`delay_s` after the tick began.
@@ -98,8 +96,7 @@ class Simulation(eqx.Module):
             after = self.model.substep(inner, acting, self.disturbance(t, self.model.state(inner)))
             return after, self.model.state(after)
 
-        begun = jnp.asarray(tick, s.t.dtype) * self.model.dt  # not s.t and so on: a sum drifts off in single precision
-        times = begun + SUBSTEP * jnp.arange(per_tick, dtype=s.t.dtype)
+        times = self.time(tick, s.a.dtype) + SUBSTEP * jnp.arange(per_tick, dtype=s.a.dtype)
         acting = jax.tree.map(lambda leaf: leaf[slots - 1 - ages], queue)
         inner, path = lax.scan(millisecond, s.model, (times, acting))
         if (sensors := self.sensors) is None:
@@ -108,7 +105,11 @@ class Simulation(eqx.Module):
             sampled = jax.tree.map(lambda leaf: leaf[sensors.period - 1 :: sensors.period], path)
             samples = sensors.received(s.samples, sampled, random.fold_in(self.key, tick))
         a = (self.model.state(inner).v - self.model.state(s.model).v) / self.model.dt
-        return SimState(inner, queue, samples, (jnp.asarray(tick, s.t.dtype) + 1.0) * self.model.dt, a)
+        return SimState(inner, queue, samples, a)
+
+    def time(self, tick: Int[ArrayLike, ""], dtype: Any) -> Float[Array, ""]:
+        """Return the time since the start of the flight [s]: not a sum, which drifts off in single precision."""
+        return jnp.asarray(tick, dtype) * self.model.dt
 
     def measured(self, s: SimState) -> State:
         """Return the newest sample that has arrived."""

@@ -83,7 +83,7 @@ def fly_ticks(
         s, k = flight.sim, flight.tick
         sensed = simulation.inertial(s, k)
         now = controller if sensed is None else controller.sensing(*sensed)
-        issued, memory = now(flight.memory, s.t, simulation.measured(s))
+        issued, memory = now(flight.memory, simulation.time(k, s.a.dtype), simulation.measured(s))
         accepted = simulation.within_limits(issued)
         limited = jnp.any(accepted.vector() != issued.vector())
         memory = where(limited, controller.accepted(memory, accepted), memory)
