@@ -205,12 +205,20 @@ def test_what_failed_elsewhere_is_kept_and_flown_again(tmp_path, monkeypatch):
         return Flights([], interrupted=False, failed=dict.fromkeys(only[1:], "OSError: gone"))
 
     monkeypatch.setattr(fleet, "run", flies)
-    sweep._fly(fleet, kept, run, reporter)
+    sweep._fly(
+        fleet, {spec: sweep._key(fleet.preset, spec, fleet.seconds) for spec in fleet.specs}, kept, run, reporter
+    )
     assert (run.failed, run.exit_code) == (True, 1)
     assert said == ["1 flights failed elsewhere, the first by OSError: gone; the same command flies them"]
     rows = [json.loads(line) for line in flown(tmp_path)]
     assert [(row["start"], row["failed"], row["preset"], row["vehicle"]) for row in rows] == [
         (0, None, preset.name, "small"), (1, "OSError: gone", preset.name, "small")
     ]  # fmt: skip
-    sweep._fly(fleet, sweep._Kept(tmp_path / "flights.jsonl"), run, reporter)
+    sweep._fly(
+        fleet,
+        {spec: sweep._key(fleet.preset, spec, fleet.seconds) for spec in fleet.specs},
+        sweep._Kept(tmp_path / "flights.jsonl"),
+        run,
+        reporter,
+    )
     assert asked == [(None, fleet.specs, True, True), (None, fleet.specs[1:], True, True)]

@@ -1,6 +1,6 @@
 """From flights to rows of results."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -28,7 +28,6 @@ FIGURES = (
 """What a flight is told by, but whether it crashed."""
 EFFORT = ("rates_rms", "rates_change_rms")
 """Commanded body rates, and their change in a tick [rad/s]."""
-"""How far a flight is behind its reference [s], and its error but for that [m]."""
 
 
 def record(flight: Flight) -> dict[str, Any]:
@@ -121,8 +120,12 @@ def summary(records: Sequence[Mapping[str, Any]], keys: Sequence[str] = CONDITIO
         "peak_after_5s": _finite(float(np.median(_column(records, "peak_after_5s")))),
         "settle_s": _finite(float(np.median(_column(records, "settle_s")))),
         **({"cross_track_m": float(np.mean(cross))} if cross else {}),
-        **{name: _mean(records, name) for name in EFFORT},
-        **({"behind_s": _median(records, "behind_s"), "unshifted_m": _mean(records, "unshifted_m")} if cross else {}),
+        **{name: _average(records, name) for name in EFFORT},
+        **(
+            {"behind_s": _average(records, "behind_s", np.median), "unshifted_m": _average(records, "unshifted_m")}
+            if cross
+            else {}
+        ),
         "interval": interval(records),
         "n": len(records) + len(why),
         "crashes": sum(each["crashed"] for each in records),
@@ -155,14 +158,11 @@ def interval(records: Sequence[Mapping[str, Any]], draws: int = 2000) -> list[fl
     return [float(low), float(high)]
 
 
-def _mean(records: Sequence[Mapping[str, Any]], name: str) -> float | None:
+def _average(
+    records: Sequence[Mapping[str, Any]], name: str, of: Callable[[list[float]], Any] = np.mean
+) -> float | None:
     found = [each[name] for each in records if each.get(name) is not None]
-    return float(np.mean(found)) if found else None
-
-
-def _median(records: Sequence[Mapping[str, Any]], name: str) -> float | None:
-    found = [each[name] for each in records if each.get(name) is not None]
-    return float(np.median(found)) if found else None
+    return float(of(found)) if found else None
 
 
 def _column(records: Sequence[Mapping[str, Any]], name: str) -> np.ndarray:

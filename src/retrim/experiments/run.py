@@ -57,17 +57,15 @@ class Run:
         self.watch = Stopwatch()
         self.taken_over = 0
         """Parts, and networks that take long to train, that an earlier run had made."""
-        self._has_parts = any((self.folder / PARTS).glob("*"))
-        self._replaces = any(self.folder.glob("*.json"))
         self.stop = stop or threading.Event()
         commit(), code()  # as they are now: the run may last for hours
         check_writable(self.folder)
 
     def of_earlier(self) -> str:
-        """Return what becomes of the results of an earlier run of the folder, in a line; empty if there are none."""
-        if self._has_parts:
+        """Return what becomes of what lies in the folder, in a line; empty if there is nothing."""
+        if any((self.folder / PARTS).glob("*")):
             return f"results in {self.folder}: what the same code made there of the same things stays, the rest goes"
-        return f"results in {self.folder} are replaced" if self._replaces else ""
+        return f"results in {self.folder} are replaced" if any(self.folder.glob("*.json")) else ""
 
     @property
     def interrupted(self) -> bool:

@@ -104,14 +104,16 @@ def run_sweep(sweep: Sweep, run: Run, reporter: Reporter) -> Rows:
         for scenario in sweep.scenarios():
             scenario.make(fleet.preset.vehicle, dt=fleet.preset.dt)  # a package may be missing
     kept = _Kept(run.folder / "flights.jsonl")
-    for preset in presets:
+    # Once, before anything is flown: a file that is changed meanwhile is another one for the next run only.
+    keys = [{spec: _key(fleet.preset, spec, fleet.seconds) for spec in fleet.specs} for fleet in fleets]
+    for preset, of_fleet in zip(presets, keys, strict=True):
         with run.interruptible():
-            _fly(_fleet(preset, _trained(preset, sweep, run, reporter), sweep), kept, run, reporter)
+            _fly(_fleet(preset, _trained(preset, sweep, run, reporter), sweep), of_fleet, kept, run, reporter)
         if run.interrupted:
             break
-    keys = [_key(fleet.preset, spec, fleet.seconds) for fleet in fleets for spec in fleet.specs]
-    earlier = len(kept.earlier.intersection(keys))
-    return _report(sweep, [kept.rows[key] for key in keys if key in kept.rows], run, reporter, earlier)
+    every = [key for of_fleet in keys for key in of_fleet.values()]
+    earlier = len(kept.earlier.intersection(every))
+    return _report(sweep, [kept.rows[key] for key in every if key in kept.rows], run, reporter, earlier)
 
 
 def _fleet(preset: Preset, policies: Mapping[int, Policy], sweep: Sweep) -> Fleet:
@@ -123,9 +125,8 @@ def _untrained(preset: Preset, sweep: Sweep) -> dict[int, Policy]:
     return dict.fromkeys(sweep.seeds, Setup.of(preset).new_policy(random.key(0)))
 
 
-def _fly(fleet: Fleet, kept: "_Kept", run: Run, reporter: Reporter) -> None:
+def _fly(fleet: Fleet, keys: Mapping[FlightSpec, str], kept: "_Kept", run: Run, reporter: Reporter) -> None:
     """Fly what is missing, and keep what has landed."""
-    keys = {spec: _key(fleet.preset, spec, fleet.seconds) for spec in fleet.specs}
     missing = [spec for spec, key in keys.items() if key not in kept.rows]
     if not missing or run.interrupted:
         return

@@ -75,8 +75,8 @@ def everything(run: Run, reporter: Reporter, *, quick: bool = False) -> None:
         part = Run("reproduce", place, stop=run.stop, remark=remark, trained=run.folder, executor=run.executor)
         done = run.folder / PARTS / f"{section_key(table=name, options=options)}.done"
         page = run.folder / row["page"]
-        before = json.loads(done.read_text()) if done.is_file() and page.is_file() else {"page": None}
-        if before.pop("page") == (digest_of(page) if page.is_file() else ""):
+        before = json.loads(done.read_text()) if done.is_file() and page.is_file() else None
+        if before is not None and before.pop("page") == digest_of(page):
             reporter.say(f"{name}: as an earlier run of this folder has made it")
             document.earlier += 1
             row |= before
