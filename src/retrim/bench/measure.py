@@ -42,9 +42,8 @@ def bench(run: Run, reporter: Reporter, *, works: Sequence[str] = tuple(WORKS)) 
         raise ConfigError(f"no work {', '.join(unknown)}; there are {', '.join(WORKS)}")
     rows, machine, failed = list[dict[str, Any]](), dict[str, dict[str, float]](), False
     with tempfile.TemporaryDirectory() as cache, reporter.progress("bench") as advance:
-        for i, name in enumerate(
-            sorted(works, key=lambda name: name == "programs-warm")
-        ):  # it fills what is to be cold
+        # What is warm comes last: it fills the folder in which the others are cold.
+        for i, name in enumerate(sorted(works, key=lambda name: name == "programs-warm")):
             advance(i / len(works), WORKS[name].title)
             if WORKS[name].two_cores and "one" not in CORES:
                 reporter.say(f"{name}: left out, it needs two cores that a process may choose")

@@ -3,4 +3,4 @@
 PHASE = 0.1  # of a tick, by which the process that flies is behind the plant
 SHARE = 0.6  # of a tick, for which a command is waited for; the rest is for a simulation, or for the upkeep of a link
 MARGIN = 0.1  # of a tick, for messages on their way and for a decision that takes longer than it usually does
-ROOM = 0.4  # of a tick, that a decision usually takes at most: what the others leave of SHARE
+ROOM = SHARE - PHASE - MARGIN  # of a tick, that a decision usually takes at most
