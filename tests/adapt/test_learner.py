@@ -24,7 +24,14 @@ pytestmark = pytest.mark.usefixtures("optax_promotion")
 
 @pytest.fixture(scope="module")
 def setup():
-    return Setup.of(tiny_preset())
+    """Its rate for low-rank deltas is another than that for all weights."""
+    return Setup.of(tiny_preset(adapt={"low_rank_learning_rate": 0.04}))
+
+
+@pytest.fixture(scope="module")
+def fresh(setup):
+    """State of the learner before the first fit."""
+    return setup.learner.init(setup.new_policy(random.key(0)), random.key(0))
 
 
 @pytest.fixture(scope="module")
