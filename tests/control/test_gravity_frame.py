@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax import random
+from jax import lax, random
 
 from helpers import GOAL, hover_env, hover_task, random_command, random_state, replaced
 from retrim.adapt.views import GravityView, RestView, WorldView
@@ -28,6 +28,18 @@ LIMIT = jnp.array(6.0)
 PUSHES = [(0.0, 0.0, 0.0), (2.0, 2.0, 2.0), (-3.0, 1.0, -2.5), (0.0, 0.0, -6.0), (5.0, -3.0, 1.0)]
 
 
+roll = eqx.filter_jit(rollout)
+
+
+fresh = eqx.filter_jit(lambda size, key: Policy.of(size, small(), key=key, hidden=(8, 8)))
+awake = eqx.filter_jit(lambda size, key: jax.tree.map(lambda leaf: leaf + 0.02, fresh(size, key)))
+
+
+def always(d, x, u):
+    """A residual that is ``d`` everywhere; with ``eqx.Partial`` a value, another of which compiles nothing."""
+    return d
+
+
 def close(a, b, atol=1e-12):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=atol), a, b)
 
@@ -43,23 +55,26 @@ def test_felt_gravity_is_standard_gravity_in_the_frame(d):
     np.testing.assert_allclose(frame.Q @ axis, axis, atol=1e-9)
 
 
-@pytest.mark.parametrize("d", PUSHES)
-@pytest.mark.parametrize("state_dependent", [False, True])
-def test_a_tick_in_the_frame_is_a_tick_in_the_world(d, state_dependent, key):
+@pytest.mark.parametrize("model", [PointMass(0.02), Lagged(PointMass(0.02), jnp.array(0.03))], ids=["bare", "lagged"])
+def test_a_tick_in_the_frame_is_a_tick_in_the_world(model, key):
     """From any state, under any command, with any residual: one tick of Eq. (1), turned before or after."""
-    d, (k_x, k_u) = jnp.array(d), random.split(key)
+    k_x, k_u = random.split(key)
     x, u = random_state(k_x), random_command(k_u)
-    drag = 0.3 if state_dependent else 0.0
-    residual = lambda x, u: d - drag * x.v + drag * u.c * x.R[:, 0]  # noqa: E731
-    frame = FeltFrame.of(d)
-    left = lambda x, u: frame.vector(residual(frame.world_state(x), frame.world_command(u)) - d)  # noqa: E731
-    for model in (PointMass(0.02), Lagged(PointMass(0.02), jnp.array(0.03))):
+
+    def ticks(d, drag):
+        residual = lambda x, u: d - drag * x.v + drag * u.c * x.R[:, 0]  # noqa: E731
+        frame = FeltFrame.of(d)
+        left = lambda x, u: frame.vector(residual(frame.world_state(x), frame.world_command(u)) - d)  # noqa: E731
         world, inside = Hybrid(model, residual), Hybrid(model, left)
         s, turned = world.init(x), inside.init(frame.state(x))
         if isinstance(model, Lagged):  # its actuators hover at first, in the world as in the frame
             turned = replaced(turned, acting=frame.command(s.acting))
         s, turned = world.step(s, u, jnp.zeros(3)), inside.step(turned, frame.command(u), jnp.zeros(3))
-        close(inside.state(turned), frame.state(world.state(s)))
+        return inside.state(turned), frame.state(world.state(s))
+
+    all_pushes = jax.jit(jax.vmap(ticks, in_axes=(0, None)))
+    for drag in (0.0, 0.3):  # without, and with a part that depends on the state
+        close(*all_pushes(jnp.array(PUSHES), jnp.array(drag)))
 
 
 def test_into_the_frame_and_back_is_nothing(key):
@@ -69,51 +84,59 @@ def test_into_the_frame_and_back_is_nothing(key):
     close(frame.world_command(frame.command(u)), u)
 
 
-@pytest.mark.parametrize("d", PUSHES)
 @pytest.mark.parametrize("make", [circle, figure8, star])
-def test_flatness_flies_the_turned_reference(make, d):
+def test_flatness_flies_the_turned_reference(make):
     """The reference's command in the frame, taken back to the world, gives its acceleration under the push."""
-    d = jnp.array(d)
-    frame, reference = FeltFrame.of(d), make()
-    times = jnp.array([0.0, 0.8, 2.2, 4.3, 5.1])
-    here = jax.vmap(reference)(times)
-    turned = jax.vmap(reference.in_frame(frame))(times)
-    close(turned.p, jax.vmap(frame.vector)(here.p))
-    close(turned.v, jax.vmap(frame.vector)(here.v))
-    thrust = np.asarray(turned.u)[:, 0] / float(frame.scale)
-    needed = np.linalg.norm(np.asarray(here.a) - np.array([0.0, 0.0, -9.81]) - np.asarray(d), axis=1)
+    reference, times, away = make(), jnp.array([0.0, 0.8, 2.2, 4.3, 5.1]), HOME + jnp.array([0.1, 0.7, -0.2])
+
+    @jax.jit
+    @jax.vmap
+    def seen(d):
+        frame = FeltFrame.of(d)
+        here, framed = jax.vmap(reference)(times), reference.in_frame(frame)
+        turned = jax.vmap(framed)(times)
+        close_to = (jax.vmap(frame.vector)(here.p), jax.vmap(frame.vector)(here.v))
+        inside = framed.distance(frame.vector(away)) / frame.scale
+        return here, turned, close_to, frame.scale, framed.lap, (inside, reference.distance(away))
+
+    here, turned, (p, v), scale, lap, (inside, outside) = jax.tree.map(np.asarray, seen(jnp.array(PUSHES)))
+    close(turned.p, p)
+    close(turned.v, v)
+    thrust = turned.u[..., 0] / scale[:, None]
+    needed = np.linalg.norm(here.a - np.array([0.0, 0.0, -9.81]) - np.array(PUSHES)[:, None], axis=-1)
     np.testing.assert_allclose(thrust, needed, rtol=1e-6)
-    if not d.any():
-        np.testing.assert_allclose(turned.u, here.u, atol=0.02)
-    np.testing.assert_array_equal(reference.in_frame(frame).lap, reference.lap)
-    away = HOME + jnp.array([0.1, 0.7, -0.2])
-    inside = reference.in_frame(frame).distance(frame.vector(away)) / frame.scale
-    np.testing.assert_allclose(inside, reference.distance(away), rtol=1e-6)
+    assert PUSHES[0] == (0.0, 0.0, 0.0)
+    np.testing.assert_allclose(turned.u[0], here.u[0], atol=0.02)
+    np.testing.assert_array_equal(lap, np.broadcast_to(reference.lap, lap.shape))
+    np.testing.assert_allclose(inside, outside, rtol=1e-6)
 
 
-@pytest.mark.parametrize("d", [(2.0, -1.0, 1.5), (0.0, 3.0, -2.0)])
-def test_the_turned_command_follows_the_turned_path(d):
+def test_the_turned_command_follows_the_turned_path():
     """From the reference's own state its rates keep the thrust where the path needs it, over a second."""
-    frame = FeltFrame.of(jnp.array(d))
-    reference = circle().in_frame(frame)
 
-    def attitude(t):
-        here = reference(t)
-        z = here.a + jnp.array([0.0, 0.0, 9.81])
-        z = z / jnp.linalg.norm(z)
-        y = jnp.cross(z, jnp.array([1.0, 0.0, 0.0]))
-        y = y / jnp.linalg.norm(y)
-        return jnp.stack([jnp.cross(y, z), y, z], axis=1)
+    @jax.jit
+    @jax.vmap
+    def ends(d):
+        reference = circle().in_frame(FeltFrame.of(d))
 
-    model = PointMass(0.005)
+        def attitude(t):
+            here = reference(t)
+            z = here.a + jnp.array([0.0, 0.0, 9.81])
+            z = z / jnp.linalg.norm(z)
+            y = jnp.cross(z, jnp.array([1.0, 0.0, 0.0]))
+            y = y / jnp.linalg.norm(y)
+            return jnp.stack([jnp.cross(y, z), y, z], axis=1)
 
-    def tick(k, x):
-        return model.step(x, Command.of(reference(4.0025 + 0.005 * k).u), jnp.zeros(3))
+        model = PointMass(0.005)
 
-    begin, end = jnp.array(4.0), jnp.array(5.0)
-    x = State(reference(begin).p, attitude(begin), reference(begin).v)
-    x = jax.lax.fori_loop(0, 200, tick, x)
-    np.testing.assert_allclose(x.p, reference(end).p, atol=0.002)
+        def tick(k, x):
+            return model.step(x, Command.of(reference(4.0025 + 0.005 * k).u), jnp.zeros(3))
+
+        begin, end = jnp.array(4.0), jnp.array(5.0)
+        x = State(reference(begin).p, attitude(begin), reference(begin).v)
+        return lax.fori_loop(0, 200, tick, x).p, reference(end).p
+
+    np.testing.assert_allclose(*ends(jnp.array([(2.0, -1.0, 1.5), (0.0, 3.0, -2.0)])), atol=0.002)
 
 
 @pytest.mark.parametrize("kind", [Track, L2Track])
@@ -121,29 +144,36 @@ def test_a_turned_task_sees_and_rewards_the_same(kind, key):
     """The reference's own state has the same reward, and what a preview shows is turned and scaled."""
     reference, frame = figure8(), FeltFrame.of(jnp.array([1.0, 2.0, -1.0]))
     task = kind(reference, Preview(reference, small().omega_max), jnp.array(1.0), jnp.array(5.0), 0.02, 50)
-    turned, t, x = task.in_frame(frame), jnp.array(4.2), random_state(key)
-    memory = task.observation.init(x)
-    seen, _ = task.observation(memory, t, x, Command.hover())
-    inside, _ = turned.observation(memory, t, frame.state(x), Command.hover())
-    for k in (0, 3, 6, 9, 12, 15, 18, 30):  # positions, velocities, and its own velocity
-        np.testing.assert_allclose(inside[k : k + 3], frame.vector(seen[k : k + 3]), atol=1e-9)
-    np.testing.assert_allclose(turned.error(t, frame.state(x)), frame.scale * task.error(t, x), rtol=1e-9)
-    at = turned.reference(t)
-    there = State(at.p, jnp.eye(3), at.v)
-    heads = 0.5 * (1.0 - np.cos(float(at.heading)))
+    t, x = jnp.array(4.2), random_state(key)
+
+    @eqx.filter_jit
+    def both(task, frame):
+        turned, memory = task.in_frame(frame), task.observation.init(x)
+        outside, _ = task.observation(memory, t, x, Command.hover())
+        inside, _ = turned.observation(memory, t, frame.state(x), Command.hover())
+        vectors = [(inside[k : k + 3], frame.vector(outside[k : k + 3])) for k in (0, 3, 6, 9, 12, 15, 18, 30)]
+        at = turned.reference(t)
+        reward = turned.reward(t, State(at.p, jnp.eye(3), at.v), Command.of(at.u))
+        return vectors, turned.error(t, frame.state(x)), frame.scale * task.error(t, x), at.heading, reward
+
+    vectors, error, scaled, heading, reward = both(task, frame)
+    for inside, outside in vectors:  # positions, velocities, and its own velocity
+        np.testing.assert_allclose(inside, outside, atol=1e-9)
+    np.testing.assert_allclose(error, scaled, rtol=1e-9)
+    heads = 0.5 * (1.0 - np.cos(float(heading)))
     if kind is L2Track:
-        np.testing.assert_allclose(turned.reward(t, there, Command.of(at.u)), -heads, atol=1e-9)
+        np.testing.assert_allclose(reward, -heads, atol=1e-9)
 
 
 @pytest.mark.parametrize("d", [(2.0, -1.0, 1.5), (-2.0, 2.0, 2.0)])
 def test_a_constant_push_leaves_nothing_to_learn(d, key):
     """Roll-outs in the view under a known push are those without one, in the frame; so are their rewards."""
     env, d = hover_env(horizon=25), jnp.array(d)  # too short to be terminated
-    frame, policy = FeltFrame.of(d), Policy.of(15, small(), key=key, hidden=(8, 8))
+    frame, policy = FeltFrame.of(d), fresh(15, key)
     start = Start(jnp.array(0.0), random_state(key))
-    pushed = eqx.filter_jit(rollout)(GravityView(LIMIT)(env, lambda x, u: d), policy, start)
+    pushed = roll(GravityView(LIMIT)(env, eqx.Partial(always, d)), policy, start)
     calm_env, calm_start = Env(env.dynamics, env.task.in_frame(frame)), Start(start.t, frame.state(start.x))
-    calm = eqx.filter_jit(rollout)(calm_env, policy, calm_start)
+    calm = roll(calm_env, policy, calm_start)
     close(jax.vmap(frame.state)(pushed.x), calm.x, 1e-9)
     close(jax.vmap(frame.command)(pushed.u), calm.u, 1e-9)
     np.testing.assert_allclose(pushed.reward, calm.reward, atol=1e-9)
@@ -165,7 +195,7 @@ def test_the_frame_sends_no_gradient_back(key):
     def tilt(v):
         return view.frame(replaced(x, v=v), Command.hover()).Q
 
-    np.testing.assert_array_equal(jax.jacobian(tilt)(x.v), 0.0)
+    np.testing.assert_array_equal(jax.jit(jax.jacobian(tilt))(x.v), 0.0)
 
 
 def test_what_is_known_needs_no_estimate(key):
@@ -173,17 +203,23 @@ def test_what_is_known_needs_no_estimate(key):
     d = jnp.array([1.0, 0.0, -2.0])
     residual = lambda x, u: d - 0.4 * x.v + 0.1 * (u.c - 9.81) * x.R[:, 2]  # noqa: E731
     x, u = random_state(key), random_command(key)
-    np.testing.assert_allclose(Unsteady(residual)(x, u) + d, residual(x, u), atol=1e-12)
     observer = DisturbanceObserver(PointMass(0.02), jnp.array(1e-9), LIMIT, jnp.array(jnp.inf))
-    policy = Policy.of(15, small(), key=key, hidden=(8, 8))
-    framed = GravityFrame(PolicyController(hover_env().task.observation, policy), observer, residual)
-    memory = framed.init(x)
-    seen = observer(memory.observer, jnp.array(-0.02), x)
-    memory = replaced(memory, observer=observer.issued(seen, u))  # no delay is declared: it acts at once
-    after = Hybrid(PointMass(0.02), residual).step(x, u, jnp.zeros(3))
-    _, memory = framed(memory, jnp.array(0.0), after)
-    np.testing.assert_allclose(memory.observer.d_hat, d, atol=1e-6)
-    np.testing.assert_allclose(memory.frame.d, residual(after, u), atol=1e-6)
+    framed = GravityFrame(PolicyController(hover_env().task.observation, fresh(15, key)), observer, residual)
+
+    @jax.jit
+    def seen():
+        memory = framed.init(x)
+        first = observer(memory.observer, jnp.array(-0.02), x)
+        memory = replaced(memory, observer=observer.issued(first, u))  # no delay is declared: it acts at once
+        after = Hybrid(PointMass(0.02), residual).step(x, u, jnp.zeros(3))
+        _, memory = framed(memory, jnp.array(0.0), after)
+        apart = Unsteady(residual)(x, u) + d, residual(x, u)
+        return apart, memory.observer.d_hat, (memory.frame.d, residual(after, u))
+
+    apart, d_hat, both = seen()
+    np.testing.assert_allclose(*apart, atol=1e-12)
+    np.testing.assert_allclose(d_hat, d, atol=1e-6)
+    np.testing.assert_allclose(*both, atol=1e-6)
 
 
 def test_the_frame_is_capped_and_defined_near_free_fall():
@@ -203,24 +239,30 @@ def test_what_a_pose_filter_feels_turns_the_picture(key):
     d, x = jnp.array([1.5, -1.0, 2.0]), State(HOME + jnp.array([0.1, -0.1, 0.1]), jnp.eye(3), jnp.zeros(3))
     frame = FeltFrame.of(d)
     full = Keypoints.of(HOME, small().omega_max, whitened=False)
-    policy = Policy.of(full.size, small(), key=key, hidden=(8, 8))
-    policy = jax.tree.map(lambda leaf: leaf + 0.02, policy)
+    policy = awake(full.size, key)
     controller = SeenFrame(PolicyController(OccludedKeypoints(full, jnp.array(1.0)), policy), LIMIT)
-    memory, last = controller.init(x)
+    calm = PolicyController(full.in_frame(frame), policy)
+
+    @jax.jit
+    def decided():
+        memory, last = controller.init(x)
+        sure = replaced(memory.pose, x=replaced(x, v=-0.02 * d), d=d, P=1e-12 * jnp.eye(12))
+        calmly = jnp.zeros((3, 4)).at[:, 0].set(1.0 / frame.scale - 1.0)  # what has been hover in the frame
+        memory = memory._replace(
+            commands=calmly, pose=sure, poses=jax.tree.map(lambda leaf: jnp.repeat(leaf[None], 13, axis=0), x)
+        )
+        u, after = controller((memory, last), jnp.array(0.0), x)
+        start = calm.init(frame.state(x))
+        wanted, _ = calm((start[0], frame.command(last)), jnp.array(0.0), frame.state(x))
+        turned = frame.command(u).vector(), wanted.vector()
+        return turned, (after[1], u), (controller.accepted(after, last)[1], last)
+
     back = PointMass(0.02).step(State(x.p, x.R, -x.v), Command.hover(), jnp.zeros(3))
     close(back.p, x.p)  # it hovers: a tick ago it was here
-    sure = replaced(memory.pose, x=replaced(x, v=-0.02 * d), d=d, P=1e-12 * jnp.eye(12))
-    calmly = jnp.zeros((3, 4)).at[:, 0].set(1.0 / frame.scale - 1.0)  # what has been hover in the frame
-    memory = memory._replace(
-        commands=calmly, pose=sure, poses=jax.tree.map(lambda leaf: jnp.repeat(leaf[None], 13, axis=0), x)
-    )
-    u, after = eqx.filter_jit(controller)((memory, last), jnp.array(0.0), x)
-    calm = PolicyController(full.in_frame(frame), policy)
-    start = calm.init(frame.state(x))
-    wanted, _ = eqx.filter_jit(calm)((start[0], frame.command(last)), jnp.array(0.0), frame.state(x))
-    np.testing.assert_allclose(frame.command(u).vector(), wanted.vector(), atol=1e-4)
-    close(after[1], u)
-    close(controller.accepted(after, last)[1], last)
+    turned, remembered, accepted = decided()
+    np.testing.assert_allclose(*turned, atol=1e-4)
+    close(*remembered)
+    close(*accepted)
 
 
 def test_what_a_roll_out_remembers_of_pictures_is_of_the_frame_that_it_flies_in(key):
@@ -239,9 +281,9 @@ def test_what_a_roll_out_remembers_of_pictures_is_of_the_frame_that_it_flies_in(
     env = eqx.tree_at(lambda e: e.task.observation, env, looking)
     frame = FeltFrame.of(d)
     at_rest = State(HOME, frame.world_state(State.at(frame.vector(HOME))).R, jnp.zeros(3))
-    policy = Policy.of(full.size, small(), key=key, hidden=(4,))
+    policy = fresh(full.size, key)
     still = eqx.tree_at(lambda p: p.layers[-1].weight, policy, jnp.zeros_like(policy.layers[-1].weight))
-    eqx.filter_jit(rollout)(env, still, Start(jnp.array(0.0), at_rest))
+    roll(env, still, Start(jnp.array(0.0), at_rest))
     jax.effects_barrier()
     first = seen[0]
     np.testing.assert_allclose(first, np.repeat(first[-1:], len(first), axis=0), atol=1e-9)
@@ -260,54 +302,58 @@ def test_training_on_keypoints_sees_one_frame(key):
 @pytest.mark.parametrize("tracking", [False, True])
 def test_a_flight_under_a_known_push_is_the_calm_flight_turned(d, tracking):
     """With a perfect estimate, a controller flies under a push as without one, in the frame."""
-    env, d = hover_env(horizon=60), jnp.array(d)
+    env, d = hover_env(horizon=40), jnp.array(d)
     frame, x0 = (
         FeltFrame.of(d),
         State(HOME + jnp.array([0.2, -0.1, 0.3]), so3.exp(jnp.array([0.1, 0.2, 0.0])), jnp.zeros(3)),
     )
     if tracking:
         reference = circle()
-        task = Track(reference, Preview(reference, small().omega_max), jnp.array(1.0), jnp.array(5.0), 0.02, 60)
+        task = Track(reference, Preview(reference, small().omega_max), jnp.array(1.0), jnp.array(5.0), 0.02, 40)
         env = Env(PointMass(0.02), task)
-    policy = Policy.of(env.task.observation.size, small(), key=random.key(3), hidden=(8, 8))
+    policy = fresh(env.task.observation.size, random.key(3))
     inner = PolicyController(env.task.observation, policy)
     exact = DisturbanceObserver(PointMass(0.02), jnp.array(1e-9), jnp.array(9.0), jnp.array(jnp.inf))
     framed = GravityFrame(inner, exact)
     start = Start(jnp.array(0.0), frame.state(x0))
-    calm = eqx.filter_jit(rollout)(Env(PointMass(0.02), env.task.in_frame(frame)), policy, start)
+    calm = roll(Env(PointMass(0.02), env.task.in_frame(frame)), policy, start)
 
-    @jax.jit
-    def tick(memory, x, k):
-        u, memory = framed(memory, 0.02 * k, x)
-        return memory, PointMass(0.02).step(x, u, d)
-
-    x, memory = x0, framed.init(x0)
+    memory = framed.init(x0)
     memory = replaced(memory, observer=replaced(memory.observer, d_hat=d))
-    positions = []
-    for k in range(40):
-        positions.append(frame.vector(x.p))
-        memory, x = tick(memory, x, jnp.array(float(k)))
-    np.testing.assert_allclose(np.stack(positions), calm.x.p[:40], atol=1e-6)
+    positions = _positions(framed, d, memory, x0)
+    np.testing.assert_allclose(jax.vmap(frame.vector)(positions), calm.x.p, atol=1e-6)
+
+
+@eqx.filter_jit
+def _positions(framed, d, memory, x):
+    """Of 40 ticks under the push ``d``."""
+
+    def tick(carry, k):
+        memory, x = carry
+        u, memory = framed(memory, 0.02 * k, x)
+        return (memory, PointMass(0.02).step(x, u, d)), x.p
+
+    return lax.scan(tick, (memory, x), jnp.arange(40.0))[1]
 
 
 def test_a_known_rate_bias_is_taken_off_the_command(key):
     """A vehicle that turns too fast flies, tick for tick, as one that does not; the policy remembers what it meant."""
-    bias, policy = jnp.array([0.3, -0.2, 0.1]), Policy.of(23, small(), key=key, hidden=(8, 8))
+    bias, policy = jnp.array([0.3, -0.2, 0.1]), awake(23, key)
     observer = DisturbanceObserver(PointMass(0.02), jnp.array(0.05), LIMIT, jnp.array(4.0))
-    inner = PolicyController(hover_env(history=2).task.observation, jax.tree.map(lambda leaf: leaf + 0.02, policy))
+    inner = PolicyController(hover_env(history=2).task.observation, policy)
     age = jnp.array(0.01)
     plain, told_less = (GravityFrame(inner, observer, age=age, rate_bias=b) for b in (jnp.zeros(3), bias))
 
     @eqx.filter_jit
     def fly(controller, model):
-        x, trail = State.at(HOME + 0.1), []
-        memory = controller.init(x)
-        for i in range(10):
-            u, memory = controller(memory, jnp.array(0.02 * i), x)
-            memory = controller.accepted(memory, u)
+        def tick(carry, i):
+            x, memory = carry
+            u, memory = controller(memory, 0.02 * i, x)
             x = model.step(x, u, jnp.zeros(3))
-            trail.append(x)
-        return trail
+            return (x, controller.accepted(memory, u)), x
+
+        x = State.at(HOME + 0.1)
+        return lax.scan(tick, (x, controller.init(x)), jnp.arange(10.0))[1]
 
     close(fly(told_less, RateBiased(PointMass(0.02), bias)), fly(plain, PointMass(0.02)), 1e-9)
 
