@@ -14,7 +14,7 @@ from retrim import learn
 from retrim.control import Policy
 from retrim.learn import Env, PolicyState, pretrain
 from retrim.learn.residuals import EnsembleResidual
-from retrim.physics import Command, Hybrid, LinearDragQuadrotor, PointMass, State, StraightThrough, small
+from retrim.physics import Hybrid, LinearDragQuadrotor, PointMass, State, StraightThrough, small
 from retrim.tasks import Start
 
 # As programs: eagerly, each call compiles its scan again.

@@ -20,7 +20,7 @@ SECOND = EnsembleModel(jnp.array(GOAL), small().omega_max, jnp.array(1e-2), jnp.
 MODEL = LayeredModel(FIRST, SECOND)
 N = 100
 
-fit = eqx.filter_jit(MODEL.fit)
+fit, fresh = eqx.filter_jit(MODEL.fit), eqx.filter_jit(MODEL.init)
 alone = eqx.filter_jit(lambda rows: FIRST.fit(FIRST.init(random.key(0)), rows)[0])
 
 
@@ -49,7 +49,7 @@ def missed(state, rows, first=None):
 
 def flown(field, key, fits=20):
     """What both layers, and the closed form alone, miss ten ticks ahead of each window of one flight."""
-    state, errors = MODEL.init(key), []
+    state, errors = fresh(key), []
     for i in range(fits):
         state, _ = fit(state, rows_of(field, key, jnp.array(10.0 * i)))
         ahead = rows_of(field, key, jnp.array(10.0 * i + 10.0))
@@ -62,9 +62,15 @@ def jet(x, u):
     return jnp.array([1.0, 0.0, 0.0]) + 3.0 * jnp.tanh(2.0 * x.p[2] - 2.0) * jnp.array([0.0, 1.0, 0.5])
 
 
-def test_what_the_closed_form_leaves_is_learnt(key):
+@pytest.fixture(scope="module")
+def in_the_jet():
+    with jax.numpy_dtype_promotion("standard"):
+        return flown(jet, random.key(0))
+
+
+def test_what_the_closed_form_leaves_is_learnt(in_the_jet):
     """The ensemble takes a part of it off, and in no window does it add to it."""
-    _, errors = flown(jet, key)
+    _, errors = in_the_jet
     both, alone = errors.T
     assert both[5:].mean() < 0.93 * alone[5:].mean()
     assert (both < 1.03 * alone).all()
@@ -73,7 +79,7 @@ def test_what_the_closed_form_leaves_is_learnt(key):
 def test_noise_is_not_learnt(key):
     """White noise, and noise of a velocity, whose differences are the targets: the share is next to nothing."""
     push = lambda x, u: jnp.array([1.0, -0.5, 0.0])  # noqa: E731
-    state = MODEL.init(key)
+    state = fresh(key)
     for i, k in enumerate(random.split(key, 10)):
         rows = rows_of(push, key, jnp.array(10.0 * i))
         dv = 0.01 * random.normal(k, (N + 1, 3))
@@ -86,15 +92,15 @@ def test_noise_is_not_learnt(key):
     assert float(state.share) < 0.2
 
 
-def test_an_ensemble_that_was_fitted_to_another_world_is_not_believed(key):
+def test_an_ensemble_that_was_fitted_to_another_world_is_not_believed(in_the_jet, key):
     """The world changes; the ensemble knows the old one. Within two fits the closed form alone is no better."""
-    state, _ = flown(jet, key)
+    state, _ = in_the_jet
     opposite = lambda x, u: -jet(x, u)  # noqa: E731
     for i in range(2):
         rows = rows_of(opposite, key, jnp.array(250.0 + 10.0 * i))
         state, _ = fit(state, rows)
-    fresh = rows_of(opposite, key, jnp.array(280.0))
-    assert float(missed(state, fresh)) < 1.1 * float(missed(state, fresh, alone(rows)))
+    ahead = rows_of(opposite, key, jnp.array(280.0))
+    assert float(missed(state, ahead)) < 1.1 * float(missed(state, ahead, alone(rows)))
 
 
 def test_it_is_a_residual_model():
@@ -104,7 +110,7 @@ def test_it_is_a_residual_model():
 def test_it_knows_how_the_vehicle_turns_as_the_closed_form_does(key):
     rows = rows_of(jet, key)
     rows = eqx.tree_at(lambda r: r.omega, rows, rows.omega + jnp.array([[0.3, 0.0, -0.2]]))
-    state, _ = fit(MODEL.init(key), rows)
+    state, _ = fit(fresh(key), rows)
     np.testing.assert_allclose(MODEL.turning(state).bias, [0.3, 0.0, -0.2], atol=0.02)
 
 

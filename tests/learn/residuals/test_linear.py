@@ -1,12 +1,13 @@
 """The linear residual: recursive least squares equals one least squares of all rows; what is counted, and how often."""
 
 import dataclasses
+from functools import partial
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import random
+from jax import lax, random
 
 from helpers import random_command, random_state, replaced
 from retrim.learn.residuals import LinearModel, Targets
@@ -18,6 +19,7 @@ STEP = round(EVERY / DT)
 MODEL = LinearModel.of(DT, every=EVERY, memory=1.5, noise=0.4)
 
 
+@partial(jax.jit, static_argnames="n")
 def flight(key, n=120, noise=0.3):
     """Random states and commands, and what random weights make of them."""
     k_x, k_u, k_w, k_noise = random.split(key, 4)
@@ -28,15 +30,19 @@ def flight(key, n=120, noise=0.3):
     return Targets(x, u, a_res, u.omega, jnp.ones(n, dtype=bool))
 
 
+fit = eqx.filter_jit(lambda model, state, rows: model.fit(state, rows))
+features = jax.jit(jax.vmap(features_of))
+
+
 def part(rows, start, stop):
-    return jax.tree.map(lambda leaf: leaf[start:stop], rows)
+    return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[start:stop]), rows)
 
 
 def carried(model, rows, count):
     """States after each of ``count`` windows of N rows, STEP apart."""
-    fit, state, states = eqx.filter_jit(model.fit), model.init(random.key(0)), []
+    state, states = model.init(random.key(0)), []
     for k in range(count):
-        state, rms = fit(state, part(rows, k * STEP, k * STEP + N))
+        state, rms = fit(model, state, part(rows, k * STEP, k * STEP + N))
         states.append((state, rms))
     return states
 
@@ -50,14 +56,14 @@ def test_windows_one_by_one_are_all_rows_at_once(key):
     rows, count = flight(key), 5
     states = carried(MODEL, rows, count)
     seen = N + (count - 1) * STEP
-    features = np.asarray(jax.vmap(features_of)(rows.x, rows.u))[:seen]
+    phi = np.asarray(features(rows.x, rows.u))[:seen]
     weight = np.exp(-DT * np.arange(seen - 1, -1, -1) / 1.5) / 0.4**2
-    precision = np.diag(1.0 / np.asarray(MODEL.prior) ** 2) + features.T @ (weight[:, None] * features)
-    wanted = np.linalg.solve(precision, features.T @ (weight[:, None] * np.asarray(rows.a_res)[:seen]))
+    precision = np.diag(1.0 / np.asarray(MODEL.prior) ** 2) + phi.T @ (weight[:, None] * phi)
+    wanted = np.linalg.solve(precision, phi.T @ (weight[:, None] * np.asarray(rows.a_res)[:seen]))
     state, rms = states[-1]
     np.testing.assert_allclose(state.weights, wanted, rtol=1e-7, atol=1e-10)
     np.testing.assert_allclose(state.covariance, np.linalg.inv(precision), rtol=1e-7, atol=1e-12)
-    error = np.asarray(rows.a_res)[seen - N : seen] - features[-N:] @ wanted
+    error = np.asarray(rows.a_res)[seen - N : seen] - phi[-N:] @ wanted
     np.testing.assert_allclose(rms, np.sqrt(np.mean(np.sum(error**2, axis=1))), rtol=1e-7)
 
 
@@ -65,10 +71,11 @@ def test_it_becomes_more_certain_and_is_as_wrong_as_it_says(key):
     rows = flight(key, n=400)
     states = [state for state, _ in carried(replaced(MODEL, memory=jnp.array(1e6), noise=jnp.array(0.3)), rows, 15)]
     new = part(rows, 380, 400)
-    spreads = [jax.vmap(lambda x, u, s=state: MODEL.spread(s, x, u))(new.x, new.u) for state in states]
-    assert float(spreads[-1].max()) < 0.5 * float(spreads[0].max())
-    truth = jnp.linalg.norm(new.a_res - jax.vmap(lambda x, u: MODEL.predict(states[-1], x, u))(new.x, new.u), axis=1)
-    assert float(jnp.sqrt(jnp.mean(truth**2) / 3)) < 2.0 * 0.3
+    spread = eqx.filter_jit(lambda state: jax.vmap(lambda x, u: MODEL.spread(state, x, u))(new.x, new.u))
+    assert float(spread(states[-1]).max()) < 0.5 * float(spread(states[0]).max())
+    predicted = eqx.filter_jit(lambda state: jax.vmap(lambda x, u: MODEL.predict(state, x, u))(new.x, new.u))
+    error = np.asarray(new.a_res) - np.asarray(predicted(states[-1]))
+    assert np.sqrt(np.mean(error**2)) < 2.0 * 0.3
 
 
 def test_an_invalid_row_does_not_count(key):
@@ -76,27 +83,30 @@ def test_an_invalid_row_does_not_count(key):
     valid = jnp.arange(N) % 3 > 0
     spoilt = dataclasses.replace(rows, a_res=jnp.where(valid[:, None], rows.a_res, 99.0), valid=valid)
     clean = dataclasses.replace(rows, valid=valid)
-    for a, b in zip(*(jax.tree.leaves(MODEL.fit(MODEL.init(key), each)) for each in (spoilt, clean)), strict=True):
+    for a, b in zip(*(jax.tree.leaves(fit(MODEL, MODEL.init(key), each)) for each in (spoilt, clean)), strict=True):
         np.testing.assert_array_equal(a, b)
     nothing = dataclasses.replace(rows, valid=jnp.zeros(N, dtype=bool))
-    state, _ = MODEL.fit(MODEL.init(key), rows)
-    kept, _ = MODEL.fit(state, nothing)
+    state, _ = fit(MODEL, MODEL.init(key), rows)
+    kept, _ = fit(MODEL, state, nothing)
     jax.tree.map(np.testing.assert_array_equal, kept, state)
 
 
 def test_single_precision_is_enough(key):
     """Ten minutes of flight, and a memory that keeps them all."""
     rows, model = flight(key, n=2000), replaced(MODEL, memory=jnp.array(600.0))
-    fit = eqx.filter_jit(model.fit)
     single = lambda tree: jax.tree.map(lambda a: a.astype(jnp.float32) if a.dtype == jnp.float64 else a, tree)  # noqa: E731
-    small = eqx.filter_jit(single(model).fit)
+
+    @eqx.filter_jit
+    def twenty_times(model, state, window):
+        return lax.fori_loop(0, 20, lambda _, state: model.fit(state, window)[0], state)
+
     state, coarse = model.init(key), single(model.init(key))
     for k in range(15):
         window = part(rows, 100 * k, 100 * k + 100)
-        for _ in range(20):
-            state, _ = fit(state, window)
-            coarse, _ = small(coarse, single(window))
+        state = twenty_times(model, state, window)
+        coarse = twenty_times(single(model), coarse, single(window))
     new = part(rows, 1800, 1900)
-    exact, rough = (new.a_res - jax.vmap(features_of)(new.x, new.u) @ s.weights.astype(float) for s in (state, coarse))
+    phi = np.asarray(features(new.x, new.u))
+    exact, rough = (np.asarray(new.a_res) - phi @ np.asarray(s.weights, dtype=float) for s in (state, coarse))
     assert coarse.weights.dtype == jnp.float32
     np.testing.assert_allclose(rough, exact, atol=0.02)
