@@ -25,6 +25,7 @@ def size(tree):
     return sum(leaf.size for leaf in jax.tree.leaves(tree))
 
 
+@eqx.filter_jit
 def moved(lora, key):
     """With a delta that changes something."""
     leaves, shape = jax.tree.flatten(lora.delta)
@@ -38,13 +39,19 @@ def same(a, b):
     jax.tree.map(np.testing.assert_array_equal, a, b)
 
 
-@pytest.fixture
-def base(key):
+@eqx.filter_jit
+def awake(key):
+    """A policy that does not command hover."""
     fresh = Policy.of(15, small(), key=key, hidden=(8, 8))
     noise = [
         0.3 * random.normal(k, layer.weight.shape) for k, layer in zip(random.split(key, 3), fresh.layers, strict=True)
     ]
     return eqx.tree_at(lambda p: [l.weight for l in p.layers], fresh, noise)
+
+
+@pytest.fixture
+def base(key):
+    return awake(key)
 
 
 @pytest.fixture
@@ -158,7 +165,7 @@ def test_training_moves_the_delta_only_and_lowers_the_loss(key):
 @pytest.mark.usefixtures("optax_promotion")
 def test_a_gradient_that_is_not_finite_changes_nothing(lora, key):
     env, optimiser = hover_env(horizon=3), optax.adam(1e-2)
-    state = PolicyState(lora, optimiser.init(lora.params))
+    state = PolicyState(lora, jax.jit(optimiser.init)(lora.params))
     x0 = random_starts(env.task, key, 1, 2)
     broken = eqx.tree_at(lambda s: s.x.v, x0, x0.x.v.at[0, 0, 0].set(jnp.nan))
     after, losses = eqx.filter_jit(lambda s, x: bptt(s, env, x, optimiser=optimiser))(state, broken)
