@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from functools import partial
 
 import jax
 import numpy as np
@@ -70,9 +71,10 @@ def test_a_recording_shows_the_command_that_followed_a_measurement(tmp_path):
 def test_what_the_first_whole_flight_learnt_is_kept(setup, tmp_path):
     """Not of one that crashed, nor of one that does not learn; a low-rank policy leaves its delta."""
     states = [learnt(setup, seed) for seed in range(4)]
+    brief = partial(flight, 0.1, seconds=0.2)
     flights = [
-        flight(0.1, spec=SPECS[0]), flight(0.1, spec=SPECS[2], terminated=True), flight(0.1, spec=SPECS[3]),
-        flight(0.1, spec=dataclasses.replace(SPECS[3], start=2)),
+        brief(spec=SPECS[0]), brief(spec=SPECS[2], terminated=True), brief(spec=SPECS[3]),
+        brief(spec=dataclasses.replace(SPECS[3], start=2)),
     ]  # fmt: skip
     flights = [flights[0], *(dataclasses.replace(f, learnt=s) for f, s in zip(flights[1:], states, strict=False))]
     outputs.write_flights(flights, setup.preset, tmp_path)

@@ -3,13 +3,14 @@
 import json
 import signal
 import time
+import tomllib
 from pathlib import Path
 
 import jax
 import pytest
 
 from commands import OVERLAY, results, retrim, started
-from helpers import BRIEF, brief_preset
+from helpers import brief_preset
 from made_up import flight
 from retrim import ConfigError, Fleet, Scenario, Setup
 from retrim.experiments import FlightSpec, Run, provenance, sweep
@@ -107,8 +108,11 @@ def test_a_sweep_that_is_done_flies_nothing_and_a_smaller_one_reports_its_own_fl
 def test_policies_and_flights_are_of_the_code_and_the_files_that_made_them(tmp_path, monkeypatch):
     """Those of other code, or of a file that has changed since, are made again."""
     monkeypatch.chdir(tmp_path)
-    asked = Sweep(methods=("indi",), disturbances=("none",), plants=("simple",), seconds=1.0, overlay=BRIEF)
+    overlay = tomllib.loads(OVERLAY)["overlay"]
+    asked = Sweep(methods=("indi",), disturbances=("none",), plants=("simple",), seconds=1.0, overlay=overlay)
     trained = []
+    monkeypatch.setattr(sweep, "bars", lambda *_: None)
+    monkeypatch.setattr(sweep, "save", lambda figure, folder, stem: (folder / f"{stem}.png", folder / f"{stem}.svg"))
     made = sweep.train
     monkeypatch.setattr(sweep, "train", lambda *a, **k: trained.append(0) or made(*a, **k))
 

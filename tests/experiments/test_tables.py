@@ -3,17 +3,17 @@
 import dataclasses
 import importlib
 import inspect
+import itertools
 from functools import partial
 from pathlib import Path
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from commands import results, retrim
-from helpers import brief_preset, tiny_preset
+from helpers import at, brief_preset, tiny_preset
 from made_up import DT, Watching, flight, log
 from retrim import ConfigError, Scenario, Setup, changed, load
 from retrim.config import named_presets as presets
@@ -38,10 +38,16 @@ pytestmark = pytest.mark.usefixtures("as_a_user")
 LEVELS = ("none", "small", "large")
 
 
+def untrained(preset, seeds, run, reporter):
+    """In place of training, where it does not matter how well a policy flies."""
+    policy = Setup.of(preset).new_policy(jax.random.key(0))
+    return Study(preset, dict.fromkeys(seeds, policy), (0.1,) * len(seeds))
+
+
 def test_a_table_of_hover_by_its_command(tmp_path, monkeypatch):
     monkeypatch.setitem(presets.PRESETS, "hover/fast", brief_preset())
     words = "--presets", "fast", "--seeds", "0", "3", "--seconds", "1", "--starts", "1", "--plant", "simple"
-    words += "--methods", "base", "indi", "full", "lora"
+    words += "--methods", "base", "indi", "full"
     out = retrim("reproduce", "hover", *words, "--out", "t", cwd=tmp_path)
     text = (tmp_path / "t" / "hover.md").read_text()
     assert text.startswith("# Hover (Table I of the paper)\n")
@@ -51,8 +57,7 @@ def test_a_table_of_hover_by_its_command(tmp_path, monkeypatch):
     assert "t/hover.md" in out
     found = results(tmp_path / "t", "hover.json")
     methods = list(dict.fromkeys(row["method"] for row in found["rows"]))
-    assert methods[0] == "base"
-    assert {"full", "lora"} <= set(methods)
+    assert methods == ["base", "indi", "full"]
     assert [(row["disturbance"], row["method"], row["n"]) for row in found["rows"]] == [
         (level, method, 2) for level in LEVELS for method in methods
     ]
@@ -61,20 +66,21 @@ def test_a_table_of_hover_by_its_command(tmp_path, monkeypatch):
     assert (tmp_path / "t" / "hover_fast.png").stat().st_size > 10_000
 
 
-def test_a_section_of_tracking_has_cross_track_and_the_papers_rows(tmp_path):
+def test_a_section_of_tracking_has_cross_track_and_the_papers_rows(tmp_path, monkeypatch):
+    monkeypatch.setattr(levels, "train_all", untrained)
     preset = brief_preset("track/preview", track={"reference": "circle"})
     scenario = Scenario(plant="simple", reference="circle")
     circle = Levels(
-        "circle", preset, scenario, "x", ("base", "lora"), {"base": ("1", "2", "3"), "datt": ("4", "5", "6")}
+        "circle", preset, scenario, "x", ("base", "indi"), {"base": ("1", "2", "3"), "datt": ("4", "5", "6")}
     )
     document = Document(Run("test", tmp_path), "table", "Title", "Intro.", [0], Silent())
     fly_levels(document, [circle], starts=1, seconds=1.0)
     (section, figures), found = document.sections, results(tmp_path, "table.json")["rows"]
     assert [(row["disturbance"], row["method"], row["reference"]) for row in found] == [
-        (level, method, "circle") for level in LEVELS for method in ("base", "lora")
+        (level, method, "circle") for level in LEVELS for method in ("base", "indi")
     ]
     assert [row[0] for row in section.rows] == [
-        "base policy", "... in step; cross-track", "**adapted, LoRA**", "... in step; cross-track", "DATT, the paper's"
+        "base policy", "... in step; cross-track", "INDI", "... in step; cross-track", "DATT, the paper's"
     ]  # fmt: skip
     assert section.rows[0][1].endswith(" (1)")
     assert section.rows[-1] == ("DATT, the paper's", "(4)", "(5)", "(6)")
@@ -82,37 +88,51 @@ def test_a_section_of_tracking_has_cross_track_and_the_papers_rows(tmp_path):
     assert found[0]["unshifted_m"] <= found[0]["mean"] + 1e-9
     assert section.picture == tmp_path / "x.png"
     assert figures.title == "circle: large, 2 m/s² per axis"
-    assert [row[0] for row in figures.rows] == ["base policy", "**adapted, LoRA**"]
+    assert [row[0] for row in figures.rows] == ["base policy", "INDI"]
     assert "behind [s]" in figures.columns
 
 
-def test_a_run_goes_on_where_it_was_killed(tmp_path, monkeypatch):
-    """What is finished is not flown again, and the table is the same; another size, or other code, is flown."""
-    preset = brief_preset()
-    sections = [Levels(f"{n}", preset, Scenario(plant="simple"), f"x{n}", ("base", "indi")) for n in (1, 2)]
-    flown = []
-    made = levels._level_section
-    monkeypatch.setattr(levels, "_level_section", lambda *a, **k: flown.append(a[1].title) or made(*a, **k))
+def test_a_run_goes_on_where_it_was_killed(tmp_path, imagine, monkeypatch):
+    """What is finished is not flown again, and the table is the same; another size, or other code, is flown.
 
-    def table(sections, starts=1):
+    No flight is like an earlier one, so that a section that is flown again is another one.
+    """
+    errors = itertools.count(1)
+    done = imagine(levels, lambda spec: None if spec.method == "indi" else 0.01 * next(errors))
+
+    def draw(flights, setup, scenario, folder, *, stem):
+        (folder / f"{stem}.png").write_text(str([flight.error[-1] for flight in flights]))
+        return [folder / f"{stem}.png"]
+
+    monkeypatch.setattr(levels, "picture", draw)
+    preset = brief_preset()
+    one, two = (
+        Levels(f"{n}", preset, Scenario(plant=plant), f"x{n}", ("base", "indi"))
+        for n, plant in ((1, "simple"), (2, "bem"))
+    )
+
+    def table(*sections, starts=1):
+        """Fly, and return the plants that were flown, and the table."""
+        done.flown.clear()
         document = Document(Run("test", tmp_path), "table", "Title", "Intro.", [0], Silent())
         fly_levels(document, sections, starts=starts, seconds=1.0)
-        return document.sections, results(tmp_path, "table.json")["rows"]
+        made = document.sections, results(tmp_path, "table.json")["rows"]
+        return [scenarios[0].plant for _, scenarios, *_ in done.flown], made
 
-    table(sections[:1])  # and killed
-    whole = table(sections)
-    again = table(sections)
-    assert flown == ["1", "2"]
-    assert whole == again
+    flown, (killed, rows) = table(one)
+    assert flown == ["simple"]
+    flown, whole = table(one, two)
+    assert flown == ["bem"]
+    assert (whole[0][: len(killed)], whole[1][: len(rows)]) == (killed, rows)
+    assert table(one, two) == ([], whole)
     assert "An earlier run had made 2 of the parts" in (tmp_path / "table.md").read_text()
-    table(sections, starts=2)
-    assert flown == ["1", "2"] * 2
+    flown, other = table(one, two, starts=2)
+    assert flown == ["simple", "bem"]
+    assert other != whole
     (tmp_path / "x1.png").write_bytes(b"what another table of this folder drew")
-    table(sections[:1])
-    assert flown[4:] == ["1"]
+    assert table(one)[0] == ["simple"]
     monkeypatch.setattr(provenance, "code", lambda: "changed")
-    table(sections[:1])
-    assert flown[5:] == ["1"]
+    assert table(one)[0] == ["simple"]
 
 
 def test_a_section_is_made_again_for_every_thing_that_it_follows_from(tmp_path, monkeypatch):
@@ -206,17 +226,17 @@ def test_datt_is_trained_once_for_a_folder(tmp_path, monkeypatch):
     reporter = Silent()
     reporter.say = said.append
     run, preset = Run("test", tmp_path), load("hover/retrim")
-    first = rivals.trained_datt(preset, [0, 1], run, reporter, steps=200)
-    again = rivals.trained_datt(preset, [0], run, reporter, steps=200)
+    first = rivals.trained_datt(preset, [0, 1], run, reporter, steps=1)
+    again = rivals.trained_datt(preset, [0], run, reporter, steps=1)
     jax.tree.map(np.testing.assert_array_equal, first[0], again[0])
     assert any(np.any(a != b) for a, b in zip(jax.tree.leaves(first[0]), jax.tree.leaves(first[1]), strict=True))
     (file,) = tmp_path.glob("datt_*_seed0.safetensors")
     file.write_bytes(file.read_bytes()[:-100])
-    other = rivals.trained_datt(preset, [0], run, reporter, steps=200)
+    other = rivals.trained_datt(preset, [0], run, reporter, steps=1)
     assert "trained again" in said[0]
     jax.tree.map(np.testing.assert_array_equal, first[0], other[0])
     monkeypatch.setattr(provenance, "code", lambda: "changed")
-    rivals.trained_datt(preset, [0], run, reporter, steps=200)
+    rivals.trained_datt(preset, [0], run, reporter, steps=1)
     assert len(list(tmp_path.glob("datt_*_seed0.safetensors"))) == 2
     with pytest.raises(ConfigError, match=r"DATT looks ahead in steps of 0\.06 s, which must be whole control periods"):
         rivals.check_rival(changed(preset, dt=0.025))
@@ -278,15 +298,15 @@ def test_baselines_fly_without_a_trained_policy(tmp_path, monkeypatch):
     assert [row[0] for row in document.sections[0].rows] == ["INDI", "DATT"]
 
 
-def test_a_table_of_fast_flight_flies_a_file_too(tmp_path):
+def test_a_table_of_fast_flight_flies_a_file_too(tmp_path, monkeypatch):
     """The race line that comes with the examples uses what the kingfisher can do, and no more."""
     line = Path(__file__).parents[2] / "examples" / "race.csv"
     preset = brief_preset("track/fast", track={"reference": "circle=8", "felt_copies": 0})
     setup = Setup.of(preset, str(line))
     assert setup.limits_exceeded() is None
-    flown = setup.flown.reference
-    speeds = [float(jnp.linalg.norm(flown(jnp.array(t)).v)) for t in np.linspace(3.0, 10.0, 50)]
+    speeds = np.linalg.norm(at(setup.flown.reference, np.linspace(3.0, 10.0, 50)).v, axis=1)
     assert 8.0 < max(speeds) < 12.0
+    monkeypatch.setattr(levels, "train_all", untrained)
     section = dataclasses.replace(fast._section(preset, str(line), "simple", ("base",)), stem="race")
     document = Document(Run("test", tmp_path), "table", "Title", "Intro.", [0], Silent())
     fly_levels(document, [section], starts=1, seconds=1.0)
