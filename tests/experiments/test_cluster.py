@@ -9,14 +9,14 @@ import subprocess
 import sys
 import threading
 import time
+import tomllib
 from concurrent.futures import Future, ThreadPoolExecutor
 
 import jax
 import pytest
 
 from commands import OVERLAY, retrim
-from helpers import brief_preset
-from retrim import ConfigError, Fleet, Scenario, Setup
+from retrim import ConfigError, Fleet, Scenario, Setup, changed, load
 from retrim.config import named_presets
 from retrim.errors import JobError
 from retrim.experiments import cluster, jobs, sweep, training  # noqa: F401  (before a test replaces what it imports)
@@ -42,6 +42,11 @@ seconds = 1.2
 )
 
 
+def small():
+    """The preset that the sweep flies, so that all tests share their programs."""
+    return changed(load("hover/retrim"), **tomllib.loads(OVERLAY)["overlay"])
+
+
 @pytest.fixture(scope="module")
 def here(as_a_user):
     """The address of a scheduler with two workers, which are threads of this process."""
@@ -53,7 +58,7 @@ def here(as_a_user):
 
 @pytest.fixture(scope="module")
 def fleet(as_a_user):
-    preset = brief_preset()
+    preset = small()
     policy = Setup.of(preset).new_policy(jax.random.key(0))
     return Fleet(preset, policy, [Scenario("small", plant="simple")], starts=2, seconds=1.2)
 
@@ -99,7 +104,7 @@ def test_a_table_with_holes_is_not_made(here, tmp_path, monkeypatch):
         raise OSError("the disk is full")
 
     monkeypatch.setattr(jobs, "fly_lot", failing)
-    monkeypatch.setitem(named_presets.PRESETS, "hover/fast", brief_preset())
+    monkeypatch.setitem(named_presets.PRESETS, "hover/fast", small())
     words = "--presets", "hover/fast", "--methods", "base", "--seeds", "0", "--starts", "4", "--seconds", "1"
     said = retrim("reproduce", "hover", *words, "--on", here, "--out", "h", cwd=tmp_path, code=1)
     assert "flights failed elsewhere, the first by OSError: the disk is full" in said
@@ -124,18 +129,18 @@ def test_a_flight_that_fails_leaves_the_others_and_an_exit_code(here, tmp_path, 
     fly = jobs.fly_lot
 
     def failing(setup, policies, specs, *rest, **more):
-        if specs[0].method == "full":
+        if specs[0].method == "indi":
             raise OSError("gone")
         return fly(setup, policies, specs, *rest, **more)
 
     monkeypatch.setattr(jobs, "fly_lot", failing)
     monkeypatch.setattr("retrim.experiments.lots.lanes", lambda: 1)
-    (tmp_path / "study.toml").write_text(SWEEP.format(starts=1))
+    (tmp_path / "study.toml").write_text(SWEEP.format(starts=1).replace('"full"', '"indi"'))
     said = retrim("sweep", "study.toml", "--on", here, "--out", "s", cwd=tmp_path, code=1)
     assert "2 flights failed elsewhere, the first by OSError: gone; the same command flies them" in said
-    base, full = rows(tmp_path / "s")
+    base, indi = rows(tmp_path / "s")
     assert "failures" not in base
-    assert (full["n"], full["failures"], full["mean"]) == (2, ["OSError: gone"] * 2, None)
+    assert (indi["n"], indi["failures"], indi["mean"]) == (2, ["OSError: gone"] * 2, None)
     monkeypatch.undo()
     retrim("sweep", "study.toml", "--on", here, "--out", "s", cwd=tmp_path)
     assert [row.get("failures") for row in rows(tmp_path / "s")] == [None, None]
@@ -232,8 +237,8 @@ def test_a_job_that_is_lost_is_given_to_the_scheduler_again_but_not_for_ever(los
 
 
 def test_a_table_grows_by_its_command(tmp_path, monkeypatch):
-    monkeypatch.setitem(named_presets.PRESETS, "hover/fast", brief_preset())
-    words = "--preset", "hover/fast", "--flights", "4", "8", "--seconds", "0.7"
+    monkeypatch.setitem(named_presets.PRESETS, "hover/fast", small())
+    words = "--preset", "hover/fast", "--flights", "4", "8", "--seconds", "1"
     said = retrim("reproduce", "scaling", *words, "--out", "s", cwd=tmp_path)
     whole = json.loads((tmp_path / "s" / "scaling.json").read_text())
     found = whole["rows"]
