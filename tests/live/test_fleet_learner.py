@@ -21,7 +21,7 @@ from retrim.onboard.messages import pack_note
 from retrim.runtime.fleet_learning import room_for
 
 pytestmark = pytest.mark.usefixtures("optax_promotion")
-SEEDS = {"a": 1, "b": 2, "c": 3}
+SEEDS = {"a": 1, "b": 2, "c": 3, "d": 4}
 
 
 def plan_of(start, layer, seed):  # noqa: F811
@@ -31,7 +31,7 @@ def plan_of(start, layer, seed):  # noqa: F811
 
 @pytest.fixture
 def vehicles(start):  # noqa: F811
-    return {name: Beside(start) for name in SEEDS}
+    return {name: Beside(start) for name in "abc"}
 
 
 def fleet_for(vehicles, start, layer):  # noqa: F811
@@ -68,10 +68,11 @@ def test_each_vehicle_gets_what_its_own_learner_learns(start, vehicles, layer): 
 
 
 def test_a_vehicle_that_is_late_is_not_waited_for(start, vehicles):  # noqa: F811
+    vehicles["d"] = Beside(start)
     fleet = fleet_for(vehicles, start, "residual")
-    vehicles["a"].fly()
-    vehicles["c"].fly()
-    assert fleet.step() == 2
+    for name in "acd":
+        vehicles[name].fly()
+    assert fleet.step() == 3
     assert vehicles["b"].bus.latest("parameters.residual") is None
     vehicles["b"].fly()
     assert fleet.step() == 1
@@ -80,12 +81,13 @@ def test_a_vehicle_that_is_late_is_not_waited_for(start, vehicles):  # noqa: F81
 
 
 def test_a_vehicle_may_go_and_the_others_are_learnt_for(start, vehicles):  # noqa: F811
+    vehicles["d"] = Beside(start)
     fleet = fleet_for(vehicles, start, "residual")
     fleet.drop("b")
     fleet.drop("nobody")
     for vehicle in vehicles.values():
         vehicle.fly()
-    assert fleet.step() == 2
+    assert fleet.step() == 3
     assert vehicles["b"].bus.latest("parameters.residual") is None
 
 
