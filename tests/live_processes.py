@@ -1,5 +1,9 @@
-"""Processes for drills: a plant and learners of a few lines, in NumPy, so that twenty flights cost little."""
+"""Processes for drills: a plant and learners of a few lines, writers, a network that is a bus of this machine.
 
+None of them imports JAX, so that twenty flights cost little.
+"""
+
+import os
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +14,8 @@ from retrim.onboard.guard import UP, G
 from retrim.onboard.messages import Parameters, Sample, Setpoint, pack_note
 from retrim.onboard.orders import wait_for_take_off
 from retrim.onboard.realtime import Lifeline, be_punctual, sleep_until
+from retrim.onboard.topics import OUT
+from retrim.transport.remote import Address
 from retrim.transport.shared_memory import SharedMemoryBus
 
 DT = 0.02
@@ -88,3 +94,44 @@ def learner(plan: DrillPlan) -> None:
 def nothing(plan) -> None:
     """A process that does nothing for long."""
     time.sleep(60.0)
+
+
+def write_for_ever(folder: Path, topic: str, room: int) -> None:
+    """Messages of many lengths, each of one byte that is repeated."""
+    bus = SharedMemoryBus(folder)
+    i = 0
+    while True:
+        i += 1
+        bus.publish(topic, (i % 256).to_bytes(1, "little") * (1 + 7919 * i % room))
+
+
+def answer(address: Address, topics: dict[str, int], topic: str, data: bytes) -> None:
+    """One message, once somebody else's is there."""
+    bus = address.join(topics, listen=False)
+    until = time.monotonic() + 10.0
+    while bus.latest(topic) is None and time.monotonic() < until:
+        time.sleep(0.01)
+    bus.publish(topic, data)
+    time.sleep(2.0)
+    os._exit(0)
+
+
+class Left(SharedMemoryBus):
+    """A bus in place of a network, which notes that somebody left it."""
+
+    def close(self):
+        if self._maps:
+            (self.folder.parent / f"{self.folder.name}-left").touch()
+        super().close()
+
+
+@dataclass(frozen=True)
+class Beside(Address):
+    """Its network is a bus of this machine."""
+
+    folder: Path = Path()
+
+    def join(self, capacities, *, listen, writes=()):
+        assert listen
+        assert set(writes) == set(OUT)
+        return Left(self.folder)

@@ -2,59 +2,44 @@
 
 import subprocess
 import time
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
 from bus_ends import arrived
+from live_processes import Beside
 from retrim.live import bridge_process
 from retrim.live.bridge_process import BridgePlan
 from retrim.onboard.launch import launch
 from retrim.onboard.messages import last_note, pack_note
 from retrim.onboard.topics import INTO, OUT
-from retrim.transport.remote import Address
 from retrim.transport.shared_memory import SharedMemoryBus
 
 ROOM = dict.fromkeys((*OUT, *INTO, "sample", "ready.bridge"), 1000)
 
 
-class Left(SharedMemoryBus):
-    """A bus in place of a network, which notes that somebody left it, and what was declared."""
-
-    def close(self):
-        if self._maps:
-            (self.folder.parent / f"{self.folder.name}-left").touch()
-        super().close()
-
-
-@dataclass(frozen=True)
-class Beside(Address):
-    """Its network is a bus of this machine."""
-
-    folder: Path = Path()
-
-    def join(self, capacities, *, listen, writes=()):
-        assert listen
-        assert set(writes) == set(OUT)
-        return Left(self.folder)
-
-
 @pytest.fixture
-def carried(tmp_path):
-    """The flight's bus, the network, the supervisor and the bridge, which carries already."""
+def between():
+    """The flight's bus, the network, the supervisor, and the plan of a bridge between them."""
     here, there = SharedMemoryBus.create(ROOM), SharedMemoryBus.create(ROOM)
     parent = subprocess.Popen(["sleep", "60"])
-    plan = BridgePlan(here.folder, Beside("zenoh", "127.0.0.1", 1, folder=there.folder), parent.pid)
-    bridge = launch("retrim.live.bridge_process:carry", plan, tmp_path / "bridge.log")
-    arrived(here, "ready.bridge", patience=30.0)
-    yield here, there, parent, bridge
-    for process in (parent, bridge):
-        process.kill()
-        process.wait()
+    yield here, there, parent, BridgePlan(here.folder, Beside("zenoh", "127.0.0.1", 1, folder=there.folder), parent.pid)
+    parent.kill()
+    parent.wait()
     Path(f"{there.folder}-left").unlink(missing_ok=True)
     here.remove()
     there.remove()
+
+
+@pytest.fixture
+def carried(between, tmp_path):
+    """The same, with the bridge in place of its plan; it carries already."""
+    here, there, parent, plan = between
+    bridge = launch("retrim.live.bridge_process:carry", plan, tmp_path / "bridge.log")
+    arrived(here, "ready.bridge", patience=30.0)
+    yield here, there, parent, bridge
+    bridge.kill()
+    bridge.wait()
 
 
 def test_a_flight_that_lost_its_supervisor_tells_the_ground_how_it_ended(carried):
@@ -72,13 +57,12 @@ def test_a_flight_that_lost_its_supervisor_tells_the_ground_how_it_ended(carried
     assert Path(f"{there.folder}-left").exists()
 
 
-def test_without_a_supervisor_and_a_flight_it_ends(carried, monkeypatch):
-    here, there, parent, _ = carried
+def test_without_a_supervisor_and_a_flight_it_ends(between, monkeypatch):
+    _, there, parent, plan = between
     monkeypatch.setattr(bridge_process, "SILENCE", 0.2)
     monkeypatch.setattr(bridge_process.signal, "signal", lambda *_: None)
     parent.kill()
     parent.wait()
-    plan = BridgePlan(here.folder, Beside("zenoh", "127.0.0.1", 1, folder=there.folder), parent.pid)
     bridge_process.carry(plan)
     assert last_note(there, "ended") == {}
 

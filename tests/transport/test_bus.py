@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import pytest
 
 from bus_ends import LOCAL, NETWORK, arrived, network, two_ends
+from live_processes import answer, write_for_ever
 from retrim.errors import ConfigError, MessageError
 from retrim.experiments.latency import free_port
 from retrim.transport import ros
@@ -65,29 +66,20 @@ def test_both_ends_may_write_each_its_own_topic(ends):
     arrived(ends.writer, "back", data=b"back")
 
 
-def _write_once(address):
-    bus = address.join(TOPICS, listen=False)
-    until = time.monotonic() + 10.0
-    while bus.latest("again") is None and time.monotonic() < until:
-        time.sleep(0.01)
-    bus.publish("again", b"of another process")
-    time.sleep(2.0)
-    os._exit(0)
-
-
 @pytest.mark.parametrize("backend", NETWORK)
 def test_between_processes_one_who_joins_late_has_the_last_message_and_goes_on_counting(backend):
     where = network(backend)
     bus = where.join(TOPICS, listen=True)
     bus.publish("again", b"before")
     version = bus.latest("again").version
-    other = multiprocessing.get_context("spawn").Process(target=_write_once, args=(where,), daemon=True)
+    words = where, TOPICS, "again", b"of another process"
+    other = multiprocessing.get_context("spawn").Process(target=answer, args=words, daemon=True)
     other.start()
     try:
         assert arrived(bus, "again", version, b"of another process", patience=30.0).version > version
     finally:
-        other.join(10.0)
         other.kill()
+        other.join(10.0)
         bus.close()
 
 
@@ -205,30 +197,25 @@ def test_one_who_joins_late_has_the_last_message():
         SharedMemoryBus(bus.folder)
 
 
-def _write_for_ever(folder):
-    bus = SharedMemoryBus(folder)
-    i = 0
-    while True:
-        i += 1
-        bus.publish("big", (i % 256).to_bytes(1, "little") * (1 + 7919 * i % TOPICS["big"]))
+def whole(data):
+    return data.count(data[:1]) == len(data) > 0
 
 
 def test_readers_never_see_half_a_message_and_a_killed_writer_leaves_a_whole_one():
     bus = SharedMemoryBus.create(TOPICS)
     try:
         for _ in range(3):
-            writer = multiprocessing.get_context("spawn").Process(
-                target=_write_for_ever, args=(bus.folder,), daemon=True
-            )
+            words = bus.folder, "big", TOPICS["big"]
+            writer = multiprocessing.get_context("spawn").Process(target=write_for_ever, args=words, daemon=True)
             writer.start()
             seen, version, until = 0, 0, time.monotonic() + 20.0
             while seen < 200 and time.monotonic() < until:
                 if (found := bus.latest("big", after=version)) is not None:
                     version, seen = found.version, seen + 1
-                    assert len(set(found.data)) == 1
+                    assert whole(found.data)
             os.kill(writer.pid, signal.SIGKILL)
             writer.join()
             assert seen == 200
-            assert len(set(bus.latest("big").data)) == 1
+            assert whole(bus.latest("big").data)
     finally:
         bus.remove()
