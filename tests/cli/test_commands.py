@@ -13,20 +13,21 @@ from retrim import load_learnt, load_policy
 pytestmark = pytest.mark.usefixtures("as_a_user")
 
 COMMANDS = ("pretrain", "fly", "demo", "sweep", "live", "gauntlet", "bench", "reproduce", "replay", "export", "doctor")
+ROUGH = "--disturbance", "gusts", "--sensors", "mocap"
+"""What is random there comes from the seed. Flights share it, and so their programs."""
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory, as_a_user):
-    """A folder with a small policy in p/, and what it flew under a small push in f/."""
+    """A folder with a small policy in p/, and what it flew in gusts in f/."""
     here = tmp_path_factory.mktemp("user")
     (here / "small.toml").write_text(
-        SMALL.replace("num_updates = 150", "num_updates = 150\nnum_envs = 8\nhorizon = 100")
+        SMALL.replace("num_updates = 150", "num_updates = 150\nnum_envs = 8\nhorizon = 60")
     )
     out = retrim("pretrain", "hover", "--config", "small.toml", "--out", "p", cwd=here)
     assert "hover error in its own model" in out
-    words = "--disturbance", "small", "--seconds", "4", "--starts", "2"
-    out = retrim("fly", "--policy", "p", *words, "--out", "f", cwd=here)
-    assert "hover error [m], last 2 s of 4 s, 2 starts" in out
+    out = retrim("fly", "--policy", "p", *ROUGH, "--seconds", "2", "--starts", "2", "--out", "f", cwd=here)
+    assert "hover error [m], last 2 s of 2 s, 2 starts" in out
     return here
 
 
@@ -58,10 +59,10 @@ def test_fly_writes_rows_events_logs_and_pictures(folder):
     events = [json.loads(line) for line in (out / "events.jsonl").read_text().splitlines()]
     assert {e["event"] for e in events} >= {"residual"}
     assert {e["start"] for e in events} == {0, 1}
-    assert all((out / f"hover_small.{kind}").stat().st_size > 10_000 for kind in ("png", "svg"))
+    assert all((out / f"hover_gusts.{kind}").stat().st_size > 10_000 for kind in ("png", "svg"))
     assert len(list((out / "logs").glob("*.npz"))) == 4
     with np.load(out / "logs" / "full_seed0_start1.npz") as log:
-        assert log["t"].shape == (201,)
+        assert log["t"].shape == (101,)
         assert log["error"][-100:].mean() == pytest.approx(found[1]["errors"][1], rel=1e-5)
 
 
@@ -70,20 +71,19 @@ def test_what_was_learnt_is_kept_and_goes_on(folder):
     assert preset.name == "hover/retrim"
     adapted, _ = load_policy(folder / "f" / "adapted.safetensors")
     np.testing.assert_array_equal(adapted.layers[0].weight, state.policy.policy.layers[0].weight)
-    words = "--resume", "f/learnt.safetensors", "--disturbance", "small", "--seconds", "3"
-    retrim("fly", *words, "--out", "r", cwd=folder)
+    retrim("fly", "--resume", "f/learnt.safetensors", *ROUGH, "--seconds", "2", "--out", "r", cwd=folder)
     went_on = results(folder / "r")["rows"]
     assert [row["method"] for row in went_on] == ["base", "full"]
 
 
 def test_a_flight_repeats_bit_for_bit_and_another_seed_flies_otherwise(folder):
-    words = "fly", "--policy", "p", "--seconds", "3", "--disturbance", "gusts", "--sensors", "mocap"
-    for name, seed in (("a", 0), ("b", 0), ("c", 7)):
-        retrim(*words, "--seed", seed, "--out", name, cwd=folder)
-    first, second, other = (results(folder / name)["rows"] for name in "abc")
+    words = "fly", "--policy", "p", *ROUGH, "--seconds", "2", "--starts", "2"
+    retrim(*words, "--out", "b", cwd=folder)
+    retrim(*words, "--seed", 7, "--adapt", "none", "--out", "c", cwd=folder)
+    first, second, other = (results(folder / name)["rows"] for name in "fbc")
     assert first == second
     assert first[0]["errors"] != other[0]["errors"]
-    assert (folder / "a" / "events.jsonl").read_text() == (folder / "b" / "events.jsonl").read_text()
+    assert (folder / "f" / "events.jsonl").read_text() == (folder / "b" / "events.jsonl").read_text()
 
 
 def test_live_flies_against_the_clock_learns_and_lands(folder):
@@ -109,14 +109,7 @@ def test_live_flies_against_the_clock_learns_and_lands(folder):
     assert {e["event"] for e in events} - {"rejected"} == {"residual", "policy", "guard"}
 
 
-def test_live_without_learning_and_what_it_refuses(folder):
-    words = "--adapt", "base-do", "--seconds", "2", "--page", "--page-port", "18280", "--record", "ld.mcap"
-    out = retrim("live", "--policy", "p", *words, "--out", "ld", cwd=folder)
-    assert "page: http://127.0.0.1:182" in out
-    assert "flight over: landed" in out
-    assert (folder / "ld.mcap").stat().st_size > 10_000
-    assert not list((folder / "ld").glob("start*"))
-    assert {row["metric"]: row["value"] for row in results(folder / "ld")["rows"]}["policies"] == 0
+def test_what_live_refuses(folder):
     for words, said in (
         (("--fence", "0.1"), "--fence 0.1 m must be between 0.5 and 1000"),
         (("--seconds", "0"), "--seconds 0 must be between 1 and 3600"),
@@ -136,19 +129,17 @@ def test_live_without_learning_and_what_it_refuses(folder):
     assert "no rosmaster at 'http://127.0.0.1:1'" in retrim("learn", "ros:127.0.0.1:1", cwd=folder, code=1)
 
 
-def test_fly_as_it_is_and_with_measured_latency(folder):
-    words = "fly", "--policy", "p", "--seconds", "3"
-    retrim(*words, "--adapt", "none", "--out", "n", cwd=folder)
-    assert [row["method"] for row in results(folder / "n")["rows"]] == ["base"]
-    assert not (folder / "n" / "learnt.safetensors").exists()
-    retrim(*words, "--latency", "measured", "--out", "m", cwd=folder)
+def test_fly_with_measured_latency(folder):
+    words = "--latency", "measured", "--seconds", "2", "--out", "m"
+    retrim("fly", "--policy", "p", *ROUGH, *words, cwd=folder)
     assert [row["method"] for row in results(folder / "m")["rows"]] == ["base", "full"]
 
 
-def test_the_default_folder_is_a_new_one_under_runs(folder):
-    retrim("fly", "--policy", "p", "--seconds", "3", "--adapt", "none", cwd=folder)
+def test_what_was_adapted_flies_as_it_is_and_the_default_folder_is_a_new_one_under_runs(folder):
+    retrim("fly", "--policy", "f/adapted.safetensors", "--seconds", "2", "--adapt", "none", cwd=folder)
     (made,) = (folder / "runs").glob("fly-*")
-    assert (made / "results.json").exists()
+    assert [row["method"] for row in results(made)["rows"]] == ["base"]
+    assert not (made / "learnt.safetensors").exists()
 
 
 def test_demo_at_reduced_size(folder, monkeypatch):
@@ -157,7 +148,7 @@ def test_demo_at_reduced_size(folder, monkeypatch):
 
     small = overlaid(presets.PRESETS["hover/retrim"], folder / "small.toml")
     monkeypatch.setitem(presets.PRESETS, "hover/retrim", small)
-    out = retrim("demo", "--seconds", "3", "--starts", "1", "--out", "d", cwd=folder)
+    out = retrim("demo", "--seconds", "2", "--starts", "1", "--out", "d", cwd=folder)
     assert "adapted, all weights" in out
     assert [(r["disturbance"], r["method"]) for r in results(folder / "d")["rows"]] == [
         (level, method) for level in ("none", "small", "large") for method in ("base", "full")
@@ -172,7 +163,11 @@ def test_demo_at_reduced_size(folder, monkeypatch):
 def test_help_of_every_command(folder, command):
     out = retrim(command, "--help", cwd=folder)
     assert f"usage: retrim {command}" in out
-    assert command in retrim("--help", cwd=folder)
+
+
+def test_help_names_every_command(folder):
+    out = retrim("--help", cwd=folder)
+    assert all(command in out for command in COMMANDS)
 
 
 def test_doctor_and_version(folder):

@@ -14,7 +14,8 @@ pytestmark = pytest.mark.usefixtures("as_a_user")
 def folder(tmp_path_factory, as_a_user):
     """A folder with a policy in p/ that was never trained."""
     here = tmp_path_factory.mktemp("user")
-    (here / "small.toml").write_text(SMALL.replace("[64, 64]", "[8]\nnum_envs = 2\nhorizon = 20"))
+    brief = SMALL.replace("[64, 64]", "[8]\nnum_envs = 2\nhorizon = 20").replace("= 150", "= 20")
+    (here / "small.toml").write_text(brief)
     preset = tiny_preset()
     save_policy(here / "p" / "policy.safetensors", Setup.of(preset).new_policy(jax.random.key(0)), preset)
     return here
@@ -51,7 +52,7 @@ def test_between_training_and_its_score_keeps_the_policy_with_results(folder):
     assert code == 130, out
     assert "Traceback" not in out
     found = results(folder / "between")
-    assert len(found["losses"]) == found["rows"][0]["updates"] == 150
+    assert len(found["losses"]) == found["rows"][0]["updates"] == 20
     assert load_policy(folder / "between")[1].name == "hover/retrim"
 
 
@@ -65,7 +66,7 @@ def test_between_training_and_flights_the_demo_keeps_the_policy_with_results(fol
     code, out = interrupted(words, folder, after=b"hover error in its own model", setup=small)
     assert code == 130, out
     assert "Traceback" not in out
-    assert len(results(folder / "demo")["losses"]) == 150
+    assert len(results(folder / "demo")["losses"]) == 20
     assert load_policy(folder / "demo")[1].pretrain.hidden_sizes == (8,)
 
 
@@ -83,10 +84,17 @@ def test_while_flying_keeps_what_was_flown(folder):
 
 
 def test_while_live_lands_the_vehicle_and_keeps_the_flight(folder):
-    words = "live", "--policy", "p", "--disturbance", "none", "--adapt", "base-do", "--out", "live"
-    code, out = interrupted(words, folder, after="│ policy".encode())
+    """It has a page and a recording; it does not learn."""
+    words = "live", "--policy", "p", "--plant", "simple", "--disturbance", "none", "--adapt", "base-do"
+    shown = "--page", "--page-port", "18280", "--record", "live.mcap", "--out", "live"
+    code, out = interrupted((*words, *shown), folder, after="│ policy".encode())
     assert code == 130, out
     assert "Traceback" not in out
     assert "flight over: landed" in out
-    assert results(folder / "live")["interrupted"]
+    assert "page: http://127.0.0.1:182" in out
+    found = results(folder / "live")
+    assert found["interrupted"]
+    assert {row["metric"]: row["value"] for row in found["rows"]}["policies"] == 0
     assert (folder / "live" / "flight.csv").exists()
+    assert not list((folder / "live").glob("start*"))
+    assert (folder / "live.mcap").stat().st_size > 10_000
