@@ -62,10 +62,10 @@ def spec_in(folder, controller, **changes):
     )  # fmt: skip
 
 
-def flown(spec, kill=None, at=0.0, seconds=SECONDS):
-    """Fly, and kill a process on the way; return the last status, the events, how long the watchdog took, and whether
-    the system allowed real-time scheduling, without which a loaded machine is late."""
-    events, took = LiveEvents(), None
+def flown(spec, kills=None, seconds=SECONDS):
+    """Fly, and kill processes on the way, each at its time; return the last status, the events, how long the watchdog
+    took, and whether the system allowed real-time scheduling, without which a loaded machine is late."""
+    events, took, kills = LiveEvents(), None, dict(kills or {})
     with Drill(spec) as drill:
         for _ in drill.warm_up():
             pass
@@ -73,10 +73,10 @@ def flown(spec, kill=None, at=0.0, seconds=SECONDS):
         until = time.monotonic() + 20.0
         while (status := drill.watch()).ended is None and time.monotonic() < until:
             events.take(status)
-            if kill and status.t >= at:
-                os.kill(drill.processes[kill].pid, signal.SIGKILL)
-                took = _first_fallback(drill.bus, time.monotonic()) if kill == "control" else None
-                kill = None
+            for role in [role for role, at in kills.items() if status.t >= at]:
+                del kills[role]
+                os.kill(drill.processes[role].pid, signal.SIGKILL)
+                took = _first_fallback(drill.bus, time.monotonic()) if role == "control" else None
             if status.t > seconds:
                 drill.land()
             time.sleep(0.02)
@@ -128,23 +128,26 @@ def test_a_flight_without_faults(tmp_path, controller):
 
 
 @pytest.mark.parametrize("seed", range(int(os.environ.get("RETRIM_DRILLS", "1"))))  # `make drill` flies four
-@pytest.mark.parametrize("role", ["control", "watchdog", "recorder", "plant", "residual", "policy"])
-def test_each_process_is_killed_at_a_random_time(tmp_path, controller, role, seed):
-    at = np.random.default_rng([seed, len(role)]).uniform(0.0, SECONDS)
-    status, events, took, punctual = flown(spec_in(tmp_path, controller), role, at)
-    rows = whole_log(tmp_path, status, at - 2 * DT if role == "control" else None)
-    if role == "plant":
+@pytest.mark.parametrize("roles", ["control", "plant", "watchdog recorder residual policy"])
+def test_each_process_is_killed_at_a_random_time(tmp_path, controller, roles, seed):
+    """What nobody flies by is killed in one flight, each at its own time, and comes back."""
+    names = roles.split()
+    kills = dict(zip(names, np.random.default_rng([seed, len(roles)]).uniform(0.0, SECONDS, len(names)), strict=True))
+    at = kills[names[0]]
+    status, events, took, punctual = flown(spec_in(tmp_path, controller), kills)
+    rows = whole_log(tmp_path, status, at - 2 * DT if roles == "control" else None)
+    if roles == "plant":
         assert status.ended.startswith("the plant process is gone")
         assert abs(rows[-1, 1] - at) < 0.3
         return
     assert status.ended == "landed"
     assert np.abs(rows[:, 3:5]).max() < 0.3
-    if role == "control":
+    if roles == "control":
         assert took < (0.04 if punctual else 1.0)
         assert rows[-1, -1] == Mode.WATCHDOG
         assert any(e.note.startswith("watchdog: ") for e in events)
     else:
-        assert status.restarts == {role: 1}
+        assert status.restarts == dict.fromkeys(kills, 1)
         assert rows[-1, -1] == Mode.LANDED
         assert not punctual or (rows[rows[:, 1] < SECONDS, -1] == Mode.POLICY).all()
 

@@ -83,22 +83,28 @@ def test_it_is_flown_from_the_hand_over_to_the_landing(spec):
     assert np.linalg.norm(flying[-1, 3:6] - HOME) < 0.3
 
 
-def test_without_control_the_watchdog_lands_it(spec):
-    status, events = flown(spec, "control")
-    rows = read_log(spec.folder / "flight.csv")
+@pytest.fixture
+def alone(spec):
+    """The same without learners."""
+    return replace(spec, layers=())
+
+
+def test_without_control_the_watchdog_lands_it(alone):
+    status, events = flown(alone, "control")
+    rows = read_log(alone.folder / "flight.csv")
     assert status.ended == "landed"
     assert rows[-1, -1] == Mode.WATCHDOG
     assert any(event.note.startswith("watchdog: ") for event in events)
 
 
-def test_a_lost_link_ends_the_flight_and_keeps_the_log(spec):
-    status, _ = flown(replace(spec, scenario=Scenario(plant="made_up_vehicle:lost")))
+def test_a_lost_link_ends_the_flight_and_keeps_the_log(alone):
+    status, _ = flown(replace(alone, scenario=Scenario(plant="made_up_vehicle:lost")))
     assert status.ended == "plant lost: the link has been silent"
-    assert read_log(spec.folder / "flight.csv")[-1, 1] > 0.1
+    assert read_log(alone.folder / "flight.csv")[-1, 1] > 0.1
 
 
-def test_what_does_not_arm_never_flies(spec):
-    spec = replace(spec, scenario=Scenario(plant="made_up_vehicle:unarmed"))
+def test_what_does_not_arm_never_flies(alone):
+    spec = replace(alone, scenario=Scenario(plant="made_up_vehicle:unarmed"))
     with pytest.raises(PlantError, match=r"before it began: .*refuses to be armed; it said: no battery"), \
             Flight(spec) as flight:  # fmt: skip
         for _ in flight.warm_up():
@@ -106,15 +112,16 @@ def test_what_does_not_arm_never_flies(spec):
     assert not flight.bus.folder.exists()
 
 
-def test_an_interrupt_on_the_ground_leaves_it_there(spec):
-    flight = Flight(spec)
+def test_an_interrupt_on_the_ground_leaves_it_there(alone):
+    flight = Flight(alone)
     with flight:
         for _ in flight.warm_up():
             if flight.bus.latest("ready.plant") is not None:
                 break
         processes = dict(flight.processes)
     assert all(process.poll() is not None for process in processes.values())
-    assert not (spec.folder / "flight.csv").exists() or not len(read_log(spec.folder / "flight.csv"))
+    log = alone.folder / "flight.csv"
+    assert not log.exists() or not len(read_log(log))
 
 
 def test_a_fleet_of_vehicles_is_refused():
