@@ -6,11 +6,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax import random
+from jax import lax, random
 
 from helpers import tiny_preset
 from retrim.config.setup import Setup
@@ -41,7 +42,7 @@ def setup():
 def policy(setup):
     """Weights large enough that commands reach their limits."""
     fresh = setup.new_policy(random.key(0))
-    grown = jax.tree.map(lambda leaf: 6.0 * leaf, fresh.layers)
+    grown = jax.tree.map(lambda leaf: jnp.asarray(6.0 * np.asarray(leaf)), fresh.layers)
     return fresh.with_params(grown)
 
 
@@ -89,38 +90,45 @@ def test_a_file_that_computes_something_else_is_refused(saved, tmp_path):
         Runner(tmp_path / "spoilt.npz")
 
 
-def states(n):
-    keys = random.split(random.key(5), 3)
-    p, v, phi = (0.5 * random.normal(k, (n, 3)) for k in keys)
-    return p + jnp.array([[0.0, 0.0, 1.0]]), jax.vmap(exp)(phi), v
+@pytest.fixture(scope="module")
+def states():
+    """Positions, attitudes and velocities of a dozen ticks."""
+    rng = np.random.default_rng(5)
+    p, v, phi = (0.5 * rng.normal(size=(12, 3)) for _ in range(3))
+    return p + np.array([[0.0, 0.0, 1.0]]), np.asarray(jax.jit(jax.vmap(exp))(phi)), v
 
 
-def flown(policy, setup, n=12):
+@pytest.fixture(scope="module")
+def flown(policy, setup, states):
     """What the controller of a flight commands, tick by tick."""
-    controller = PolicyController(setup.env.task.observation, policy)
-    p, R, v = states(n)
-    memory, out = controller.init(State(p[0], R[0], v[0])), []
-    for k in range(n):
-        u, memory = controller(memory, jnp.array(0.02 * k), State(p[k], R[k], v[k]))
-        out.append(u.vector())
-    return np.asarray(jnp.stack(out))
+
+    @eqx.filter_jit
+    def fly(controller, p, R, v):
+        def tick(memory, now):
+            t, *x = now
+            u, memory = controller(memory, t, State(*x))
+            return memory, u.vector()
+
+        t = 0.02 * jnp.arange(float(len(p)))
+        return lax.scan(tick, controller.init(State(p[0], R[0], v[0])), (t, p, R, v))[1]
+
+    return np.asarray(fly(PolicyController(setup.env.task.observation, policy), *map(jnp.asarray, states)))
 
 
-def test_the_runner_flies_as_the_controller_does(policy, setup, saved, tmp_path):
+def test_the_runner_flies_as_the_controller_does(setup, saved, states, flown, tmp_path):
     export(saved, "npz", tmp_path / "p.npz", None, Silent())
     loaded = Runner(tmp_path / "p.npz")
-    wanted = flown(policy, setup)
     for _ in range(2):  # the second flight begins as the first
-        found = np.array([loaded.step(*(np.asarray(x[k]) for x in states(12))) for k in range(12)])
-        np.testing.assert_allclose(found, wanted, atol=2e-4)
+        found = np.array([loaded.step(*(x[k] for x in states)) for k in range(12)])
+        np.testing.assert_allclose(found, flown, atol=2e-4)
         loaded.reset()
     assert loaded.dt == setup.preset.dt
 
 
 @HAS_C
-def test_c_flies_as_the_controller_does(policy, setup, saved, tmp_path):
+def test_c_flies_as_the_controller_does(saved, states, flown, tmp_path):
     export(saved, "c", tmp_path / "my-quad.h", None, Silent())
-    p, R, v = (np.asarray(x, dtype=np.float32) for x in states(12))
+    p, R, v = (x.astype(np.float32) for x in states)
     rows = np.concatenate([p, R.reshape(12, 9), v], axis=1)
     (tmp_path / "main.c").write_text("""
 #include <stdio.h>
@@ -139,7 +147,7 @@ int main(void) {
     subprocess.run(["gcc", *FLAGS, "main.c", "-o", "main", "-lm"], cwd=tmp_path, check=True)
     ran = subprocess.run([tmp_path / "main"], input=rows.tobytes(), capture_output=True, check=True)
     found = np.frombuffer(ran.stdout, np.float32).reshape(-1, 4)
-    np.testing.assert_allclose(found, flown(policy, setup), atol=2e-4)
+    np.testing.assert_allclose(found, flown, atol=2e-4)
     text = (tmp_path / "my-quad.h").read_text()
     assert not any(word in text for word in ("malloc", "double", "static float"))
 
@@ -158,11 +166,13 @@ def test_the_runner_needs_numpy_only(saved, tmp_path):
 
 def test_a_delta_travels_alone(policy, setup, saved, tmp_path):
     low = LoraPolicy.of(policy, key=random.key(1), ranks=(2, 2, 1))
-    low = low.with_params(jax.tree.map(lambda leaf: leaf + 0.1, low.delta)).shifted(jnp.array([0.1, 0.0, -0.1, 0.0]))
+    low = low.with_params(jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf) + 0.1), low.delta)).shifted(
+        jnp.array([0.1, 0.0, -0.1, 0.0])
+    )
     save_delta(tmp_path / "delta.safetensors", low)
     export(saved, "npz", tmp_path / "p.npz", None, Silent())
     export(saved, "delta", tmp_path / "d.npz", tmp_path / "delta.safetensors", Silent())
-    rows = observations(portable_of(policy, setup).sizes[0], 200, seed=2)
+    rows = observations(portable_of(policy, setup).sizes[0], 500, seed=2)
     wanted = commands(low.merged(), rows)
     np.testing.assert_allclose(Runner(tmp_path / "p.npz", tmp_path / "d.npz").command(rows), wanted, atol=5e-4)
     assert np.abs(Runner(tmp_path / "p.npz").command(rows) - wanted).max() > 0.1
