@@ -2,9 +2,11 @@
 
 import dataclasses
 import tomllib
+from itertools import accumulate
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from retrim.config.loading import load
@@ -13,11 +15,18 @@ from retrim.config.validation import validated
 from retrim.config.vehicle_file import VehicleSpec
 from retrim.errors import LogError
 from retrim.io.logs import FlightLog
+from retrim.replay import identification
 from retrim.replay.identification import identify
 from retrim.replay.rows import acting
 from retrim.replay.vehicle import vehicle_toml
 
 DT, SUB = 0.02, 20
+
+
+@pytest.fixture(autouse=True)
+def few_draws(monkeypatch):
+    """Intervals of a bootstrap of a quarter of the samples that users get."""
+    monkeypatch.setattr(identification, "DRAWS", 50)
 
 
 def wander(rng, n, size, tau):
@@ -28,30 +37,36 @@ def wander(rng, n, size, tau):
     return x
 
 
-def driven(seed, *, delay, lag, rate_lag, gain, drag, n=1200, noise=1.0, size=1.0):
+def driven(seed, *, delay, lag, rate_lag, gain, drag, n=900, noise=1.0, size=1.0):
     """A vehicle that follows random commands, integrated in steps of a millisecond; mild noise on what is logged."""
     rng, h = np.random.default_rng(seed), DT / SUB
     c = 9.81 / gain + size * wander(rng, n, 1.5, 0.3)
     w = size * np.stack([wander(rng, n, 0.8, 0.2), wander(rng, n, 0.8, 0.2), wander(rng, n, 0.5, 0.5)], axis=1)
-    R, v, p, thrust, omega = np.eye(3), np.zeros(3), np.zeros(3), 9.81 / gain, np.zeros(3)
-    places, turns, speeds = [], [], []
-    for i in range(n * SUB):
-        if i % SUB == 0:
-            places.append(p.copy()), turns.append(R.copy()), speeds.append(v.copy())
-        j = max(0, i - round(delay / h)) // SUB
-        thrust += (c[j] - thrust) * (1 - np.exp(-h / lag))
-        omega = omega + (w[j] - omega) * (1 - np.exp(-h / np.array(rate_lag)))
-        a = gain * thrust * R[:, 2] - np.array([0, 0, 9.81]) - R @ (np.array(drag) * (R.T @ v))
-        p, v, R = p + h * v, v + h * a, R @ _turn(h * omega)
-    p, v, R = (np.array(x) for x in (places, speeds, turns))
+    j = np.maximum(0, np.arange(n * SUB) - round(delay / h)) // SUB
+    keep, started = np.exp(-h / np.array([lag, *rate_lag])), np.array([9.81 / gain, 0.0, 0.0, 0.0])
+    acts = np.stack([_following(u, k, at) for u, k, at in zip(np.column_stack([c, w])[j].T, keep, started, strict=True)])
+    thrust, turns = acts[0], _turns(h * acts[1:].T)
+    R = np.stack(list(accumulate(turns[:-1], np.matmul, initial=np.eye(3))))
+    gained = h * (gain * thrust[:, None] * R[:, :, 2] - np.array([0, 0, 9.81]))
+    kept = np.eye(3) - h * (R * np.array(drag)) @ np.swapaxes(R, 1, 2)
+    steps = zip(kept[:-1], gained[:-1], strict=True)
+    v = np.stack(list(accumulate(steps, lambda v, step: step[0] @ v + step[1], initial=np.zeros(3))))
+    p = h * (np.cumsum(v, axis=0) - v)
+    p, v, R = (x[::SUB] for x in (p, v, R))
     R = R @ Rotation.from_rotvec(1e-3 * noise * rng.normal(size=(n, 3))).as_matrix()
     v = v + 3e-3 * noise * rng.normal(size=v.shape)
     valid = np.ones(n, dtype=bool)
     return FlightLog(DT * np.arange(n), p, R, v, np.zeros_like(v), c, np.zeros((n, 3)), w, valid, DT, None, ())
 
 
-def _turn(phi):
-    K = np.array([[0, -phi[2], phi[1]], [phi[2], 0, -phi[0]], [-phi[1], phi[0], 0]])
+def _following(wanted, keep, y):
+    """What follows ``wanted`` and keeps that share of its distance to it in a step; ``y`` is where it begins."""
+    return lfilter([1 - keep], [1, -keep], wanted, zi=[keep * y])[0]
+
+
+def _turns(phi):
+    x, y, z = phi.T
+    K = np.stack([0 * x, -z, y, z, 0 * x, -x, -y, x, 0 * x], axis=1).reshape(-1, 3, 3)
     return np.eye(3) + K + 0.5 * K @ K
 
 
@@ -79,7 +94,7 @@ def test_what_was_put_in_is_found(seed, truth):
 
 def test_a_controller_that_answers_noise_is_no_vehicle_that_follows():
     """At rest all that moves is noise, and the command answers it: the next difference seems to follow at once."""
-    rng, n = np.random.default_rng(0), 1200
+    rng, n = np.random.default_rng(0), 900
     tilt = 2e-3 * rng.normal(size=(n, 3))
     v = 6e-3 * rng.normal(size=(n, 3))
     R = Rotation.from_rotvec(tilt).as_matrix()
