@@ -119,7 +119,7 @@ def test_mirror_symmetry(bem, key):
     """Left and right are the same: mirror start, command and wind in y, and the flight is mirrored."""
     M = jnp.diag(jnp.array([1.0, -1.0, 1.0]))
     x, u, wind = random_state(key, 0.3), random_command(key), jnp.array([1.0, 2.0, 0.5])
-    mirrored = State(M @ x.p, M @ x.R @ M, M @ x.v)
+    mirrored = jax.jit(lambda x: State(M @ x.p, M @ x.R @ M, M @ x.v))(x)
     s = at(path(bem, start(bem, x), u, effects(wind=wind)), 300).body.x
     t = at(path(bem, start(bem, mirrored), Command(u.c, -M @ u.omega), effects(wind=M @ wind)), 300).body.x
     np.testing.assert_allclose(t.p, M @ s.p, atol=1e-10)
@@ -159,16 +159,23 @@ def test_terminal_velocity(bem):
 def test_air_takes_energy(bem, key):
     """Body drag and in-plane forces brake what meets them, turning or not: the power of the whole is theirs."""
     for k in random.split(key, 20):
-        x, omega = random_state(k, 5.0), random.normal(k, (3,))
-        b, through = body(x, 1000.0 * np.ones(4), omega), x.R.T @ x.v
-        of_body = float(bem.body_drag(b, jnp.zeros(3)) @ through)
-        _, blades = loads(bem, b, b.motors, effects())
-        force, torque = bem.loads(b, b.motors, blades._replace(thrust=jnp.zeros(4), torque=jnp.zeros(4)), effects())
-        hubs = np.asarray(through) + np.cross(omega, bem.places())
-        of_rotors = -bem_module.IN_PLANE_GAIN * float(blades.in_plane @ np.linalg.norm(hubs[:, :2], axis=1))
+        x, omega = random_state(k, 5.0), np.asarray(random.normal(k, (3,)))
+        b, through = body(x, 1000.0 * np.ones(4), omega), np.asarray(x.R).T @ np.asarray(x.v)
+        drag, in_plane, (force, torque) = jax.tree.map(np.asarray, braking(bem, b))
+        of_body = drag @ through
+        hubs = through + np.cross(omega, bem.places())
+        of_rotors = -bem_module.IN_PLANE_GAIN * in_plane @ np.linalg.norm(hubs[:, :2], axis=1)
         assert of_body < 0.0
-        assert (blades.in_plane > 0).all()
-        assert float(force @ through + torque @ omega) == pytest.approx(of_body + of_rotors, rel=1e-6)
+        assert (in_plane > 0).all()
+        assert force @ through + torque @ omega == pytest.approx(of_body + of_rotors, rel=1e-6)
+
+
+@jax.jit
+def braking(model, b):
+    """Drag of the body, in-plane forces, and the loads of these two alone."""
+    _, blades = loads(model, b, b.motors, effects())
+    alone = blades._replace(thrust=jnp.zeros(4), torque=jnp.zeros(4))
+    return model.body_drag(b, jnp.zeros(3)), blades.in_plane, model.loads(b, b.motors, alone, effects())
 
 
 # ---- rates, rotors, load
@@ -305,9 +312,10 @@ def test_hybrid_and_straight_through(key):
 
     both = StraightThrough(Hybrid(model, lambda x, u: 2.0 * x.v), PointMass(0.02))
     value, gradient = jax.jit(lambda s: slope(both, s))(s)
+    _, expected = jax.jit(lambda x: slope(both.backward, x))(x)
     flown = at(path(model, s, u, effects(push=push + 2.0 * x.v)), 20)
     assert float(value) == pytest.approx(float(weights @ flown.body.x.vector()), rel=1e-12)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12), gradient, slope(both.backward, x)[1])
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12), gradient, expected)
 
 
 @pytest.mark.parametrize("dt", [0.0005, 0.0205, 0.0])
@@ -319,8 +327,8 @@ def test_tick_must_be_whole_milliseconds(dt):
 @pytest.mark.parametrize("name", ["small", "large"])
 def test_the_integral_removes_the_steady_rate_error_of_a_weak_rotor(name):
     """With the firmware's scaling the integral holds the commanded rates against a constant torque."""
-    bem = BemQuadrotor.of({"small": small, "large": large}[name](), 0.02)
-    weak = ExternalEffects.of(jnp.zeros(3).dtype, gain=jnp.array([0.9, 1.0, 1.0, 1.0]))
-    rates = path(bem, start(bem, state()), command(G, np.zeros(3)), weak).body.omega
+    bem = strong(BemQuadrotor.of(VEHICLES[name](), 0.02))
+    weak = effects(gain=[0.9, 1.0, 1.0, 1.0])
+    rates = path(bem, start(bem, state()), command(), weak).body.omega
     assert np.abs(rates[:200]).max() > 0.05  # the torque is felt
     np.testing.assert_allclose(rates[-1], 0.0, atol=0.01)

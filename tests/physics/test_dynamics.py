@@ -1,5 +1,6 @@
 """Eq. (1), its integrator's order, and what flows backward through hybrid and straight-through models."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,6 +23,9 @@ from retrim.physics import (
 )
 
 G = 9.81
+# One program each, instead of one for each operation.
+rate = jax.jit(f_a)
+stepped = eqx.filter_jit(lambda model, x, u, a_ext: model.step(x, u, a_ext))
 
 
 def test_f_a_is_equation_1_in_numpy(key):
@@ -30,12 +34,13 @@ def test_f_a_is_equation_1_in_numpy(key):
         a_ext = np.array([0.5, -1.0, 2.0])
         R, w = np.asarray(x.R), np.asarray(u.omega)
         hat = np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
-        found = f_a(x, u, jnp.asarray(a_ext))
+        found = rate(x, u, jnp.asarray(a_ext))
         np.testing.assert_allclose(found.p, x.v)
-        np.testing.assert_allclose(R @ so3.hat(found.omega), R @ hat)
+        np.testing.assert_allclose(R @ np.asarray(so3.hat(found.omega)), R @ hat)
         np.testing.assert_allclose(found.v, R @ [0, 0, float(u.c)] + [0, 0, -G] + a_ext, rtol=1e-14)
 
 
+@jax.jit
 def generic_rk4(x, u, a_ext, h):
     """Runge-Kutta 4 on the manifold, stage by stage; the model has it with equal stages merged."""
 
@@ -54,7 +59,7 @@ def test_step_is_runge_kutta_4(key):
         x, u, a_ext = random_state(k), random_command(k), random.normal(k, (3,))
         jax.tree.map(
             lambda a, b: np.testing.assert_allclose(a, b, atol=1e-14),
-            PointMass(0.02).step(x, u, a_ext),
+            stepped(PointMass(0.02), x, u, a_ext),
             generic_rk4(x, u, a_ext, 0.02),
         )
 
@@ -69,7 +74,7 @@ def spin(t, w, c):
 def flown(dt, seconds, u, x=None):
     x = State.at(jnp.zeros(3)) if x is None else x
     for _ in range(round(seconds / dt)):
-        x = PointMass(dt).step(x, u, jnp.zeros(3))
+        x = stepped(PointMass(dt), x, u, jnp.zeros(3))
     return x
 
 
@@ -90,7 +95,10 @@ def test_order_of_accuracy_is_four():
     u = Command(jnp.array(12.0), jnp.array([5.0, 0.0, 0.0]))
     p, v = spin(1.2, 5.0, 12.0)
     errors = np.array(
-        [[np.linalg.norm(x.p - p), np.linalg.norm(x.v - v)] for x in (flown(dt, 1.2, u) for dt in (0.04, 0.02, 0.01))]
+        [
+            [np.linalg.norm(np.asarray(x.p) - p), np.linalg.norm(np.asarray(x.v) - v)]
+            for x in (flown(dt, 1.2, u) for dt in (0.04, 0.02, 0.01))
+        ]
     )
     orders = np.log2(errors[:-1] / errors[1:])
     np.testing.assert_allclose(orders, 4.0, atol=0.15)
@@ -98,7 +106,8 @@ def test_order_of_accuracy_is_four():
 
 def test_rotation_does_not_drift():
     x = flown(0.02, 3.0, Command(jnp.array(10.0), jnp.array([3.0, -2.0, 1.0])))
-    np.testing.assert_allclose(x.R @ x.R.T, np.eye(3), atol=1e-12)
+    R = np.asarray(x.R)
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
 
 
 def test_one_step_of_the_published_check():
@@ -116,6 +125,7 @@ def network(key):
 def flat_step(model, a_ext):
     """(x, u) as one vector -> x as one vector; for Jacobians."""
 
+    @jax.jit
     def step(y):
         x = State(y[:3], y[3:12].reshape(3, 3), y[12:15])
         return model.state(model.step(model.init(x), Command.of(y[15:]), a_ext)).vector()
@@ -123,18 +133,22 @@ def flat_step(model, a_ext):
     return step
 
 
+def differences(step, y, h=1e-6):
+    """Its Jacobian by finite differences."""
+    columns = jax.jit(jax.vmap(lambda e: (step(y + h * e) - step(y - h * e)) / (2 * h)))
+    return np.asarray(columns(jnp.eye(19))).T
+
+
 def test_no_gradient_through_the_residual(key):
     """The Jacobian is the analytical model's, by finite differences, while the value has the residual."""
     x, u, a_ext = random_state(key), random_command(key), jnp.array([0.3, 0.0, -0.2])
     residual = network(key)
     y = jnp.concatenate([x.vector(), u.vector()])
-    hybrid, held = flat_step(Hybrid(PointMass(0.02), residual), a_ext), residual(x, u)
+    hybrid, held = flat_step(Hybrid(PointMass(0.02), residual), a_ext), jax.jit(residual)(x, u)
     analytical = flat_step(PointMass(0.02), a_ext + held)
     np.testing.assert_allclose(hybrid(y), analytical(y), atol=1e-15)
-    J = jax.jacobian(hybrid)(y)
-    step = 1e-6
-    differences = np.stack([(analytical(y + step * e) - analytical(y - step * e)) / (2 * step) for e in jnp.eye(19)], 1)
-    np.testing.assert_allclose(J, differences, atol=1e-8)
+    J = jax.jit(jax.jacobian(hybrid))(y)
+    np.testing.assert_allclose(J, differences(analytical, y), atol=1e-8)
     np.testing.assert_allclose(J[12:15, 12:15], np.eye(3), atol=1e-15)  # dv+/dv, although the residual depends on v
 
 
@@ -142,10 +156,9 @@ def test_backprop_option_differentiates_the_residual(key):
     x, u = random_state(key), random_command(key)
     y = jnp.concatenate([x.vector(), u.vector()])
     through = flat_step(Hybrid(PointMass(0.02), network(key), backprop=True), jnp.zeros(3))
-    step = 1e-6
-    differences = np.stack([(through(y + step * e) - through(y - step * e)) / (2 * step) for e in jnp.eye(19)], 1)
-    np.testing.assert_allclose(jax.jacobian(through)(y), differences, atol=1e-8)
-    assert abs(jax.jacobian(through)(y)[12:15, 12:15] - np.eye(3)).max() > 1e-3
+    J = np.asarray(jax.jit(jax.jacobian(through))(y))
+    np.testing.assert_allclose(J, differences(through, y), atol=1e-8)
+    assert abs(J[12:15, 12:15] - np.eye(3)).max() > 1e-3
 
 
 def test_straight_through_has_one_models_value_and_the_others_gradient(key):
@@ -154,23 +167,22 @@ def test_straight_through_has_one_models_value_and_the_others_gradient(key):
     rotors, simple = LinearDragQuadrotor.of(small(), 0.02), PointMass(0.02)
     model = StraightThrough(rotors, simple)
     y = jnp.concatenate([x.vector(), u.vector()])
-    np.testing.assert_array_equal(flat_step(model, a_ext)(y), flat_step(rotors, a_ext)(y))
-    np.testing.assert_allclose(
-        jax.jacobian(flat_step(model, a_ext))(y), jax.jacobian(flat_step(simple, a_ext))(y), atol=1e-15
-    )
+    both, forward, backward = (flat_step(each, a_ext) for each in (model, rotors, simple))
+    ways = jax.jit(lambda y: (both(y), forward(y), jax.jacobian(both)(y), jax.jacobian(backward)(y)))
+    value, wanted, slope, wanted_slope = ways(y)
+    np.testing.assert_array_equal(value, wanted)
+    np.testing.assert_allclose(slope, wanted_slope, atol=1e-15)
     # over two ticks too: what is hidden in the forward state carries no gradient
     two = lambda m: lambda u: m.state(m.step(m.step(m.init(x), u, a_ext), u, a_ext)).v  # noqa: E731
-    reached = rotors.step(rotors.init(x), u, a_ext)
 
     def surrogate(u):
-        middle = simple.step(x, u, a_ext)
+        reached, middle = jax.lax.stop_gradient(rotors.step(rotors.init(x), u, a_ext)), simple.step(x, u, a_ext)
         moved = jax.tree.map(lambda value, b: value + b - jax.lax.stop_gradient(b), rotors.state(reached), middle)
         return simple.step(moved, u, a_ext).v
 
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, atol=1e-13),
-        jax.jacobian(two(model))(u),
-        jax.jacobian(surrogate)(u),
+        *jax.jit(lambda u: (jax.jacobian(two(model))(u), jax.jacobian(surrogate)(u)))(u),
     )
 
 

@@ -44,7 +44,9 @@ def driven(seed, *, delay, lag, rate_lag, gain, drag, n=900, noise=1.0, size=1.0
     w = size * np.stack([wander(rng, n, 0.8, 0.2), wander(rng, n, 0.8, 0.2), wander(rng, n, 0.5, 0.5)], axis=1)
     j = np.maximum(0, np.arange(n * SUB) - round(delay / h)) // SUB
     keep, started = np.exp(-h / np.array([lag, *rate_lag])), np.array([9.81 / gain, 0.0, 0.0, 0.0])
-    acts = np.stack([_following(u, k, at) for u, k, at in zip(np.column_stack([c, w])[j].T, keep, started, strict=True)])
+    acts = np.stack(
+        [_following(u, k, at) for u, k, at in zip(np.column_stack([c, w])[j].T, keep, started, strict=True)]
+    )
     thrust, turns = acts[0], _turns(h * acts[1:].T)
     R = np.stack(list(accumulate(turns[:-1], np.matmul, initial=np.eye(3))))
     gained = h * (gain * thrust[:, None] * R[:, :, 2] - np.array([0, 0, 9.81]))
