@@ -46,14 +46,20 @@ def test_ideal_sensing_is_the_truth():
 
 def test_noise_has_the_stated_deviation(key):
     sensors, x, n = SensorModel.of(position=0.01, velocity=0.2, attitude=0.03), random_state(key), 20_000
-    seen = jax.jit(jax.vmap(lambda k: sensors.noisy(x, k)))(random.split(key, n))
-    turned = jax.vmap(lambda R: so3.log(x.R.T @ R))(seen.R)
-    for error, sigma in ((seen.p - x.p[None], 0.01), (seen.v - x.v[None], 0.2), (turned, 0.03)):
-        np.testing.assert_allclose(jnp.std(error, axis=0), sigma, rtol=0.03)
-        np.testing.assert_allclose(jnp.mean(error, axis=0), 0.0, atol=5 * sigma / n**0.5)
-        correlation = np.corrcoef(np.asarray(error).T) - np.eye(3)
+
+    @jax.jit
+    @jax.vmap
+    def errors(key):
+        seen = sensors.noisy(x, key)
+        return (seen.p - x.p, seen.v - x.v, so3.log(x.R.T @ seen.R)), seen.R
+
+    found, R = jax.tree.map(np.asarray, errors(random.split(key, n)))
+    for error, sigma in zip(found, (0.01, 0.2, 0.03), strict=True):
+        np.testing.assert_allclose(error.std(axis=0), sigma, rtol=0.03)
+        np.testing.assert_allclose(error.mean(axis=0), 0.0, atol=5 * sigma / n**0.5)
+        correlation = np.corrcoef(error.T) - np.eye(3)
         assert np.abs(correlation).max() < 0.05
-    np.testing.assert_allclose(jnp.linalg.det(seen.R), 1.0, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.det(R), 1.0, atol=1e-12)
 
 
 def test_samples_of_a_flight_are_noisy():

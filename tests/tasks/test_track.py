@@ -35,6 +35,9 @@ def tracking(reference, make=Track, *, history=2, spread=1.0, box=5.0, horizon=1
     return make(reference, seen, jnp.array(spread), jnp.array(box), 0.02, horizon)
 
 
+turned = jax.jit(so3.rotz)
+
+
 @eqx.filter_jit
 def on(reference, t):
     """The state that is the reference at ``t``, level, heading as it says."""
@@ -44,6 +47,7 @@ def on(reference, t):
 
 # ---- rewards
 
+place = eqx.filter_jit(lambda reference, t: reference(t))
 reward = eqx.filter_jit(lambda task, t, x, u: task.reward(t, x, u))
 
 
@@ -58,9 +62,9 @@ def test_paper_reward_by_hand(nose):
 def test_sharp_reward_by_hand(nose):
     """|5 (p - p_ref)| = 2.5 -> 2; |v - v_ref| = .5 -> .125; |u - u_ref| = 1 -> .5, weighed 0.1; 60 degrees off."""
     x = on(nose, 3.0)
-    turned = so3.rotz(jnp.array(math.pi / 6.0 + math.pi / 3.0))
-    x = State(x.p + jnp.array([0.3, 0.0, -0.4]), turned, x.v + jnp.array([0.3, 0.4, 0.0]))
-    u = Command.of(nose(jnp.array(3.0)).u + jnp.array([0.6, 0.0, 0.8, 0.0]))
+    R = turned(jnp.array(math.pi / 6.0 + math.pi / 3.0))
+    x = State(x.p + jnp.array([0.3, 0.0, -0.4]), R, x.v + jnp.array([0.3, 0.4, 0.0]))
+    u = Command.of(place(nose, jnp.array(3.0)).u + jnp.array([0.6, 0.0, 0.8, 0.0]))
     wanted = -(2.0 + 0.125 + 0.1 * 0.5 + 0.5 * (1.0 - 0.5))
     assert float(reward(tracking(nose, L2Track), jnp.array(3.0), x, u)) == pytest.approx(wanted, rel=1e-6)
 
@@ -68,7 +72,7 @@ def test_sharp_reward_by_hand(nose):
 def test_l2_reward_against_the_papers(loop, key):
     """Five times as sharp in position, another command asked for, and half of 1 - cos of the heading error."""
     t, x, u = jnp.array(4.0), random_state(key), random_command(key)
-    here, hover = loop(t), np.array([9.81, 0.0, 0.0, 0.0])
+    here, hover = place(loop, t), np.array([9.81, 0.0, 0.0, 0.0])
     off, issued = x.p - here.p, u.vector()
     nose = np.array([math.cos(float(here.heading)), math.sin(float(here.heading))])
     difference = -(huber(5.0 * off) - huber(off)) - 0.1 * (huber(issued - here.u) - huber(issued - hover))
@@ -83,7 +87,7 @@ def test_l2_reward_against_the_papers(loop, key):
 def test_what_each_reward_wants(loop):
     """The sharp one is zero, and greatest, for the reference with its own command; the paper's asks for hover."""
     t, x = jnp.array(4.0), on(loop, 4.0)
-    own = Command.of(loop(t).u)
+    own = Command.of(place(loop, t).u)
     assert float(reward(tracking(loop, L2Track), t, x, own)) == pytest.approx(0.0, abs=1e-12)
     assert float(reward(tracking(loop, L2Track), t, x, Command.hover())) < -1e-3
     assert float(reward(tracking(loop), t, x, Command.hover())) == 0.0
@@ -95,7 +99,7 @@ def test_reward_is_differentiable_everywhere(make, loop, key):
     task, t = tracking(loop, make), jnp.array(4.0)
     slope = jax.jit(jax.grad(lambda xu, t: task.reward(t, *xu)))
     steep = 0.0
-    for x, u in [(on(loop, 4.0), Command.of(loop(t).u)), (random_state(key), random_command(key))]:
+    for x, u in [(on(loop, 4.0), Command.of(place(loop, t).u)), (random_state(key), random_command(key))]:
         leaves = jax.tree.leaves(slope((x, u), t))
         assert all(np.isfinite(leaf).all() for leaf in leaves)
         steep = max(float(jnp.abs(leaf).max()) for leaf in leaves)
@@ -219,7 +223,7 @@ def test_simulation_and_flight_see_the_same(t0, preview, loop, key):
     task = tracking(loop, preview=preview)
     policy = Policy.of(task.observation.size, small(), key=key, hidden=(8,))
     policy = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf) + 0.1), policy)  # so that what is seen matters
-    x0 = replaced(on(loop, t0), p=loop(jnp.array(t0)).p + 0.2)
+    x0 = replaced(on(loop, t0), p=place(loop, jnp.array(t0)).p + 0.2)
     simulated = eqx.filter_jit(rollout)(Env(PointMass(0.02), task), policy, Start(jnp.array(t0), x0))
     simulated = jax.tree.map(np.asarray, simulated)
     pilot = ControllerPilot(PolicyController(task.observation, policy))
