@@ -1,5 +1,6 @@
 """The policy: bounded, centred at hover, differentiable at its limits; sizes as published."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 from jax import random
 
 from retrim.control import Policy
+from retrim.control.datt import DattNet
 from retrim.control.policy import Policy as PolicyType
 from retrim.learn.residuals import EnsembleResidual
 from retrim.physics import large, small
@@ -49,6 +51,16 @@ def test_fresh_policy_hovers(key):
     policy = Policy.of(15, small(), key=key)
     o = random.normal(key, (15,))
     np.testing.assert_allclose(policy(o).vector(), [9.81, 0, 0, 0], atol=0.05)
+
+
+@pytest.mark.parametrize(
+    "make", [lambda key: Policy.of(15, small(), key=key, hidden=(8,)), lambda key: DattNet.of(key=key)]
+)
+def test_a_fresh_network_has_the_types_of_a_trained_or_loaded_one(make, key):
+    """A weak type would have the same program compiled twice."""
+    arrays = jax.tree.leaves(eqx.filter(make(key), eqx.is_array))
+    assert arrays
+    assert not any(leaf.weak_type for leaf in arrays)
 
 
 def test_zero_perturbations_change_nothing(key):

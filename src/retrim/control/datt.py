@@ -51,7 +51,7 @@ class DattNet(eqx.Module):
             jnp.zeros(8),
             actor,
             eqx.nn.MLP(seen, "scalar", width, 3, key=k_critic),
-            jnp.full(4, -0.5),
+            jnp.full(4, -0.5, dtype=actor.layers[-1].bias.dtype),  # of a weak type, the first update is compiled twice
         )
 
     def __call__(self, o: Float[Array, " o"]) -> tuple[Float[Array, "4"], Float[Array, ""]]:

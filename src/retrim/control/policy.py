@@ -53,7 +53,10 @@ class Policy(eqx.Module):
                     (std * random.normal(k, (fan_out, fan_in)), jnp.zeros(fan_out)),
                 )
             )
-        return cls(tuple(layers), Command.hover(), vehicle.command_min, vehicle.command_max)
+        bounds = (Command.hover(), vehicle.command_min, vehicle.command_max)
+        # Of strong types, as a loaded policy has them: what was compiled for one is not compiled again for the other.
+        bounds = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=leaf.dtype), bounds)
+        return cls(tuple(layers), *bounds)
 
     @property
     def params(self) -> Layers:

@@ -74,7 +74,7 @@ class ControllerPilot(Pilot):
 
     def reset(self, measurement: Measurement) -> None:
         """Initialise the controller's memory."""
-        self._memory, self._start = self.controller.init(measurement.x), measurement.t
+        self._memory, self._start = _begin(self.controller, measurement.x), measurement.t
 
     def act(self, measurement: Measurement) -> Command:
         """Call the controller once, with the time since the start of the flight."""
@@ -89,6 +89,11 @@ class ControllerPilot(Pilot):
     def accepted(self, u: Command) -> None:
         """Correct the controller's memory of its last command."""
         self._memory = self.controller.accepted(self._memory, u)
+
+
+@eqx.filter_jit
+def _begin(controller: AbstractController[Any], x: State) -> Any:
+    return controller.init(x)
 
 
 @eqx.filter_jit
