@@ -47,9 +47,9 @@ wheel: | $(UV)
 mutants: dev
 	$(BIN)/python tools/mutants.py
 
-# Live flights in which each process is killed at random times, four times each.
+# Live flights in which each process is killed at random times, seven times each.
 drill: dev
-	RETRIM_DRILLS=4 $(BIN)/pytest tests/live/test_faults.py
+	RETRIM_DRILLS=7 $(BIN)/pytest tests/live/test_faults.py
 
 # The page of a live flight in a browser without a screen; Debian's Chromium is installed if there is none.
 test-page: dev

@@ -127,7 +127,7 @@ def test_a_flight_without_faults(tmp_path, controller):
     assert np.linalg.norm(rows[rows[:, 1] > 1.2][0, 3:6] - HOME) < 0.2
 
 
-@pytest.mark.parametrize("seed", range(int(os.environ.get("RETRIM_DRILLS", "1"))))  # `make drill` flies four
+@pytest.mark.parametrize("seed", range(int(os.environ.get("RETRIM_DRILLS", "1"))))  # `make drill` flies seven
 @pytest.mark.parametrize("roles", ["control", "plant", "watchdog recorder residual policy"])
 def test_each_process_is_killed_at_a_random_time(tmp_path, controller, roles, seed):
     """What nobody flies by is killed in one flight, each at its own time, and comes back."""
