@@ -3,7 +3,6 @@
 import dataclasses
 
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
@@ -73,7 +72,6 @@ def test_bars_of_methods_have_colours_of_their_own(methods):
     figure = bars("Error", {"none": {name: [0.1] for name in methods}, "large": {name: [np.inf] for name in methods}})
     drawn = [handle.patches[0].get_facecolor() for handle in figure.axes[0].containers]
     assert len(set(drawn)) == len(methods)
-    plt.close(figure)
 
 
 @pytest.mark.parametrize("last", [np.nan, np.inf])

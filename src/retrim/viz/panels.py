@@ -3,12 +3,15 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import cycle
+from typing import TYPE_CHECKING
 
-import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.figure import Figure
 
 from .plots import ADAPTED, BASE, INK, PUSH, UPDATE
+from .sheet import sheet
+
+if TYPE_CHECKING:
+    import matplotlib.figure
 
 COLORS = (ADAPTED, BASE, UPDATE, PUSH, "#CC79A7", "#56B4E9")
 
@@ -40,15 +43,11 @@ class Panel:
     """Both axes."""
 
 
-def panel_figure(title: str, panels: Sequence[Panel], *, across: int = 3) -> Figure:
+def panel_figure(title: str, panels: Sequence[Panel], *, across: int = 3) -> "matplotlib.figure.Figure":
     """Panels in rows of ``across``."""
     down = -(-len(panels) // across)
-    with plt.rc_context(
-        {"font.size": 10, "axes.spines.top": False, "axes.spines.right": False, "svg.fonttype": "none"}
-    ):
-        figure, grid = plt.subplots(
-            down, across, figsize=(4.6 * across, 3.7 * down), layout="constrained", facecolor="white", squeeze=False
-        )
+    with sheet((4.6 * across, 3.7 * down), 10.0) as figure:
+        grid = figure.subplots(down, across, squeeze=False)
         figure.suptitle(title, fontsize=14, fontweight="bold", color=INK)
         for axes, panel in zip(grid.flat, panels, strict=False):
             for i, curve in enumerate(panel.curves):
@@ -69,7 +68,9 @@ def panel_figure(title: str, panels: Sequence[Panel], *, across: int = 3) -> Fig
     return figure
 
 
-def heat_map(titles: Sequence[str], rows: Sequence[str], columns: Sequence[str], values: np.ndarray) -> Figure:
+def heat_map(
+    titles: Sequence[str], rows: Sequence[str], columns: Sequence[str], values: np.ndarray
+) -> "matplotlib.figure.Figure":
     """Draw tables of figures as colours, one beside the other; dark is large, each on its own logarithmic scale.
 
     Args:
@@ -78,9 +79,9 @@ def heat_map(titles: Sequence[str], rows: Sequence[str], columns: Sequence[str],
         columns: Labels.
         values: Tables x rows x columns, not negative; infinity is written as such, NaN is left white.
     """
-    with plt.rc_context({"font.size": 9, "svg.fonttype": "none"}):
-        size = (2.6 + len(titles) * (0.6 + 0.75 * len(columns)), 1.2 + 0.3 * len(rows))
-        figure, grid = plt.subplots(1, len(titles), figsize=size, layout="constrained", squeeze=False, sharey=True)
+    size = (2.6 + len(titles) * (0.6 + 0.75 * len(columns)), 1.2 + 0.3 * len(rows))
+    with sheet(size, 9.0, boxed=True) as figure:
+        grid = figure.subplots(1, len(titles), squeeze=False, sharey=True)
         for axes, title, table in zip(grid.flat, titles, values, strict=True):
             finite = table[np.isfinite(table)]
             top = max(finite.max(initial=1e-3), 1e-3)
@@ -97,18 +98,14 @@ def heat_map(titles: Sequence[str], rows: Sequence[str], columns: Sequence[str],
     return figure
 
 
-def bars(title: str, groups: dict[str, dict[str, list[float]]]) -> Figure:
+def bars(title: str, groups: dict[str, dict[str, list[float]]]) -> "matplotlib.figure.Figure":
     """Draw one group of bars per label and one bar per method: the mean, and a dot for each flight.
 
     An infinite value is a flight that crashed; the number of these stands below the bar's place.
     """
     methods = list(dict.fromkeys(method for group in groups.values() for method in group))
-    with plt.rc_context(
-        {"font.size": 10, "axes.spines.top": False, "axes.spines.right": False, "svg.fonttype": "none"}
-    ):
-        figure, axes = plt.subplots(
-            figsize=(max(6.0, 1.1 * len(groups) * len(methods)), 4.5), layout="constrained", facecolor="white"
-        )
+    with sheet((max(6.0, 1.1 * len(groups) * len(methods)), 4.5), 10.0) as figure:
+        axes = figure.subplots()
         width = 0.8 / len(methods)
         others = cycle(color for color in COLORS if color != BASE)
         for k, method in enumerate(methods):

@@ -1,18 +1,17 @@
-"""Pictures of flights: the only place that imports matplotlib."""
+"""Pictures of flights."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import TYPE_CHECKING, Generic, TypeVar
 
-import matplotlib
-
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+
+from .sheet import sheet
+
+if TYPE_CHECKING:
+    import matplotlib.axes
+    import matplotlib.figure
 
 T = TypeVar("T")
 
@@ -73,15 +72,14 @@ class Span:
 
 
 def flight_figure(
-    title: str, groups: Sequence[Group[Track]], spans: Sequence[Span], beside: Callable[[Axes], None]
-) -> Figure:
+    title: str,
+    groups: Sequence[Group[Track]],
+    spans: Sequence[Span],
+    beside: Callable[["matplotlib.axes.Axes"], None],
+) -> "matplotlib.figure.Figure":
     """Error over time, group against group, one thin line a flight, the mean thick; ``beside`` draws what is right."""
-    with plt.rc_context(
-        {"font.size": 11, "axes.spines.top": False, "axes.spines.right": False, "svg.fonttype": "none"}
-    ):
-        figure, (left, right) = plt.subplots(
-            1, 2, figsize=(13, 5.4), width_ratios=(1.9, 1), layout="constrained", facecolor="white"
-        )
+    with sheet((13.0, 5.4), 11.0) as figure:
+        left, right = figure.subplots(1, 2, width_ratios=(1.9, 1))
         figure.suptitle(title, fontsize=14, fontweight="bold", color=INK)
         _errors(left, groups, spans)
         beside(right)
@@ -89,14 +87,13 @@ def flight_figure(
     return figure
 
 
-def save(figure: Figure, folder: Path, name: str) -> list[Path]:
+def save(figure: "matplotlib.figure.Figure", folder: Path, name: str) -> list[Path]:
     """Write PNG and SVG; returns their paths."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / f"{name}.{kind}" for kind in ("png", "svg")]
     for path in paths:
         figure.savefig(path, dpi=130, metadata={"Date": None} if path.suffix == ".svg" else None)
         figure.set_layout_engine("none")  # what was laid out once stays where it is
-    plt.close(figure)
     return paths
 
 
@@ -106,7 +103,7 @@ def _coloured(groups: Sequence[Group[T]]) -> Iterator[tuple[Sequence[T], str, st
         yield group.tracks, GROUPS[group.colour % len(GROUPS)], group.name
 
 
-def _errors(axes: Axes, groups: Sequence[Group[Track]], spans: Sequence[Span]) -> None:
+def _errors(axes: "matplotlib.axes.Axes", groups: Sequence[Group[Track]], spans: Sequence[Span]) -> None:
     every = [track for group in groups for track in group.tracks]
     finite = [track.error[np.isfinite(track.error)] for track in every]  # a flight may end where nothing is a number
     top = 1.15 * max((float(error.max()) for error in finite if len(error)), default=1.0)
@@ -145,7 +142,7 @@ def _errors(axes: Axes, groups: Sequence[Group[Track]], spans: Sequence[Span]) -
     axes.margins(x=0)
 
 
-def paths(axes: Axes, groups: Sequence[Group[Track]], goal: tuple[float, float, float]) -> None:
+def paths(axes: "matplotlib.axes.Axes", groups: Sequence[Group[Track]], goal: tuple[float, float, float]) -> None:
     """The paths from above, to the goal."""
     for tracks, color, name in _coloured(groups):
         for i, track in enumerate(tracks):
@@ -167,7 +164,7 @@ def paths(axes: Axes, groups: Sequence[Group[Track]], goal: tuple[float, float, 
     axes.set_aspect("equal", adjustable="datalim")
 
 
-def laps(axes: Axes, groups: Sequence[Group[Track]], lap: np.ndarray) -> None:
+def laps(axes: "matplotlib.axes.Axes", groups: Sequence[Group[Track]], lap: np.ndarray) -> None:
     """The paths of the last ten seconds from above, over the lap (points x 3)."""
     axes.plot(lap[:, 0], lap[:, 1], color="#BBBBBB", linewidth=5, label="reference", zorder=1)
     for tracks, color, name in _coloured(groups):
@@ -181,7 +178,7 @@ def laps(axes: Axes, groups: Sequence[Group[Track]], lap: np.ndarray) -> None:
     axes.set_aspect("equal", adjustable="datalim")
 
 
-def camera(axes: Axes, groups: Sequence[Group[ImageTrack]], wanted: np.ndarray) -> None:
+def camera(axes: "matplotlib.axes.Axes", groups: Sequence[Group[ImageTrack]], wanted: np.ndarray) -> None:
     """What the camera saw in the first flight of each kind; ``wanted`` (7 x 2): where the points are at the goal."""
     for sightings, color, name in _coloured(groups):
         for sighting in sightings[:1]:
