@@ -113,7 +113,7 @@ def test_every_public_name_resolves():
 QUICK_IMPORT = """
 import sys
 import retrim
-from retrim.cli.main import main
+from retrim.cli.main import COMMANDS, main
 
 assert "jax" not in sys.modules, "import retrim imports jax"
 for words in (["--help"], ["--version"], [], ["fyl"]):
@@ -122,6 +122,9 @@ for words in (["--help"], ["--version"], [], ["fyl"]):
     except SystemExit as end:
         print(words, end.code)
 assert "jax" not in sys.modules, "retrim --help imports jax"
+for module in (*(f"cli.{{name}}" for name in COMMANDS), "onboard.control_process", "onboard.watchdog"):
+    __import__(f"retrim.{{module}}")
+    assert not {{"matplotlib", "scipy"}} & set(sys.modules), f"{{module}} begins with what it may never need"
 for package in {packages!r}:
     __import__(package)
 for name in retrim.__all__:

@@ -20,7 +20,6 @@ from ..experiments.outputs import write_flights
 from ..experiments.run import INTERRUPTED, Run
 from ..experiments.tables.document import TableSection
 from .console import RichReporter, console, show_paths, show_table, started
-from .live import live
 
 
 def fly(
@@ -62,6 +61,8 @@ def fly(
         if where.is_vehicle:
             if delta or config or starts != 1 or latency != "fixed":
                 raise ConfigError("a vehicle is flown live: without --delta, --config, --starts and --latency")
+            from .live import live  # here: other flights need nothing of it
+
             go = live(
                 policy, resume, where=where, adapt=adapt, residual=residual, seconds=seconds or 30.0, seed=seed, out=out
             )

@@ -5,7 +5,6 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 RED, BLUE, GREY, GREEN, DARK = (214, 69, 65), (48, 112, 214), (150, 150, 150), (60, 160, 90), (45, 45, 50)
 METRES = 0.25  # of an arrow, for each m/s^2
@@ -93,6 +92,8 @@ class Scene:
 
 def quaternion(R: np.ndarray) -> tuple[float, float, float, float]:
     """Return an attitude as a unit quaternion, real part first."""
+    from scipy.spatial.transform import Rotation  # here: it takes as long to import as all of retrim
+
     x, y, z, w = Rotation.from_matrix(R).as_quat()
     return float(w), float(x), float(y), float(z)
 

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from scipy import special
 
 Index = tuple[int, ...]
 
@@ -16,6 +15,8 @@ def logistic(x: Any) -> Any:
 
 def erf_inv(x: Any) -> Any:
     """Return the inverse of the error function."""
+    from scipy import special  # here: it takes as long to import as all of retrim; programs are run before they fly
+
     return special.erfinv(x)
 
 
