@@ -63,10 +63,9 @@ def fly(
                 raise ConfigError("a vehicle is flown live: without --delta, --config, --starts and --latency")
             from .live import live  # here: other flights need nothing of it
 
-            go = live(
+            return live(
                 policy, resume, where=where, adapt=adapt, residual=residual, seconds=seconds or 30.0, seed=seed, out=out
-            )
-            return go(stop)
+            )(stop)
         weights, preset, state = loaded(policy, resume, delta)
         if config is not None:
             preset = same_policy(preset, overlaid(preset, config), config)
