@@ -21,7 +21,7 @@ class AbstractController(eqx.Module, Generic[M]):
 
     @abc.abstractmethod
     def init(self, x: State) -> M:
-        """Return the memory at the start of a flight in the state ``x``."""
+        """Return the memory at the start of a flight in the state ``x``; like a call, it is traced by JAX."""
 
     @abc.abstractmethod
     def __call__(self, memory: M, t: Float[Array, ""], x: State) -> tuple[Command, M]:
