@@ -181,9 +181,9 @@ def test_a_user_s_own_task_is_pretrained_and_flown_by_its_file(folder, monkeypat
     monkeypatch.syspath_prepend(str(folder))
     words = "--config", "small.toml", "--updates", "10", "--out", "own"
     out = retrim("pretrain", "follow_task:entry", *words, cwd=folder)
-    assert "entry error in its own model" in out
+    assert "follow_task:entry error in its own model" in out
     retrim("fly", "--policy", "own", "--seconds", "1", "--adapt", "none", "--out", "ownf", cwd=folder)
-    assert (folder / "ownf" / "entry_large.png").exists()
+    assert (folder / "ownf" / "follow_task_entry_large.png").exists()
 
 
 @pytest.mark.parametrize(

@@ -89,6 +89,10 @@ def residual(request):
     return Zero(jnp.array(request.preset.goal), request.vehicle.omega_max, jnp.array(0.1), jnp.array(0.0), steps=2)
 
 
+def no_disturbance(key, size):
+    return size
+
+
 def no_residual(request):
     return 3
 
@@ -203,7 +207,14 @@ def test_ones_own_task(mine):
     assert type(Setup.of(entry).env.task).__name__ == "Higher"
 
 
-@pytest.mark.parametrize(("name", "message"), [("NUMBER", "is a int, not a function"), ("no_task", "needs a height")])
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("NUMBER", "is a int, not a function"),
+        ("no_task", "needs a height"),
+        ("no_residual", "gives a int, expected a retrim.AbstractTask"),
+    ],
+)
 def test_a_task_that_is_none(mine, name, message):
     with pytest.raises(ConfigError, match=message):
         Setup.of(changed(tiny_preset(), task=f"{mine}:{name}"))
@@ -231,6 +242,13 @@ def test_a_size_that_ones_own_disturbance_refuses(mine):
 def test_a_plant_that_is_none(mine):
     with pytest.raises(ConfigError, match="is a int, not a function of a PlantRequest"):
         Scenario(plant=f"{mine}:NUMBER")
+    with pytest.raises(ConfigError, match=r"gives a int, expected a retrim\.Plant"):
+        Scenario(plant=f"{mine}:no_residual").make()
+
+
+def test_a_disturbance_that_is_none(mine):
+    with pytest.raises(ConfigError, match=rf"disturbance '{mine}:no_disturbance=2' gives a float, expected a retrim"):
+        disturbance(f"{mine}:no_disturbance=2")
 
 
 def test_a_vehicle_that_is_none(mine):

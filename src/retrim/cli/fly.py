@@ -95,8 +95,7 @@ def _fly(fleet: Fleet, setup: Setup, scenario: Scenario, run: Run) -> int:
         run.write_results(found, seeds=list(fleet.policies), preset=preset.name)
         write_flights(flights, preset, run.folder)
     n, steady = found[0]["n"], min(flights[0].steady_seconds, fleet.seconds)
-    kind = preset.task.rpartition(":")[2]
-    title = f"{kind} error [m], last {steady:g} s of {fleet.seconds:g} s, {n} start{'s' * (n > 1)}"
+    title = f"{preset.task} error [m], last {steady:g} s of {fleet.seconds:g} s, {n} start{'s' * (n > 1)}"
     lines = tuple((row["disturbance"], row["method"], cell(row)) for row in found)
     show_table(TableSection(("disturbance", "method", "error"), lines, title))
     for note in notes(flights, preset):

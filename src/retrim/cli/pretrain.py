@@ -71,8 +71,8 @@ def _pretrain(preset: Preset, seed: int, out: Path | None, stop: threading.Event
         if not run.interrupted:
             error_m = nominal_error(setup, policy)
             write_trained(run, setup, policy, losses, seed=seed, error_m=error_m)
-            name = preset.task.rpartition(":")[2]
-            console.print(f"{name} error in its own model: {1000 * error_m:.1f} mm after {len(losses)} steps")
+            told = f"{preset.task} error in its own model: {1000 * error_m:.1f} mm after {len(losses)} steps"
+            console.print(told, markup=False)
     if run.interrupted:
         console.print(f"interrupted after {len(losses)} steps, which are saved")
     console.print(run.watch.sentence())

@@ -43,9 +43,12 @@ def disturbance(names: str, seed: int = 0) -> Disturbance:
         factory = DISTURBANCES.find(name)
         key = random.fold_in(random.fold_in(random.key(seed), SEED_TAG), i)
         try:
-            parts.append(factory(key, size))
+            made = factory(key, size)
         except (TypeError, ValueError) as error:
             raise ConfigError(f"disturbance {part!r}: {error}") from error
+        if not callable(made):
+            raise ConfigError(f"disturbance {part!r} gives a {type(made).__name__}, expected a retrim.Disturbance")
+        parts.append(made)
     return parts[0] if len(parts) == 1 else Together(tuple(parts))
 
 

@@ -115,10 +115,13 @@ class Scenario:
             find_plant(self.plant)[1],
         )
         try:
-            return entry.make(request)
+            plant = entry.make(request)
         except RetrimError:
             raise
         except ValueError as error:
             raise ConfigError(
                 f"plant {self.plant!r} with sensors {self.sensors!r} at dt = {dt:g} s: {error}"
             ) from error
+        if not isinstance(plant, Plant):
+            raise ConfigError(f"plant {self.plant!r} gives a {type(plant).__name__}, expected a retrim.Plant")
+        return plant

@@ -39,7 +39,7 @@ from .presets import Preset
 from .presets import Track as TrackTable
 from .references import make_reference, make_training_reference
 from .residuals import ResidualRequest, make_residual
-from .tasks import TaskRequest, delayed, find_task
+from .tasks import TaskRequest, delayed, find_task, make_task
 from .vehicles import make_vehicle
 
 Latency = Literal["fixed", "measured"]
@@ -89,11 +89,11 @@ class Setup:
         if table.felt_copies and reference is None:
             reference = table.reference
         try:
-            task = entry.make(TaskRequest(preset, vehicle, trained_on))
+            task = make_task(TaskRequest(preset, vehicle, trained_on))
             flown = task
             if reference is not None:
                 followed = make_reference(reference) if isinstance(reference, str) else reference
-                flown = entry.make(TaskRequest(preset, vehicle, followed))
+                flown = make_task(TaskRequest(preset, vehicle, followed))
             nominal = nominal_model(preset, vehicle)
             jumps = jnp.array(preset.jump_cost) if preset.jump_cost else None
             env = Env(nominal, task, preset.delay_ticks, jump_cost=jumps)

@@ -79,6 +79,19 @@ def find_task(name: str) -> TaskEntry:
     return TaskEntry(entry)
 
 
+def make_task(request: TaskRequest) -> AbstractTask:
+    """Build the preset's task.
+
+    Raises:
+        ConfigError: There is no such task, or what the entry gives is none.
+    """
+    name = request.preset.task
+    task = find_task(name).make(request)
+    if not isinstance(task, AbstractTask):
+        raise ConfigError(f"task {name!r} gives a {type(task).__name__}, expected a retrim.AbstractTask")
+    return task
+
+
 def _hover(request: TaskRequest) -> AbstractTask:
     p = request.preset
     kind = L2Hover if p.reward == "l2" else Hover

@@ -64,14 +64,14 @@ def _explained(kind: type[Any], error: ValidationError) -> str:
     found = dict[str, str]()
     for each in error.errors(include_url=False):
         path = [str(part) for part in each["loc"] if not str(part).startswith("function-")]
-        where = ".".join(path) or kind.__name__.lower()
+        where = ".".join(path)
         message = each["msg"].removeprefix("Value error, ")
         if each["type"] == "unexpected_keyword_argument":
             message = f"unknown key; {suggestion(path[-1], _keys(kind, path[:-1]))}"
         elif each["type"] in ("missing", "missing_argument"):
             message = "is missing"
         found.setdefault(where, message)
-    return "; ".join(f"{where}: {message}" for where, message in found.items())
+    return "; ".join(f"{where}: {message}" if where else message for where, message in found.items())
 
 
 def _keys(kind: type[Any], path: Sequence[str]) -> list[str]:

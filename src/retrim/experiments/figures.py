@@ -49,8 +49,8 @@ def picture(
     seconds = max(float(track.t[-1]) for group in groups for track in group.tracks)
     task, preset = setup.flown, setup.preset
     where = f"{shown[0].vehicle} on plant {scenario.plant!r}"
-    kind = preset.task.rpartition(":")[2]
-    title = f"{kind.capitalize()}: {where}, disturbance {scenario.disturbance!r}, preset {preset.name!r}"
+    kind = preset.task if ":" in preset.task else preset.task.capitalize()
+    title = f"{kind}: {where}, disturbance {scenario.disturbance!r}, preset {preset.name!r}"
 
     observation = setup.env.task.observation
     if isinstance(observation, Keypoints):
@@ -69,8 +69,8 @@ def picture(
         x, y, z = (float(value) for value in task.home())
         beside = partial(plots.paths, groups=groups, goal=(x, y, z))
     figure = plots.flight_figure(title, groups, spans(scenario.disturbance, task.home(), seconds), beside)
-    clean = "".join(sign if sign.isalnum() or sign in "-." else "_" for sign in scenario.disturbance)
-    return plots.save(figure, folder, stem or f"{kind}_{clean}")
+    clean = "".join(sign if sign.isalnum() or sign in "-." else "_" for sign in f"{preset.task}_{scenario.disturbance}")
+    return plots.save(figure, folder, stem or clean)
 
 
 def spans(name: str, home: Array, seconds: float) -> list[plots.Span]:
