@@ -75,6 +75,12 @@ def test_what_a_file_leaves_out_follows_from_its_size(vehicle_file, size):
     assert float(bare.propeller.radius) == pytest.approx(0.9 * 0.105, rel=0.02)
 
 
+@pytest.mark.parametrize(("kind", "inches"), [("3 inch", 3.0), ("3 inch", 6.0), ("5 inch", 5.0)])
+def test_a_propeller_is_as_large_as_it_is_said_to_be(vehicle_file, kind, inches):
+    vehicle = read_vehicle(vehicle_file(propeller=f"'{kind}'", propeller_diameter=str(inches))).build()
+    assert float(vehicle.propeller.radius) == pytest.approx(0.5 * inches * 0.0254, rel=0.02)
+
+
 @pytest.mark.parametrize("plant", ["bem", "simple"])
 @pytest.mark.parametrize("propeller", [None, "7.0"])
 def test_it_hovers_on_hover_commands(vehicle_file, plant, propeller):
