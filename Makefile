@@ -51,11 +51,12 @@ mutants: dev
 drill: dev
 	RETRIM_DRILLS=7 $(BIN)/pytest tests/live/test_faults.py
 
-# The page of a live flight in a browser without a screen; Debian's Chromium is installed if there is none.
+# The page of a live flight in a browser without a screen, and recordings for rerun; Debian's Chromium is installed if
+# there is none.
 test-page: dev
 	command -v chromium >/dev/null || apt-get install --yes --no-install-recommends chromium
-	$(UV) pip install --quiet --python $(VENV) --constraints constraints.txt --group browser
-	$(BIN)/pytest -n 0 tests/live/test_page.py
+	$(UV) pip install --quiet --python $(VENV) --constraints constraints.txt --group browser --editable '.[rerun]'
+	$(BIN)/pytest -n 0 tests/live/test_page.py tests/io/test_recording.py
 
 # Links to vehicles, flown against peers, and learners in another network namespace: against the clock, one at a time.
 test-links: dev

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from retrim.errors import ConfigError
-from retrim.io.logs.recording import Recording, check_recording, write_mcap, write_npz
+from retrim.io.logs.recording import Recording, write_mcap, write_npz
+from retrim.io.logs.viewers import check_recording, record
 from retrim.runtime.events import Event
 
 N = 40
@@ -54,6 +55,39 @@ def test_what_is_written_is_read_by_another_reader(tmp_path):
     assert {m.data for _, m in found["/flown_by"]} == {"policy"}
 
 
+def test_rerun_s_own_reader_finds_the_flight(tmp_path):
+    """On one timeline, in seconds since the start."""
+    pytest.importorskip("rerun")
+    from rerun.chunk import RrdReader
+
+    flight, path = recording(), tmp_path / "flight.rrd"
+    record(path, flight)
+    assert [p.name for p in tmp_path.iterdir()] == ["flight.rrd"]
+    reader = RrdReader(path)
+    assert len(reader.recordings()) == len(reader.blueprints()) == 1
+    found = {}
+    for chunk in reader.stream():
+        columns = chunk.to_record_batch().to_pydict()
+        for name, values in columns.items():
+            found.setdefault(chunk.entity_path, {}).setdefault(name.rpartition(":")[2], []).extend(values)
+
+    def seconds(entity):
+        return [t.total_seconds() for t in found[entity]["flight"]]
+
+    for entity in ("/world/vehicle", "/world/measured", "/error", "/command/rates/y"):
+        np.testing.assert_allclose(seconds(entity), flight.t, atol=1e-6)
+    places = np.array([v[0] for v in found["/world/vehicle"]["translation"]])
+    np.testing.assert_allclose(places, flight.true[:, :3], rtol=1e-6)
+    x, y, z, w = np.array([v[0] for v in found["/world/vehicle"]["quaternion"]]).T
+    up = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x**2 + y**2)], axis=1)
+    np.testing.assert_allclose(up, flight.true[:, 3:12].reshape(-1, 3, 3)[:, :, 2], atol=1e-6)
+    np.testing.assert_allclose([v[0] for v in found["/command/rates/y"]["scalars"]], flight.command[:, 2])
+    np.testing.assert_allclose([v[0] for v in found["/error"]["scalars"]], flight.error)
+    told = ["flown by policy", "knobs: push 1 0 0", "policy: version 1"]
+    assert [v[0] for v in found["/events"]["text"]] == told
+    np.testing.assert_allclose(seconds("/events"), [0.0, 0.1, 0.3], atol=1e-6)
+
+
 def test_arrays_are_the_flight(tmp_path):
     flight, path = recording(), tmp_path / "flight.npz"
     write_npz(path, flight)
@@ -65,9 +99,15 @@ def test_arrays_are_the_flight(tmp_path):
 
 
 def test_where_nothing_can_be_recorded_is_named(tmp_path):
-    with pytest.raises(ConfigError, match=r"must end with \.mcap"):
+    with pytest.raises(ConfigError, match=r"must end with \.mcap or \.rrd"):
         check_recording(tmp_path / "flight.bag")
     pytest.importorskip("rosbags")
     with pytest.raises(ConfigError, match="nothing can be written in"):
         check_recording(tmp_path / "nowhere" / "flight.mcap")
     assert check_recording(tmp_path / "flight.mcap") == tmp_path / "flight.mcap"
+
+
+def test_a_viewer_that_is_not_installed_is_named(tmp_path, monkeypatch):
+    monkeypatch.setattr("retrim.io.logs.viewers.find_spec", lambda name: None)
+    with pytest.raises(ConfigError, match=r"flight\.rrd needs rerun: pip install 'retrim\[rerun\]'"):
+        check_recording(tmp_path / "flight.rrd")

@@ -22,7 +22,7 @@ from ..experiments.limits import check_seeds
 from ..experiments.run import INTERRUPTED, Run
 from ..experiments.tables.document import TableSection
 from ..experiments.training import train
-from ..io.logs.recording import check_recording
+from ..io.logs.viewers import check_recording
 from ..live.display import figures, live_line, live_rows
 from ..live.events import LiveEvents
 from ..live.flying import fly_live
@@ -76,7 +76,7 @@ def live(
         no_page: Show it in the terminal only.
         page_host: Address that the page listens on. Anybody who reaches another than 127.0.0.1 may turn the knobs.
         page_port: Port of the page, or the next one that is free.
-        record: FILE.mcap for Foxglove, PlotJuggler or rerun, written at the end; by default flight.mcap in the folder.
+        record: FILE.mcap for Foxglove and PlotJuggler, or FILE.rrd for rerun, beside the flight.mcap in the folder.
         out: Folder of what the flight leaves; a new one under runs/ by default.
     """
 

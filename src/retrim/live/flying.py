@@ -15,6 +15,7 @@ from ..experiments.outputs import clear_outputs, write_events, write_learnt
 from ..experiments.reporter import Reporter
 from ..experiments.run import Run
 from ..io.logs.recording import Recording, can_record, write_mcap, write_npz
+from ..io.logs.viewers import record
 from ..onboard.guard import Mode
 from ..onboard.messages import ACCOUNTS, COMMAND, MEASURED, TRUE
 from ..runtime.events import Event
@@ -111,7 +112,7 @@ def _written(
 
 
 def _recorded(request: LiveRequest, rows: np.ndarray, events: LiveEvents) -> list[Path]:
-    """Write the flight, the landing too, as NPZ and MCAP; return where the latter is, if it was asked for."""
+    """Write the flight, the landing too, as NPZ and for viewers; return where the recording is that was asked for."""
     target = np.asarray(jax.jit(jax.vmap(request.setup.flown.target))(rows[:, 1]), dtype=float)
     recording = Recording(
         rows[:, 1], rows[:, MEASURED], rows[:, TRUE], rows[:, 2], rows[:, COMMAND],
@@ -121,8 +122,11 @@ def _recorded(request: LiveRequest, rows: np.ndarray, events: LiveEvents) -> lis
     )  # fmt: skip
     write_npz(request.folder / "flight.npz", recording)
     if can_record():
-        write_mcap(request.record or request.folder / "flight.mcap", recording)
-    return [] if request.record is None else [request.record]
+        write_mcap(request.folder / "flight.mcap", recording)
+    if request.record is None:
+        return []
+    record(request.record, recording)
+    return [request.record]
 
 
 def _warmed_up(supervisor: Supervisor, run: Run, reporter: Reporter) -> bool:

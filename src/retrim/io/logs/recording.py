@@ -4,7 +4,6 @@ Foxglove, PlotJuggler, rerun and ``ros2 bag`` open MCAP; it needs the extra ``mc
 """
 
 import io
-import os
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import ConfigError
 from ...runtime.events import Event
 from ..files import write_whole
 
@@ -47,23 +45,6 @@ class Recording:
     terminated: bool = False
 
 
-def check_recording(path: Path) -> Path:
-    """Return where a recording goes, before anything is flown.
-
-    Raises:
-        ConfigError: It cannot be written there, or what writes it is not installed.
-    """
-    if path.suffix != ".mcap":
-        raise ConfigError(f"--record {path}: the name must end with .mcap")
-    if not can_record():
-        raise ConfigError("--record needs rosbags: pip install 'retrim[mcap]'")
-    if path.is_dir():
-        raise ConfigError(f"--record {path}: it is a folder")
-    if not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
-        raise ConfigError(f"--record {path}: nothing can be written in {path.parent}")
-    return path
-
-
 def can_record() -> bool:
     """Return whether what writes MCAP is installed."""
     return find_spec("rosbags") is not None
@@ -89,11 +70,10 @@ def write_mcap(path: Path, flight: Recording) -> None:
     """
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
-    from scipy.spatial.transform import Rotation  # here: it takes as long to import as all of retrim
 
     types = get_typestore(Stores.ROS2_JAZZY)
     make = _Messages(types.types)
-    quaternions = [Rotation.from_matrix(x[:, 3:12].reshape(-1, 3, 3)).as_quat() for x in (flight.measured, flight.true)]
+    turned = [quaternions(x) for x in (flight.measured, flight.true)]
     with tempfile.TemporaryDirectory(dir=path.parent) as place:
         bag = Path(place) / "flight"
         with Writer(bag, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
@@ -109,9 +89,9 @@ def write_mcap(path: Path, flight: Recording) -> None:
             for k, t in enumerate((flight.t + later).tolist()):
                 x, truth, u = flight.measured[k], flight.true[k], flight.command[k]
                 seen = t - float(flight.age[k])  # the header says when a state was true, the log when it came
-                add("/measured/pose", t, make.pose(seen, x, quaternions[0][k]))
+                add("/measured/pose", t, make.pose(seen, x, turned[0][k]))
                 add("/measured/velocity", t, make.twist(seen, x[12:15], np.zeros(3)))
-                add("/true/pose", t, make.pose(t, truth, quaternions[1][k]))
+                add("/true/pose", t, make.pose(t, truth, turned[1][k]))
                 add("/true/velocity", t, make.twist(t, truth[12:15], np.zeros(3)))
                 add("/command", t, make.twist(t, np.array([0.0, 0.0, u[0]]), u[1:]))
                 add("/error", t, make.number(float(flight.error[k])))
@@ -124,6 +104,14 @@ def write_mcap(path: Path, flight: Recording) -> None:
             for event in sorted(flight.events, key=lambda event: event.t):
                 add("/events", max(0.0, event.t) + later, make.text(f"{event.kind}: {event.note}"))
         next(bag.glob("*.mcap")).replace(path)
+
+
+def quaternions(x: np.ndarray) -> np.ndarray:
+    """Return the attitudes of states as quaternions x, y, z, w, (n, 4)."""
+    from scipy.spatial.transform import Rotation  # here: it takes as long to import as all of retrim
+
+    found: np.ndarray = Rotation.from_matrix(x[:, 3:12].reshape(-1, 3, 3)).as_quat()
+    return found
 
 
 class _Messages:

@@ -1,0 +1,50 @@
+"""Recordings for other viewers, by the ends of their names."""
+
+import os
+from collections.abc import Callable, Mapping
+from importlib.util import find_spec
+from pathlib import Path
+from typing import NamedTuple
+
+from ...errors import ConfigError
+from .recording import Recording, write_mcap
+from .rerun_file import write_rrd
+
+
+class Viewer(NamedTuple):
+    """A kind of recording."""
+
+    write: Callable[[Path, Recording], None]
+    package: str
+    """What writes it, as it is imported."""
+    extra: str
+    """Of this package, that installs it."""
+
+
+VIEWERS: Mapping[str, Viewer] = {
+    ".mcap": Viewer(write_mcap, "rosbags", "mcap"),
+    ".rrd": Viewer(write_rrd, "rerun", "rerun"),
+}
+
+
+def check_recording(path: Path) -> Path:
+    """Return where a recording goes, before anything is flown.
+
+    Raises:
+        ConfigError: It cannot be written there, or what writes it is not installed.
+    """
+    viewer = VIEWERS.get(path.suffix)
+    if viewer is None:
+        raise ConfigError(f"--record {path}: the name must end with {' or '.join(VIEWERS)}")
+    if find_spec(viewer.package) is None:
+        raise ConfigError(f"--record {path} needs {viewer.package}: pip install 'retrim[{viewer.extra}]'")
+    if path.is_dir():
+        raise ConfigError(f"--record {path}: it is a folder")
+    if not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
+        raise ConfigError(f"--record {path}: nothing can be written in {path.parent}")
+    return path
+
+
+def record(path: Path, flight: Recording) -> None:
+    """Write a flight in the form that the end of the name says; the file appears when it is whole."""
+    VIEWERS[path.suffix].write(path, flight)
