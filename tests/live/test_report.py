@@ -37,10 +37,10 @@ def flown(asked, ticks=30):
     return rows
 
 
-def reported(asked, rows, ended, **control):
+def reported(asked, rows, ended, stalls=None, **control):
     lines = [",".join(COLUMNS), *(",".join(map(repr, row)) for row in rows.tolist())]
     (asked.folder / "flight.csv").write_text("\n".join(lines) + "\n")
-    status, events = Status(1.0, control, {}, {}, {}, ended, [], False, 0, None), LiveEvents()
+    status, events = Status(1.0, control, {}, {}, {}, ended, [], False, 0, None, stalls or {}), LiveEvents()
     flight, found = flight_of(asked, (), status, None)
     return {row["metric"]: row for row in results(asked, flight, found, status, events)}
 
@@ -55,6 +55,16 @@ def test_a_crash_is_counted_with_its_last_row_and_without(asked):
     assert reported(asked, rows, CRASHED, reason="landing")["steady"]["crashes"] == 0
     rows[-1, TRUE] = rows[-1, MEASURED] = level((0.0, 0.0, -1.0))
     assert reported(asked, rows, CRASHED)["steady"]["crashes"] == 1
+
+
+def test_ticks_that_were_missed_while_the_machine_stood_still_are_told_apart(asked):
+    gaps = [(10.0, 10.04, 1), (11.0, 11.08, 3), (12.0, 12.04, 1)]
+    stalls = {"count": 2, "longest": 0.05, "newest": [[11.01, 11.06], [12.05, 12.06]]}
+    found = reported(asked, flown(asked), "landed", stalls, missed=5, gaps=gaps)
+    assert [found[name]["value"] for name in ("missed_ticks", "missed_in_stalls", "stalls")] == [5, 3, 2]
+    assert found["stall_max_ms"]["value"] == pytest.approx(50.0)
+    unknown = reported(asked, flown(asked), "landed", missed=5, gaps=gaps)  # the watchdog came behind others
+    assert [unknown[name]["value"] for name in ("missed_in_stalls", "stalls", "stall_max_ms")] == [None] * 3
 
 
 def test_a_hang_is_in_the_statistics_and_what_nobody_timed_is_not(asked):

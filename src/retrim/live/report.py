@@ -17,6 +17,7 @@ from ..onboard.accounts import EDGES_MS, accounted, summary
 from ..onboard.guard import HOVER, Mode
 from ..onboard.messages import ACCOUNTS, COMMAND, MEASURED, TRUE
 from ..onboard.recorder import read_log
+from ..onboard.stalls import lost_in
 from ..onboard.topics import LAYERS
 from ..runtime.events import Event
 from ..runtime.flight import Log, States
@@ -88,6 +89,7 @@ def results(
     given_up = status.control.get("given_up", [])
     values = {
         "missed_ticks": status.control.get("missed"),
+        **_stalls(status),
         **{f"{name}_{q}_ms": by[name][q] for name in ("lateness", "step", "idle") for q in ("p50", "p99", "max")},
         "state_age_p99_ms": by["state_age"]["p99"],
         "policy_age_p50_s": None if by["policy_age"]["p50"] is None else 1e-3 * by["policy_age"]["p50"],
@@ -106,6 +108,14 @@ def results(
     about = {"scenario": scenario.disturbance, "method": request.method, "plant": scenario.plant, "n": 1,
              "crashes": int(crashed)}  # fmt: skip
     return [{**about, "metric": metric, "value": _finite(value)} for metric, value in values.items()]
+
+
+def _stalls(status: Status) -> dict[str, Any]:
+    """When the machine stood still, and how many ticks were missed then; None where nobody could tell."""
+    seen = status.stalls
+    missed = lost_in(seen["newest"], status.control.get("gaps", [])) if seen else None
+    longest = 1e3 * seen["longest"] if seen else None
+    return {"missed_in_stalls": missed, "stalls": seen.get("count"), "stall_max_ms": longest}
 
 
 def histograms(rows: np.ndarray) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """How a live flight stands."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 
@@ -24,3 +24,5 @@ class Status:
     """How often the watchdog has commanded."""
     log_failed: str | None
     """Why the flight is no longer written down; None while it is."""
+    stalls: dict[str, Any] = field(default_factory=dict)
+    """How often the machine stood still, and for how long."""

@@ -182,8 +182,8 @@ class Supervisor:
         t, fallback = time.monotonic() - self.epoch, self.bus.latest("fallback")
         by_watchdog = last_sent(self.bus, "fallback") > last_sent(self.bus, "setpoint")
         ticks = 0 if fallback is None else fallback.version
-        said = self._rejections()
-        return Status(t, control, world, alive, dict(self.restarts), ended, said, by_watchdog, ticks, failed)
+        said, stalls = self._rejections(), last_note(self.bus, "stalls")
+        return Status(t, control, world, alive, dict(self.restarts), ended, said, by_watchdog, ticks, failed, stalls)
 
     def finish(self, patience: float = 3.0) -> None:
         """Wait until the log is written."""

@@ -17,7 +17,7 @@ def topics(spec: LiveSpec) -> dict[str, int]:
     learnt = spec.start.stat().st_size + 3 * half.get("policy", 0) + 200_000
     return (
         dict.fromkeys(SMALL, 4096)
-        | {"status": 65536, "flight": rows, "fallback.flight": rows}
+        | {"status": 65536, "stalls": 16384, "flight": rows, "fallback.flight": rows}
         | {f"ready.{role}": 8192 for role in ROLES}
         | {f"parameters.{name}": size + 100_000 for name, size in ({REFERENCE: 0} | half).items()}
         | {"mission": learnt}

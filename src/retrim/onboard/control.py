@@ -17,6 +17,7 @@ from .plan import ControlPlan
 from .shares import ROOM
 
 REPORT_EVERY = 5  # ticks
+GAPS = 100  # newest ones
 LANDING = "landing"
 FELT = 0.1  # share of a tick in the mean of what is felt
 
@@ -38,6 +39,8 @@ class ControlLoop:
         """The flight has ended, and all its ticks are reported."""
         self.error = 0.0
         self.missed, self.late_samples = 0, 0
+        self.gaps: deque[tuple[float, float, int]] = deque(maxlen=GAPS)
+        """From when to when ticks were missed [s, monotonic], and how many."""
         self.felt, self.estimate = np.zeros(3), np.zeros(3)
         """Acceleration that the simple model misses, over the last tenths of a second, and what the residual model says
         of it, world [m/s^2]."""
@@ -131,7 +134,7 @@ class ControlLoop:
         self.bus.publish("status", pack_note(
             "status", mode=self.mode.name.lower(), reason=self.reason, error=self.error, versions=self.pilot.versions,
             newest=intake.newest, given_up=intake.given_up, refused=intake.refused, swaps=list(intake.swaps),
-            missed=self.missed, late_samples=self.late_samples, felt=self.felt.tolist(),
+            missed=self.missed, gaps=list(self.gaps), late_samples=self.late_samples, felt=self.felt.tolist(),
             estimate=self.estimate.tolist(), target=self._target.tolist(), learning=self.intake.open,
         ))  # fmt: skip
 
@@ -198,7 +201,9 @@ class ControlLoop:
     def _follow(self, before: Sample, sample: Sample) -> None:
         """Take note of what the plant says of the tick that has ended."""
         accepted, lost = np.asarray(sample.accepted), sample.tick - before.tick - 1
-        self.missed += lost
+        if lost:
+            self.missed += lost
+            self.gaps.append((before.sent, sample.sent, lost))
         if lost * self.plan.dt > self.plan.limits.state_age:
             self._gap = f"{lost} measurements were not answered"
         if self.mode == Mode.POLICY and np.abs(accepted - self._issued).max() > 1e-4:

@@ -13,6 +13,7 @@ from ..transport.shared_memory import SharedMemoryBus
 from .guard import Fallback, GeometricHover, Limits, Mode
 from .messages import COMMAND, FlightRows, Sample, Setpoint, Stamp, pack_note
 from .realtime import Lifeline, be_punctual
+from .stalls import Stalls
 
 PATIENCE = 1.6  # ticks without a command
 CHECK_EVERY = 0.002  # [s]
@@ -128,7 +129,12 @@ def watch(plan: WatchdogPlan) -> None:
     bus = SharedMemoryBus(plan.folder)
     watchdog, control, parent = Watchdog(plan, bus), Lifeline(plan.control), Lifeline(plan.parent)
     bus.publish("ready.watchdog", pack_note("ready", refused=refused))
+    stalls = None if refused else Stalls(CHECK_EVERY)  # who comes behind others waits for them, not for the machine
+    if stalls is not None:
+        bus.publish("stalls", stalls.pack())
     while not watchdog.done:
+        if stalls is not None and stalls.woke(time.monotonic()):
+            bus.publish("stalls", stalls.pack())
         gone = control.gone(CHECK_EVERY)
         if gone:
             time.sleep(CHECK_EVERY)
