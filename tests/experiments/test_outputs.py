@@ -13,7 +13,7 @@ from made_up import DT, flight, log
 from retrim import Event, LoraPolicy, Scenario, Setup
 from retrim.experiments import FlightSpec, Run, outputs
 from retrim.experiments.metrics import failed_record, notes, summary
-from retrim.io.logs.recording import can_record
+from retrim.io.logs.viewers import can_record
 from retrim.io.trained import load_learnt, load_policy
 
 SPECS = [FlightSpec(Scenario(), method, start, 4) for method in ("base", "full") for start in (0, 1)]
@@ -86,7 +86,7 @@ def test_what_the_first_whole_flight_learnt_is_kept(setup, tmp_path):
     np.testing.assert_array_equal(weights(state.policy.policy)[0], weights(states[1].policy.policy)[0])
     names = sorted(path.name for path in (tmp_path / "logs").glob("*.npz"))
     assert names == ["base_seed4_start0.npz", "full_seed4_start0.npz", "full_seed4_start1.npz", "full_seed4_start2.npz"]
-    if can_record():
+    if can_record(tmp_path / "flight.mcap"):
         assert len(list((tmp_path / "logs").glob("*.mcap"))) == 4
     low = dataclasses.replace(flights[2], learnt=learnt(setup, 0, low_rank=True))
     assert isinstance(low.learnt.policy.policy, LoraPolicy)

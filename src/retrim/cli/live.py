@@ -76,7 +76,7 @@ def live(
         no_page: Show it in the terminal only.
         page_host: Address that the page listens on. Anybody who reaches another than 127.0.0.1 may turn the knobs.
         page_port: Port of the page, or the next one that is free.
-        record: FILE.mcap for Foxglove and PlotJuggler, or FILE.rrd for rerun, beside the flight.mcap in the folder.
+        record: FILE.mcap for Foxglove and PlotJuggler, by default flight.mcap in the folder; or FILE.rrd for rerun.
         out: Folder of what the flight leaves; a new one under runs/ by default.
     """
 

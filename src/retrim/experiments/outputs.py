@@ -14,7 +14,8 @@ from ..control.lora import LoraPolicy
 from ..control.policy import Policy
 from ..io.checkpoint import save_delta
 from ..io.files import write_whole
-from ..io.logs.recording import Recording, can_record, write_mcap, write_npz
+from ..io.logs.recording import Recording, write_npz
+from ..io.logs.viewers import can_record, record
 from ..io.trained import save_learnt, save_policy
 from .flights import Flight
 from .interrupts import interrupts_only_set
@@ -92,10 +93,10 @@ def write_logs(flights: Sequence[Flight], folder: Path) -> None:
     (folder / "logs").mkdir(parents=True, exist_ok=True)
     for flight in flights:
         spec, recording = flight.spec, recording_of(flight)
-        path = folder / "logs" / f"{spec.method}_seed{spec.seed}_start{spec.start}.npz"
-        write_npz(path, recording)
-        if can_record():
-            write_mcap(path.with_suffix(".mcap"), recording)
+        path = folder / "logs" / f"{spec.method}_seed{spec.seed}_start{spec.start}.mcap"
+        write_npz(path.with_suffix(".npz"), recording)
+        if can_record(path):
+            record(path, recording)
 
 
 def recording_of(flight: Flight) -> Recording:

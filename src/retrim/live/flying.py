@@ -14,8 +14,8 @@ from ..experiments.flights import Flight
 from ..experiments.outputs import clear_outputs, write_events, write_learnt
 from ..experiments.reporter import Reporter
 from ..experiments.run import Run
-from ..io.logs.recording import Recording, can_record, write_mcap, write_npz
-from ..io.logs.viewers import record
+from ..io.logs.recording import Recording, write_npz
+from ..io.logs.viewers import can_record, record
 from ..onboard.guard import Mode
 from ..onboard.messages import ACCOUNTS, COMMAND, MEASURED, TRUE
 from ..runtime.events import Event
@@ -121,12 +121,12 @@ def _recorded(request: LiveRequest, rows: np.ndarray, events: LiveEvents) -> lis
         events=events.all,
     )  # fmt: skip
     write_npz(request.folder / "flight.npz", recording)
-    if can_record():
-        write_mcap(request.folder / "flight.mcap", recording)
-    if request.record is None:
-        return []
-    record(request.record, recording)
-    return [request.record]
+    paths = {".mcap": request.folder / "flight.mcap"}
+    if request.record is not None:
+        paths[request.record.suffix] = request.record
+    for path in filter(can_record, paths.values()):
+        record(path, recording)
+    return [] if request.record is None else [request.record]
 
 
 def _warmed_up(supervisor: Supervisor, run: Run, reporter: Reporter) -> bool:

@@ -113,9 +113,10 @@ def results(
 def _stalls(status: Status) -> dict[str, Any]:
     """When the machine stood still, and how many ticks were missed then; None where nobody could tell."""
     seen = status.stalls
-    missed = lost_in(seen["newest"], status.control.get("gaps", [])) if seen else None
-    longest = 1e3 * seen["longest"] if seen else None
-    return {"missed_in_stalls": missed, "stalls": seen.get("count"), "stall_max_ms": longest}
+    if not seen:
+        return dict.fromkeys(("missed_in_stalls", "stalls", "stall_max_ms"))
+    missed = lost_in(seen["newest"], status.control.get("gaps", []))
+    return {"missed_in_stalls": missed, "stalls": seen["count"], "stall_max_ms": 1e3 * seen["longest"]}
 
 
 def histograms(rows: np.ndarray) -> dict[str, Any]:

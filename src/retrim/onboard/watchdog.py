@@ -133,7 +133,7 @@ def watch(plan: WatchdogPlan) -> None:
     if stalls is not None:
         bus.publish("stalls", stalls.pack())
     while not watchdog.done:
-        if stalls is not None and stalls.woke(time.monotonic()):
+        if stalls is not None and watchdog.heard is not None and stalls.woke(time.monotonic()):
             bus.publish("stalls", stalls.pack())
         gone = control.gone(CHECK_EVERY)
         if gone:

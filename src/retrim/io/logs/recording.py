@@ -7,7 +7,6 @@ import io
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -43,11 +42,6 @@ class Recording:
     """How old the flight is that the policy was learnt from [s], (n,)."""
     events: Sequence[Event] = ()
     terminated: bool = False
-
-
-def can_record() -> bool:
-    """Return whether what writes MCAP is installed."""
-    return find_spec("rosbags") is not None
 
 
 def write_npz(path: Path, flight: Recording) -> None:

@@ -36,13 +36,18 @@ def check_recording(path: Path) -> Path:
     viewer = VIEWERS.get(path.suffix)
     if viewer is None:
         raise ConfigError(f"--record {path}: the name must end with {' or '.join(VIEWERS)}")
-    if find_spec(viewer.package) is None:
+    if not can_record(path):
         raise ConfigError(f"--record {path} needs {viewer.package}: pip install 'retrim[{viewer.extra}]'")
     if path.is_dir():
         raise ConfigError(f"--record {path}: it is a folder")
     if not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
         raise ConfigError(f"--record {path}: nothing can be written in {path.parent}")
     return path
+
+
+def can_record(path: Path) -> bool:
+    """Return whether what writes recordings of that name is installed."""
+    return find_spec(VIEWERS[path.suffix].package) is not None
 
 
 def record(path: Path, flight: Recording) -> None:
