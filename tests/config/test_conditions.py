@@ -1,5 +1,7 @@
 """The conditions of the gauntlet are what their names say."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -45,6 +47,17 @@ def test_a_condition_at_hover_is_its_disturbance_with_one_thing_changed():
     assert {name: np.unique(np.round(ratio, 6)).tolist() for name, ratio in slow.items()} == {
         name: [2.0 if name == "motor_tau" else 1.0] for name in slow
     }
+
+
+@pytest.mark.parametrize("preset", ["hover/retrim", "track/retrim"])
+def test_other_sensors_measure_every_condition_that_names_none_and_has_some(preset):
+    ideal, rough = conditions(PRESETS[preset]), conditions(PRESETS[preset], "rough")
+    assert {scenario.sensors for scenario in rough.values()} == {"rough"}
+    for name, scenario in ideal.items():
+        if name in rough:
+            assert scenario == replace(rough[name], sensors="ideal")
+        else:
+            assert scenario.sensors != "ideal" or not scenario.entry.has_sensors
 
 
 @pytest.mark.parametrize(("preset", "own"), [("track/retrim", small), ("track/fast", kingfisher)])

@@ -1,6 +1,7 @@
 """The conditions of the gauntlet: everything that changes, and everything that differs from training."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Array
@@ -12,9 +13,19 @@ from .vehicle_file import VehicleSpec
 from .vehicles import make_vehicle
 
 
-def conditions(preset: Preset) -> dict[str, Scenario]:
-    """Return what is flown with a preset, by name: at hover, or on every reference that it was trained on."""
-    return _at_hover() if preset.track is None else _on_references(preset, preset.track.reference.split("+"))
+def conditions(preset: Preset, sensors: str = "ideal") -> dict[str, Scenario]:
+    """Return what is flown with a preset, by name: at hover, or on every reference that it was trained on.
+
+    Args:
+        preset: What is flown.
+        sensors: What every condition is measured with; with others than ideal ones, those conditions are left out that
+            name sensors of their own or fly a plant without sensors.
+    """
+    found = _at_hover() if preset.track is None else _on_references(preset, preset.track.reference.split("+"))
+    if sensors == "ideal":
+        return found
+    measured = {name: flown for name, flown in found.items() if flown.sensors == "ideal" and flown.entry.has_sensors}
+    return {name: replace(flown, sensors=sensors) for name, flown in measured.items()}
 
 
 def _on_references(preset: Preset, references: Sequence[str]) -> dict[str, Scenario]:
@@ -73,6 +84,8 @@ def _at_hover() -> dict[str, Scenario]:
         "none/rough": Scenario(sensors="rough"),
         "step/rough": Scenario("step", sensors="rough"),
         "gusts/rough": Scenario("gusts", sensors="rough"),
+        "fan/rough": Scenario("fan", sensors="rough"),
+        "walk/rough": Scenario("walk", sensors="rough"),
         "kick": Scenario("kick"),
         "step/delay-40ms": Scenario("step", delay=0.04),
         "step/slow-motors": Scenario("step", vehicle=_like(small(), "slow-motors", motor_tau=2.0)),

@@ -44,6 +44,7 @@ def gauntlet(
     seeds: tuple[int, ...] = (0,),
     seconds: float = 30.0,
     starts: int = 4,
+    sensors: str = "ideal",
 ) -> None:
     """A policy under everything that changes: recovery, steady and worst error, as one heat map.
 
@@ -57,13 +58,14 @@ def gauntlet(
         seeds: Training seeds; each also seeds the starts, the gusts and the learners of its flights.
         seconds: Length of a flight [s].
         starts: Flights per condition, method and seed.
+        sensors: What the conditions are measured with that name no sensors themselves: ideal, mocap, onboard or rough.
     """
     task = load(preset).task
     if task not in METHODS:
         raise ConfigError(f"preset {preset!r} is for {task}; the gauntlet is flown for {', '.join(METHODS)}")
     methods = methods or METHODS[task]
     (loaded,) = table_presets([preset], task, seeds=seeds, starts=starts, seconds=seconds)
-    known = conditions(loaded)
+    known = conditions(loaded, sensors)
     if unknown := [name for name in only if name not in known]:
         raise ConfigError(f"no condition {unknown[0]!r}; there are {', '.join(known)}")
     chosen = [known[name] for name in only or known]
