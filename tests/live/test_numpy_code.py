@@ -50,12 +50,19 @@ OPERATIONS = {
         x + p, x - p, x * p, x / p, jnp.arctan2(x, p), jnp.maximum(x, p), jnp.minimum(x, p), jnp.fmod(x, p),
         jnp.abs(x) ** p, x < p, x >= p, x == p, (x < p) & (x > -p), (x < p) | (x > 1.0), ~(x < p), (x < p) ^ (x > 1.0),
     ],
-    "choice": lambda p, x: [jnp.where(x > p, x, p), jnp.clip(x, -p, p), lax.select_n(jnp.array(2), x, 2 * x, 3 * x)],
+    "choice": lambda p, x: [
+        jnp.where(x > p, x, p), jnp.clip(x, -p, p), lax.select_n(jnp.array(2), x, 2 * x, 3 * x), jnp.where(x > p, x, x),
+        lax.select(p > 0.0, x, -x), lax.select(p < 0.0, x, -x), jnp.where(x[1, 2, 3] > p, x[0, 0, 0], p), p + (p > 9.0),
+        lax.select(x[0, 0, 0] < p, x[0, 1, 2], jnp.nan * p), lax.select(p > 0.0, x > p, x < p),
+    ],
     "shapes": lambda p, x: [
         x.reshape(6, 4), x[0, 1:, ::2], x[..., ::-1], x.transpose(2, 0, 1), jnp.broadcast_to(x[:, :1], (2, 5, 4)),
-        jnp.concatenate([x, 2.0 * x], axis=1), jnp.stack([x, x], axis=-1), jnp.pad(x, ((0, 0), (1, 2), (0, 1))),
+        jnp.concatenate([x, 2.0 * x], axis=1), jnp.stack([x, x], axis=-1), jnp.stack([x, p * x]),
+        jnp.pad(x, ((0, 0), (1, 2), (0, 1))),
         lax.pad(x, p, ((0, 0, 0), (-1, 2, 1), (1, -1, 0))), jnp.split(x, [1, 3], axis=2), jnp.tile(x, (1, 2, 1)),
-        jnp.squeeze(x[:1]), x[:, None], jnp.arange(5) * p, jnp.eye(3) * p,
+        jnp.squeeze(x[:1]), x[:, None], jnp.arange(5) * p, jnp.eye(3) * p, x[1, 2, 3], p * x[1, 0, 2] + x[0, 1, 1],
+        jnp.stack([x[1, 2, 3], x[0, 0, 1], p]), jnp.stack([x[0, 0] > p, x[1, 1] > p]),
+        (p + x[0, 1])[2] * x[:1, 1:2, 2:3],
     ],
     "sums": lambda p, x: [
         x.sum(), x.sum((0, 2)), x.max(1), x.min((1, 2)), x.mean(0), x.prod(2),

@@ -83,11 +83,13 @@ def test_it_is_the_lockstep_flight_tick_for_tick():
 
     bus = InProcessBus(TOPICS)
     loop = ControlLoop(plan(adaptive_source(made, state), window=100), bus)
+    loop.warm_up()
     with SimPlant(CheapModel(), push) as plant:
         measurement, accepted = plant.reset(x0), np.array([9.81, 0.0, 0.0, 0.0])
         for tick in range(60):
             x = np.concatenate([np.asarray(leaf).ravel() for leaf in (measurement.p, measurement.R, measurement.v)])
             now = time.monotonic()
+            loop.rehearse()  # which changes nothing
             bus.publish("sample", Sample(tick, measurement.t, now, 0.0, x, x, accepted).pack())
             u = loop.tick(now).u
             measurement, taken = plant.step(Command(jnp.asarray(u[0]), jnp.asarray(u[1:])))
@@ -98,6 +100,24 @@ def test_it_is_the_lockstep_flight_tick_for_tick():
     np.testing.assert_allclose(rows[:, 3:6], log.p[:-2], atol=1e-9)
     np.testing.assert_allclose(rows[:, COMMAND], log.u[1:-1], atol=1e-9)
     np.testing.assert_allclose(rows[:, 1], log.t[:-2], atol=1e-12)
+
+
+@pytest.mark.parametrize("slow", [False, True])
+def test_only_a_controller_that_decides_at_once_is_rehearsed(monkeypatch, slow):
+    flight = Flight(holding())
+    act, rehearsed = flight.loop.pilot.act, []
+    monkeypatch.setattr(flight.loop.pilot, "act", lambda *given: (time.sleep(0.1 * DT * slow), act(*given))[1])
+    monkeypatch.setattr(flight.loop.pilot, "rehearse", lambda *given: rehearsed.append(given))
+    flight.loop.warm_up()
+    flight.loop.rehearse()
+    assert not rehearsed  # nothing has been measured
+    flight.step()
+    flight.loop.rehearse()
+    assert bool(rehearsed) != slow
+    flight.step(late=1.0)  # the guard flies
+    rehearsed.clear()
+    flight.loop.rehearse()
+    assert not rehearsed
 
 
 def test_a_swap_changes_the_command_little_by_little():

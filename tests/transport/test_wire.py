@@ -35,7 +35,7 @@ def with_header(header):
 def edited(data, change=None, **header):
     """The message with other tensors or another header, without the checksum's consent."""
     tensors = load(data)
-    return save(change(tensors) if change else tensors, metadata=message._metadata(data) | header)
+    return save(change(tensors) if change else tensors, metadata=message._header(data, "test") | header)
 
 
 @pytest.mark.parametrize("like", [TREE, SHAPES])

@@ -5,6 +5,7 @@ reaches is computed now, what only parameters reach is computed when they change
 classical controllers, ours and the user's own, fly in real time by the same definition that trains in JAX.
 """
 
+import re
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -21,6 +22,9 @@ from .primitives import EXPRESSIONS, no_form
 CONSTANT, PARAMETER, INPUT = range(3)
 INLINE = ("jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "remat", "checkpoint")
 LONGEST = 100  # steps of a loop
+NUMBER = ".reshape(())"
+"""What makes a number of a block of one element."""
+BLOCK = re.compile(r"(\w+)\[(\d+:\d+(?:, \d+:\d+)*)\]")
 Ref = tuple[str, int]
 """Name of a value in the source, and the kind of what it depends on."""
 
@@ -111,6 +115,7 @@ class _Writer:
 
     def _line(self, text: str, operands: Sequence[Ref]) -> Ref:
         """Return the name of an expression of operands; the same one is written once."""
+        text, operands = self._number(text, operands)
         kind = max((kind for _, kind in operands), default=CONSTANT)
         if kind == CONSTANT:
             return self.constant(eval(text, self._scope))
@@ -118,6 +123,15 @@ class _Writer:
             self._known[text] = (f"v{len(self.lines)}", kind)
             self.lines.append((f"v{len(self.lines)}", text, kind, tuple(name for name, _ in operands)))
         return self._known[text]
+
+    def _number(self, text: str, operands: Sequence[Ref]) -> tuple[str, Sequence[Ref]]:
+        """Take a number out of an array at once: scalars of NumPy are several times faster than arrays without axes."""
+        name = operands[0][0] if text.endswith(NUMBER) else ""
+        block = BLOCK.fullmatch(self.lines[int(name[1:])][1]) if name.startswith("v") else None
+        if block is None:
+            return text, operands
+        array, starts = block[1], re.sub(r":\d+", "", block[2])
+        return f"{array}[{starts}]", [(array, operands[0][1])]
 
     def _unrolled(self, eqn: Any, operands: list[Ref]) -> list[Ref]:
         """Write the body of a loop of known length once for each of its steps."""

@@ -52,7 +52,7 @@ def _reduced(ufunc: str) -> Expression:
 
 
 def _stack(eqn: Any, *xs: str) -> str:
-    if eqn.invars[0].aval.ndim == 0 and not _is_key(eqn.invars[0]):
+    if eqn.params["axis"] == 0 and not _is_key(eqn.invars[0]):  # a quarter of the time of np.stack
         return f"np.array(({', '.join(xs)},), {np.dtype(eqn.outvars[0].aval.dtype).name!r})"
     return f"np.stack(({', '.join(xs)},), axis={eqn.params['axis']})"
 
@@ -103,7 +103,11 @@ def _slice(eqn: Any, x: str) -> str:
 def _select(eqn: Any, which: str, *cases: str) -> str:
     if _is_key(eqn.invars[1]) and eqn.invars[0].aval.ndim:
         raise no_form("a batch of random keys")
+    if len(set(cases)) == 1:
+        return cases[0]
     if len(cases) == 2 and eqn.invars[0].aval.dtype == bool:
+        if not eqn.invars[0].aval.ndim:  # a fiftieth of the time of np.where
+            return f"({cases[1]} if {which} else {cases[0]})"
         return f"np.where({which}, {cases[1]}, {cases[0]})"
     return f"np.choose({which}, ({', '.join(cases)},))"
 
@@ -223,7 +227,7 @@ EXPRESSIONS: dict[str, Expression] = {
     "squeeze": _reshape,
     "expand_dims": _reshape,
     "broadcast_in_dim": _broadcast,
-    "transpose": lambda eqn, x: f"np.transpose({x}, {tuple(eqn.params['permutation'])})",
+    "transpose": lambda eqn, x: f"{x}.transpose({tuple(eqn.params['permutation'])})",
     "rev": lambda eqn, x: f"np.flip({x}, {tuple(eqn.params['dimensions'])})",
     "slice": _slice,
     "split": _split,

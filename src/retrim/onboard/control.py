@@ -14,11 +14,12 @@ from .intake import Intake
 from .messages import ACCOUNTS, COMMAND, FlightRows, Sample, Setpoint, Stamp, pack_note, unpack_note
 from .pilot import LivePilot
 from .plan import ControlPlan
-from .shares import ROOM
+from .shares import PHASE, ROOM
 
 REPORT_EVERY = 5  # ticks
 GAPS = 100  # newest ones
 LANDING = "landing"
+BRIEF = PHASE / 4  # of a tick: what a decision takes at most that is rehearsed
 FELT = 0.1  # share of a tick in the mean of what is felt
 
 
@@ -51,6 +52,7 @@ class ControlLoop:
         self._known = {"sample": 0, "order": 0, "learning": 0}
         self._landing, self._gap, self._ticks = "", "", 0
         self._ended: tuple[Sample, Sample] | None = None
+        self._usual = float("inf")  # [s] for a decision
 
     def new_sample(self) -> bool:
         """Return whether there is a measurement that has not been answered."""
@@ -73,9 +75,10 @@ class ControlLoop:
             self.pilot.predicted(x, u)
             self._fallback.hover.command(x, x[:3])
         self._fallback.rest()
-        if (usual := float(np.median(took))) > ROOM * self.plan.dt:
+        self._usual = float(np.median(took))
+        if self._usual > ROOM * self.plan.dt:
             raise PlantError(
-                f"this controller takes {1e3 * usual:.0f} ms to decide, here and in NumPy, of a tick of "
+                f"this controller takes {1e3 * self._usual:.0f} ms to decide, here and in NumPy, of a tick of "
                 f"{1e3 * self.plan.dt:.0f} ms, and {1e3 * ROOM * self.plan.dt:.1f} ms is the most"
             )
 
@@ -103,6 +106,12 @@ class ControlLoop:
             self._publish_rows()
             self.bus.publish("setpoint", setpoint.pack())
         return setpoint
+
+    def rehearse(self) -> None:
+        """Do for nobody what the next measurement will need, so that the caches of the processor hold it by then."""
+        if (sample := self.sample) is not None and self.mode == Mode.POLICY and self._usual < BRIEF * self.plan.dt:
+            self.pilot.rehearse(sample.t - self._start, sample.age, sample.state)
+            self.plan.limits.broken(Sample.unpack(sample.pack()).state)
 
     def idle(self) -> None:
         """Do what is not urgent: orders, new parameters, reports."""

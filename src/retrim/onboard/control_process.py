@@ -8,10 +8,11 @@ from .control import ControlLoop
 from .messages import Stamp, pack_note
 from .orders import wait_for_take_off
 from .plan import ControlPlan
-from .realtime import Lifeline, be_punctual, sleep_until
+from .realtime import Lifeline, be_punctual, sleep_until, wait_until
 from .shares import PHASE
 
 PATIENCE = 0.25  # of a tick, for which a late sample is waited for
+AHEAD = PHASE / 2  # of a tick, by which the process is awake before a step is due
 LATE = 0.5  # of a tick, after which a step is left out
 
 
@@ -53,8 +54,10 @@ def fly(plan: ControlPlan) -> None:
     schedule = Schedule(epoch, plan.dt)
     while not loop.over:
         scheduled = schedule.next()
-        sleep_until(scheduled)
-        woke = time.monotonic()
+        sleep_until(scheduled - AHEAD * plan.dt)
+        if time.monotonic() < scheduled - 0.5 * AHEAD * plan.dt:
+            loop.rehearse()
+        woke = wait_until(scheduled)
         while not loop.new_sample() and time.monotonic() < scheduled + PATIENCE * plan.dt:
             time.sleep(2e-4)
         loop.late_samples += time.monotonic() - woke > 2e-4

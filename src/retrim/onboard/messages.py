@@ -73,9 +73,9 @@ class Sample:
             MessageError: The bytes are not one, or a number is not finite.
         """
         row = _numbers(data)
-        if wrong := np.sum(~np.isfinite(row)):
-            raise MessageError(f"sample: {wrong} numbers are not finite")
-        state, truth, accepted = np.split(row[4:], [STATE, 2 * STATE])
+        if not (finite := np.isfinite(row)).all():
+            raise MessageError(f"sample: {row.size - np.count_nonzero(finite)} numbers are not finite")
+        state, truth, accepted = row[4 : 4 + STATE], row[4 + STATE : 4 + 2 * STATE], row[4 + 2 * STATE :]
         return cls(int(row[0]), float(row[1]), float(row[2]), float(row[3]), state, truth, accepted)
 
 

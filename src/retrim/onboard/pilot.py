@@ -84,6 +84,10 @@ class LivePilot:
             self.accepted(u)
         return u
 
+    def rehearse(self, t: float, age: float, x: np.ndarray) -> None:
+        """Decide for nobody; what :meth:`act` takes and returns stays as it is."""
+        self._decide.step(self._prepared[1], [*self._memory, self._scalar(t), self._scalar(age), *self._state(x)])
+
     def accepted(self, u: np.ndarray) -> None:
         """Correct the memory: the plant took ``u`` instead of the command that was issued last."""
         command = [self._scalar(u[0]), u[1:].astype(self._source.dtype)]

@@ -69,6 +69,17 @@ def sleep_until(instant: float) -> None:
         time.sleep(left)
 
 
+def wait_until(instant: float) -> float:
+    """Return at ``instant`` of the monotonic clock [s] without sleeping, so that nobody has to wake the process.
+
+    Returns:
+        When it is, which is later if the instant has passed [s].
+    """
+    while (now := time.monotonic()) < instant:
+        pass
+    return now
+
+
 class Lifeline:
     """Tells whether another process lives, at once and without asking it."""
 

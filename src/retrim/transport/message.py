@@ -17,6 +17,7 @@ from ..errors import MessageError
 
 FORMAT = "retrim/1"
 MAX_BYTES = 256 * 2**20
+UNNAMED = "nothing"
 
 
 @runtime_checkable
@@ -53,9 +54,10 @@ def describe(data: bytes, *, kind: str, source: str) -> dict[str, str]:
     Raises:
         MessageError: It is not a whole message of this format and ``kind``.
     """
-    if (found := kind_of(data, source=source)) != kind:
+    header = _header(data, source)
+    if (found := header.get("kind", UNNAMED)) != kind:
         raise MessageError(f"{source}: holds a {found!r}, expected a {kind!r}")
-    return _metadata(data)
+    return header
 
 
 def kind_of(data: bytes, *, source: str) -> str:
@@ -64,16 +66,7 @@ def kind_of(data: bytes, *, source: str) -> str:
     Raises:
         MessageError: It is not a whole message of this format.
     """
-    if len(data) > MAX_BYTES:
-        raise MessageError(f"{source}: {len(data)} bytes, more than the {MAX_BYTES} that are accepted")
-    try:
-        deserialize(data)
-    except SafetensorError as error:
-        raise MessageError(f"{source}: not a whole safetensors file; truncated or of another kind ({error})") from error
-    header = _metadata(data)
-    if header.get("format") != FORMAT:
-        raise MessageError(f"{source}: format {header.get('format', 'none')!r}, expected {FORMAT!r}")
-    return header.get("kind", "nothing")
+    return _header(data, source).get("kind", UNNAMED)
 
 
 def unpack_arrays(data: bytes, expected: Mapping[str, ArrayLike], *, kind: str, source: str) -> dict[str, np.ndarray]:
@@ -105,22 +98,33 @@ def unpack_arrays(data: bytes, expected: Mapping[str, ArrayLike], *, kind: str, 
         there, wanted = tensors[name], expected[name]
         if there.shape != wanted.shape:
             raise MessageError(f"{source}: tensor {name!r} has shape {there.shape}, expected {tuple(wanted.shape)}")
-        real = np.issubdtype(wanted.dtype, np.floating)
-        if not np.issubdtype(there.dtype, np.floating if real else np.integer):
+        real = np.dtype(wanted.dtype).kind == "f"
+        if there.dtype.kind not in ("f" if real else "iu"):
             expects = "floating point" if real else "integers"
             raise MessageError(f"{source}: tensor {name!r} has type {there.dtype}, expected {expects}")
         with np.errstate(over="ignore"):
             found[name] = there.astype(wanted.dtype)
-        if wrong := np.sum(~np.isfinite(found[name])):
+        if not (finite := np.isfinite(found[name])).all():
+            wrong = finite.size - np.count_nonzero(finite)
             raise MessageError(f"{source}: tensor {name!r} has {wrong} weights that are not finite")
     if header.pop("checksum", None) != _checksum(tensors, header):
         raise MessageError(f"{source}: the checksum does not match; the file was damaged or edited")
     return {name: found[name] for name in expected}
 
 
-def _metadata(data: bytes) -> dict[str, str]:
+def _header(data: bytes, source: str) -> dict[str, str]:
+    """Return the header of a whole message."""
+    if len(data) > MAX_BYTES:
+        raise MessageError(f"{source}: {len(data)} bytes, more than the {MAX_BYTES} that are accepted")
+    try:
+        deserialize(data)
+    except SafetensorError as error:
+        raise MessageError(f"{source}: not a whole safetensors file; truncated or of another kind ({error})") from error
     size = int.from_bytes(data[:8], "little")
-    return dict(json.loads(data[8 : 8 + size]).get("__metadata__") or {})
+    header = dict(json.loads(data[8 : 8 + size]).get("__metadata__") or {})
+    if header.get("format") != FORMAT:
+        raise MessageError(f"{source}: format {header.get('format', 'none')!r}, expected {FORMAT!r}")
+    return header
 
 
 def _checksum(tensors: Mapping[str, np.ndarray], header: Mapping[str, str]) -> str:
