@@ -315,6 +315,10 @@ def test_a_missed_tick_is_counted_and_gets_no_row_of_another():
     assert flight.status["missed"] == 2
     np.testing.assert_array_equal(rows[:, 0], [*range(10), 12, 13])
     np.testing.assert_allclose(rows[9, COMMAND], flight.issued[9], atol=1e-12)
+    flight.loop.land("landing")
+    flight.tick += 2
+    flight.step()
+    assert flight.status["missed"] == 2  # nothing of the landing counts
 
 
 def test_it_lands_by_itself_after_its_time():

@@ -39,7 +39,7 @@ class ControlLoop:
         self.over = False
         """The flight has ended, and all its ticks are reported."""
         self.error = 0.0
-        self.missed, self.late_samples = 0, 0
+        self.missed, self.late_samples = 0, 0  # before the landing
         self.gaps: deque[tuple[float, float, int]] = deque(maxlen=GAPS)
         """From when to when ticks were missed [s, monotonic], and how many."""
         self.felt, self.estimate = np.zeros(3), np.zeros(3)
@@ -210,7 +210,7 @@ class ControlLoop:
     def _follow(self, before: Sample, sample: Sample) -> None:
         """Take note of what the plant says of the tick that has ended."""
         accepted, lost = np.asarray(sample.accepted), sample.tick - before.tick - 1
-        if lost:
+        if lost and not self._landing:
             self.missed += lost
             self.gaps.append((before.sent, sample.sent, lost))
         if lost * self.plan.dt > self.plan.limits.state_age:
