@@ -26,6 +26,7 @@ class Scene:
             arm: From the centre of the vehicle to a rotor [m].
             rate: How often the scene is moved [Hz].
         """
+        server.scene.configure_default_lights(cast_shadow=False)  # a sixth of the time to the page, drawn by software
         self._scene, self._trail = server.scene, deque[np.ndarray](maxlen=round(TRAIL_S * rate))
         middle, size = path.mean(0), float(np.ptp(path, axis=0).max())
         server.initial_camera.position = tuple(middle + (1.3 + size) * np.array([-0.8, -0.7, 0.35]))
@@ -35,6 +36,9 @@ class Scene:
         if size > 0.01:
             self.follow(path)
         self._target = self._scene.add_icosphere("/target", 0.03, GREEN, opacity=0.6, cast_shadow=False)
+        self._shadow = self._scene.add_cylinder(
+            "/shadow", radius=1.2 * max(arm, 0.08), height=0.002, color=GREY, opacity=0.4
+        )
         self._vehicle = self._scene.add_frame("/vehicle", show_axes=False)
         _quadrotor(self._scene, max(arm, 0.08))
         self._grip = self._scene.add_icosphere(
@@ -78,6 +82,7 @@ class Scene:
             estimate: What the residual model says of it, world [m/s^2].
         """
         self._vehicle.position, self._vehicle.wxyz = tuple(p), quaternion(R)
+        self._shadow.position = (p[0], p[1], 0.0)  # straight below, so that its height is seen
         self._target.position = tuple(target)
         self._trail.append(p)
         if len(self._trail) > 1:
