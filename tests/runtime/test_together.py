@@ -15,7 +15,7 @@ from retrim.learn import Window
 from retrim.physics import Command
 from retrim.plants import SensorModel, SimPlant
 from retrim.runtime import ControllerPilot, FlightStopped, FunctionPilot, LockstepLearner, fly
-from retrim.runtime.batch_learning import offers
+from retrim.runtime.batch_learning import IN_CACHE, at_once, offers
 from retrim.runtime.together import can_fly_together, fly_together
 
 TICKS = 70
@@ -50,20 +50,30 @@ def test_offers_are_those_of_a_learner_on_the_virtual_clock(period, latency):
     assert sorted(told, key=str) == sorted((each for each in expected if each[0] < 60), key=str)
 
 
+@given(n=st.integers(1, 400))
+def test_few_updates_are_made_at_once_and_hardly_any_in_vain(n):
+    few = at_once(n)
+    assert min(n, 2) <= few <= IN_CACHE
+    assert -n % few <= n % 2
+
+
 @pytest.fixture(scope="module")
 def flown(as_a_user):
-    """Three flights that train a delta, with noisy sensors; every other offer finds the learner busy."""
+    """Five flights that train a delta, with noisy sensors; every other offer finds the learner busy.
+
+    Three learn at once, so that the last round has a place to spare.
+    """
     soon = {"window": 20, "fit_every": 0.2, "update_every": 0.3, "fit_latency": 0.1, "update_latency": 0.38}
     preset = tiny_preset(adapt=soon)
     setup = Setup.of(preset)
-    policies = [setup.new_policy(jax.random.key(seed)) for seed in (0, 0, 5)]
-    starts = setup.flight_starts(3)
+    policies = [setup.new_policy(jax.random.key(seed)) for seed in (0, 0, 5, 0, 0)]
+    starts = setup.flight_starts(5)
     sensors = SensorModel.of(position=1e-3, velocity=3e-3, attitude=1e-3, latency=10)
 
     def parts():
         pilots = [setup.pilot(policy, "lora", jax.random.key(i)) for i, policy in enumerate(policies)]
         push = disturbance("small")
-        return [SimPlant(CheapModel(0.02), push, sensors=sensors, seed=i) for i in range(3)], pilots
+        return [SimPlant(CheapModel(0.02), push, sensors=sensors, seed=i) for i in range(5)], pilots
 
     plants, pilots = parts()
     assert can_fly_together(plants, pilots)

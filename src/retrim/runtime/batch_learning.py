@@ -21,7 +21,7 @@ from ..adapt.updates import Layer, Skip, Update
 from ..adapt.workers import PolicyWorker, ResidualWorker, policy_update, residual_update
 from ..control.controller import AbstractController
 from ..learn.bptt import PolicyState
-from ..learn.devices import shared_by, spread
+from ..learn.devices import spread
 from ..learn.window import Window
 from ..physics.state import where
 from .adaptive import AdaptivePilot
@@ -29,7 +29,7 @@ from .batched import Batch
 from .events import Event
 from .lockstep import LockstepLearner
 
-IN_CACHE = 4  # updates that a core makes at once
+IN_CACHE = 4  # updates that a core makes at once at most
 RESIDUAL, POLICY = 0, 1
 LAYERS: tuple[Layer, Layer] = ("residual", "policy")
 """In the order in which a pilot asks them."""
@@ -227,15 +227,23 @@ def update_all(
     if jax.default_backend() != "cpu" or jax.device_count() > 1:
         updated: tuple[PolicyState, Verdict] = eqx.filter_vmap(update)(state, windows, keys, flown)
         return updated
-    # A core is fastest with a few at once, whose activations stay in its cache.
+    # A core is fastest with a few at once, whose activations stay in its cache; the last few are filled up.
     arrays, rest = eqx.partition((state, windows, keys, flown), eqx.is_array)
+    n, few = keys.shape[0], at_once(keys.shape[0])
+    filled = jnp.minimum(jnp.arange(n + -n % few), n - 1)
 
     def of_arrays(one: Any) -> tuple[PolicyState, Verdict]:
         trained, verdict = update(*eqx.combine(one, rest))
         return eqx.filter(trained, eqx.is_array), verdict
 
-    trained, verdicts = lax.map(of_arrays, arrays, batch_size=shared_by(keys.shape[0], IN_CACHE))
+    made = lax.map(of_arrays, jax.tree.map(lambda leaf: leaf[filled], arrays), batch_size=few)
+    trained, verdicts = jax.tree.map(lambda leaf: leaf[:n], made)
     return eqx.combine(trained, eqx.filter(state.policy, eqx.is_array, inverse=True)), verdicts
+
+
+def at_once(n: int) -> int:
+    """Return how many of ``n`` updates a core makes at once: as many as stay in its cache, and few of them in vain."""
+    return min(n, max(range(2, IN_CACHE + 1), key=lambda few: (-(-n % few), few)))
 
 
 @jax.jit
