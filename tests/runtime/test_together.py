@@ -15,7 +15,7 @@ from retrim.learn import Window
 from retrim.physics import Command
 from retrim.plants import SensorModel, SimPlant
 from retrim.runtime import ControllerPilot, FlightStopped, FunctionPilot, LockstepLearner, fly
-from retrim.runtime.batch_learning import IN_CACHE, at_once, offers
+from retrim.runtime.batch_learning import AT_ONCE, IN_CACHE, at_once, offers
 from retrim.runtime.together import can_fly_together, fly_together
 
 TICKS = 70
@@ -50,11 +50,13 @@ def test_offers_are_those_of_a_learner_on_the_virtual_clock(period, latency):
     assert sorted(told, key=str) == sorted((each for each in expected if each[0] < 60), key=str)
 
 
-@given(n=st.integers(1, 400))
-def test_few_updates_are_made_at_once_and_hardly_any_in_vain(n):
-    few = at_once(n)
-    assert min(n, 2) <= few <= IN_CACHE
+@given(n=st.integers(1, 400), size=st.integers(1, 2 * IN_CACHE))
+def test_few_updates_are_made_at_once_and_hardly_any_in_vain(n, size):
+    few = at_once(n, size)
+    assert 1 <= few <= AT_ONCE
+    assert few == 1 or few * size <= IN_CACHE
     assert -n % few <= n % 2
+    assert few > 1 or n == 1 or 2 * size > IN_CACHE
 
 
 @pytest.fixture(scope="module")

@@ -29,7 +29,8 @@ from .batched import Batch
 from .events import Event
 from .lockstep import LockstepLearner
 
-IN_CACHE = 4  # updates that a core makes at once at most
+AT_ONCE = 4  # updates of a core, at most
+IN_CACHE = 750_000  # bytes of the policies that a core trains at once, beside what they compute
 RESIDUAL, POLICY = 0, 1
 LAYERS: tuple[Layer, Layer] = ("residual", "policy")
 """In the order in which a pilot asks them."""
@@ -229,7 +230,8 @@ def update_all(
         return updated
     # A core is fastest with a few at once, whose activations stay in its cache; the last few are filled up.
     arrays, rest = eqx.partition((state, windows, keys, flown), eqx.is_array)
-    n, few = keys.shape[0], at_once(keys.shape[0])
+    n = keys.shape[0]
+    few = at_once(n, sum(leaf.nbytes for leaf in jax.tree.leaves(eqx.filter(state.policy.policy, eqx.is_array))) // n)
     filled = jnp.minimum(jnp.arange(n + -n % few), n - 1)
 
     def of_arrays(one: Any) -> tuple[PolicyState, Verdict]:
@@ -241,9 +243,15 @@ def update_all(
     return eqx.combine(trained, eqx.filter(state.policy, eqx.is_array, inverse=True)), verdicts
 
 
-def at_once(n: int) -> int:
-    """Return how many of ``n`` updates a core makes at once: as many as stay in its cache, and few of them in vain."""
-    return min(n, max(range(2, IN_CACHE + 1), key=lambda few: (-(-n % few), few)))
+def at_once(n: int, size: int) -> int:
+    """Return how many updates a core makes at once: as many as stay in its cache, and few of them in vain.
+
+    Args:
+        n: How many there are.
+        size: Of a policy [bytes].
+    """
+    most = min(n, AT_ONCE, IN_CACHE // size)
+    return max(range(2, most + 1), key=lambda few: (-(-n % few), few), default=1)
 
 
 @jax.jit
