@@ -27,11 +27,12 @@ METHODS: dict[str, tuple[str, ...]] = {
 }
 METRICS = {"steady": "[m]", "late": "[m]", "peak": "[m]", "recovery_5cm": "[s]", "recovery_2cm": "[s]"}
 INTRO = """\
-Made by `retrim gauntlet`. The preset's own vehicle on plant `bem` unless the row says otherwise, at hover or on the
-reference that the row names. steady: mean error over the last 2 s of hover, or the last 10 s of tracking; late: mean
-error after 5 s; peak: largest error after 5 s; recovery: time after a change of the world until the error stays below 5
-or 2 cm (without a change: from the start, 1 m away). Means over flights, and the worst in brackets; a flight that
-crashed, or did not recover, is infinite (∞). Learning is charged to flight time by the preset's fixed latencies."""
+Made by `retrim gauntlet`. The preset's own vehicle on plant `bem`, with {sensors} sensors, unless the row says
+otherwise, at hover or on the reference that the row names. steady: mean error over the last 2 s of hover, or the last
+10 s of tracking; late: mean error after 5 s; peak: largest error after 5 s; recovery: time after a change of the world
+until the error stays below 5 or 2 cm (without a change: from the start, 1 m away). Means over flights, and the worst
+in brackets; a flight that crashed, or did not recover, is infinite (∞). Learning is charged to flight time by the
+preset's fixed latencies."""
 
 
 def gauntlet(
@@ -70,7 +71,8 @@ def gauntlet(
         raise ConfigError(f"no condition {unknown[0]!r}; there are {', '.join(known)}")
     chosen = [known[name] for name in only or known]
     refuse_misfits(loaded, chosen, methods=methods, starts=starts, seconds=seconds)
-    document = Document(run, "gauntlet", "The gauntlet", INTRO, seeds, reporter, data="results")
+    intro = INTRO.format(sensors=sensors)
+    document = Document(run, "gauntlet", "The gauntlet", intro, seeds, reporter, data="results")
     study = train_all(loaded, seeds, run, reporter)
     home, flown, left_out = Setup.of(loaded).flown.home(), dict[str, list[Flight]](), list[str]()
     found = list[dict[str, Any]]()
