@@ -9,10 +9,10 @@ from .messages import Stamp, pack_note
 from .orders import wait_for_take_off
 from .plan import ControlPlan
 from .realtime import Lifeline, be_punctual, sleep_until, wait_until
-from .shares import PHASE
+from .shares import PHASE, ROOM
 
-PATIENCE = 0.25  # of a tick, for which a late sample is waited for
-AHEAD = PHASE / 2  # of a tick, by which the process is awake before a step is due
+PATIENCE = ROOM  # of a tick, for which a late sample is waited for: then its sender still waits for the answer
+AHEAD = 0.75 * PHASE  # of a tick, by which the process is awake before a step is due
 LATE = 0.5  # of a tick, after which a step is left out
 
 
@@ -41,6 +41,19 @@ class Schedule:
         self._tick = max(answered, due) + 1
 
 
+def _ready(loop: ControlLoop, due: float, ahead: float) -> float:
+    """Wait for a step that is due, and rehearse it if its sample is there early enough; return when it can begin."""
+    sleep_until(due - ahead)
+    latest = due - 0.5 * ahead
+    while not (there := loop.new_sample()) and time.monotonic() < latest:
+        time.sleep(1e-4)  # whoever measures may need the core
+    if there and time.monotonic() < latest:
+        loop.rehearse()
+        return wait_until(due)
+    sleep_until(due)
+    return time.monotonic()
+
+
 def fly(plan: ControlPlan) -> None:
     """Fly until the vehicle has landed: the main function of the process."""
     refused = be_punctual(plan.priority, set(plan.cores))
@@ -54,14 +67,13 @@ def fly(plan: ControlPlan) -> None:
     schedule = Schedule(epoch, plan.dt)
     while not loop.over:
         scheduled = schedule.next()
-        sleep_until(scheduled - AHEAD * plan.dt)
-        if time.monotonic() < scheduled - 0.5 * AHEAD * plan.dt:
-            loop.rehearse()
-        woke = wait_until(scheduled)
+        woke = _ready(loop, scheduled, AHEAD * plan.dt)
+        late = not loop.new_sample()
         while not loop.new_sample() and time.monotonic() < scheduled + PATIENCE * plan.dt:
             time.sleep(2e-4)
-        loop.late_samples += time.monotonic() - woke > 2e-4
-        loop.tick(time.monotonic(), woke - scheduled)
+        now = time.monotonic()
+        loop.late_samples += late
+        loop.tick(now, (woke if late else now) - scheduled)  # what the step waits for is not its own lateness
         if parent.gone():
             loop.land("the supervisor is gone")
         loop.idle()
