@@ -32,7 +32,8 @@ def test_the_newest_stay_and_a_note_of_them_fits():
 
 def test_a_gap_counts_once_whatever_stalls_it_overlaps():
     gaps = [(1.00, 1.04, 1), (2.00, 2.10, 4)]
-    assert lost_in([], gaps) == 0
-    assert lost_in([(1.01, 1.02), (1.02, 1.05)], gaps) == 1
-    assert lost_in([(0.5, 3.0)], gaps) == 5
-    assert lost_in([(1.04, 2.0)], gaps) == 0
+    assert lost_in([], gaps, 0.02) == 0
+    assert lost_in([(1.01, 1.02), (1.02, 1.05)], gaps, 0.02) == 1
+    assert lost_in([(0.5, 3.0)], gaps, 0.02) == 5
+    assert lost_in([(1.04, 1.97)], gaps, 0.02) == 0
+    assert lost_in([(1.04, 1.99)], gaps, 0.02) == 4  # the plant catches up

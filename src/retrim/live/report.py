@@ -89,7 +89,7 @@ def results(
     given_up = status.control.get("given_up", [])
     values = {
         "missed_ticks": status.control.get("missed"),
-        **_stalls(status),
+        **_stalls(status, log.dt),
         **{f"{name}_{q}_ms": by[name][q] for name in ("lateness", "step", "idle") for q in ("p50", "p99", "max")},
         "state_age_p99_ms": by["state_age"]["p99"],
         "policy_age_p50_s": None if by["policy_age"]["p50"] is None else 1e-3 * by["policy_age"]["p50"],
@@ -110,12 +110,12 @@ def results(
     return [{**about, "metric": metric, "value": _finite(value)} for metric, value in values.items()]
 
 
-def _stalls(status: Status) -> dict[str, Any]:
+def _stalls(status: Status, dt: float) -> dict[str, Any]:
     """When the machine stood still, and how many ticks were missed then; None where nobody could tell."""
     seen = status.stalls
     if not seen:
         return dict.fromkeys(("missed_in_stalls", "stalls", "stall_max_ms"))
-    missed = lost_in(seen["newest"], status.control.get("gaps", []))
+    missed = lost_in(seen["newest"], status.control.get("gaps", []), dt)
     return {"missed_in_stalls": missed, "stalls": seen["count"], "stall_max_ms": 1e3 * seen["longest"]}
 
 

@@ -49,11 +49,12 @@ class Stalls:
         return pack_note("stalls", count=self.count, longest=self.longest, newest=newest)
 
 
-def lost_in(stalls: Sequence[Sequence[Any]], gaps: Sequence[Sequence[Any]]) -> int:
-    """Return how many ticks were missed while the machine stood still.
+def lost_in(stalls: Sequence[Sequence[Any]], gaps: Sequence[Sequence[Any]], dt: float) -> int:
+    """Return how many ticks were missed while the machine stood still, or while a plant caught up within a tick after.
 
     Args:
         stalls: From when to when it did [s].
         gaps: From the measurement before missed ticks to the one after them [s], and how many these were.
+        dt: Control tick [s].
     """
-    return sum(int(n) for a, b, n in gaps if any(begin < b and end > a for begin, end in stalls))
+    return sum(int(n) for a, b, n in gaps if any(begin < b and end + dt > a for begin, end in stalls))
