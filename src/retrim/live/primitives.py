@@ -106,7 +106,7 @@ def _select(eqn: Any, which: str, *cases: str) -> str:
     if len(set(cases)) == 1:
         return cases[0]
     if len(cases) == 2 and eqn.invars[0].aval.dtype == bool:
-        if not eqn.invars[0].aval.ndim:  # a fiftieth of the time of np.where
+        if not eqn.invars[0].aval.ndim:  # a fortieth of the time of np.where
             return f"({cases[1]} if {which} else {cases[0]})"
         return f"np.where({which}, {cases[1]}, {cases[0]})"
     return f"np.choose({which}, ({', '.join(cases)},))"
