@@ -11,6 +11,7 @@ from ..control.lora import LoraPolicy
 from ..control.policy import Inputs, Layers, Perturbations, Policy
 from ..tasks.task import Start
 from . import weight_gradients
+from .both_layouts import both_layouts
 from .env import Env
 from .rollout import Trajectory, perturbed_rollout, rollout
 
@@ -24,9 +25,10 @@ class PolicyState(eqx.Module):
 
 def policy_loss(policy: Policy, env: Env, x0: Start) -> Float[Array, ""]:
     """Return minus the reward, averaged over ticks and over the batch of starts ``x0`` (leading axis)."""
+    flying, laid = both_layouts((policy, env))
 
     def fly(start: Start) -> Trajectory:
-        return rollout(env, policy, start)
+        return rollout(laid, flying, start)
 
     flown = jax.vmap(fly)(x0)
     return -jnp.mean(flown.reward)
@@ -37,10 +39,11 @@ def policy_gradient(policy: Policy, env: Env, x0: Start) -> tuple[Float[Array, "
 
     The gradient is formed from perturbations of the layers' outputs; see :mod:`retrim.learn.weight_gradients`.
     """
+    flying, laid = both_layouts((policy, env))
 
     def loss(zeros: Perturbations) -> tuple[Float[Array, ""], Inputs]:
         def fly(start: Start, z: Perturbations) -> tuple[Trajectory, Inputs]:
-            return perturbed_rollout(env, policy, start, z)
+            return perturbed_rollout(laid, flying, start, z)
 
         # Keep time as the leading axis, as the scan lays it out, to avoid transposing activations.
         flown, inputs = jax.vmap(fly, in_axes=(0, 1), out_axes=(0, 1))(x0, zeros)

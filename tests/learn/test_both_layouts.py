@@ -1,0 +1,67 @@
+"""Weights in both layouts: the same layers, and products that read their matrices along the rows."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import random
+from jax.extend.core import ClosedJaxpr, Jaxpr
+
+from helpers import draw_starts, hover_env
+from retrim.control import Policy
+from retrim.learn import policy_gradient
+from retrim.learn.both_layouts import BothLayouts, both_layouts
+from retrim.learn.residuals import EnsembleResidual
+from retrim.physics import Hybrid, PointMass, small
+
+
+@pytest.mark.parametrize("use_bias", [True, False])
+def test_a_layer_in_both_layouts_is_that_layer(use_bias, key):
+    """Value, and gradients with respect to weight, bias and input, for one input and for several."""
+    layer = eqx.nn.Linear(5, 3, use_bias=use_bias, key=key)
+
+    def cost(layer, x):
+        return jnp.sum(jnp.sin(jax.vmap(layer)(x)))
+
+    both = eqx.filter_jit(jax.value_and_grad(lambda both: cost(both_layouts(both[0]), both[1])))
+    plain = eqx.filter_jit(jax.value_and_grad(lambda both: cost(*both)))
+    x = random.normal(key, (4, 5))
+    for found, wanted in zip(jax.tree.leaves(both((layer, x))), jax.tree.leaves(plain((layer, x))), strict=True):
+        np.testing.assert_allclose(found, wanted, rtol=1e-13)
+
+
+def test_layers_anywhere_are_laid_out_and_all_else_stays(key):
+    """Whatever holds them; a layer of scalars has no matrix."""
+    scalar = eqx.nn.Linear("scalar", 3, key=key)
+    tree = {"deep": [eqx.nn.Linear(2, 2, key=key), jnp.ones(3)], "scalar": scalar, "word": "w"}
+    laid = both_layouts(tree)
+    assert isinstance(laid["deep"][0], BothLayouts)
+    assert laid["deep"][1] is tree["deep"][1]
+    assert (laid["scalar"], laid["word"]) == (scalar, "w")
+
+
+def test_no_product_of_a_scan_reads_a_matrix_across_its_rows(key):
+    """Forward and backward, of the policy and of networks in the model."""
+    residual = EnsembleResidual.of(jnp.zeros(3), small().omega_max, key=key, members=2, hidden=(8, 8))
+    env = hover_env(Hybrid(PointMass(0.02), residual, backprop=True), horizon=8, history=2)
+    policy = Policy.of(23, small(), key=key, hidden=(8, 8))
+    program = jax.make_jaxpr(lambda policy, x0: policy_gradient(policy, env, x0))(policy, draw_starts(env.task, key, 3))
+    products = [
+        (eqn.params["dimension_numbers"], [each.aval.shape for each in eqn.invars])
+        for scan in found("scan", program.jaxpr)
+        for eqn in found("dot_general", scan.params["jaxpr"].jaxpr)
+    ]
+    of_layers = [axes for (axes, _), shapes in products if len(shapes[1]) == 2 and set(shapes[1]) <= {23, 8, 4, 19, 3}]
+    assert len(of_layers) >= 2 * 3 + 2 * 2 * 3  # each layer, forward and backward
+    assert set(of_layers) == {((1,), (0,))}
+
+
+def found(name, jaxpr):
+    """Equations of a name, in a program and in all that it calls."""
+    for eqn in jaxpr.eqns:
+        if eqn.primitive.name == name:
+            yield eqn
+        for inner in jax.tree.leaves(list(eqn.params.values())):  # programs have no leaves of their own
+            if isinstance(inner, (Jaxpr, ClosedJaxpr)):
+                yield from found(name, getattr(inner, "jaxpr", inner))
