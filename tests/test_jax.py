@@ -7,6 +7,7 @@ import tomllib
 from pathlib import Path
 
 import jax
+import pytest
 
 from retrim.experiments.known_fault import EXCLUDED
 
@@ -24,6 +25,16 @@ def test_batched_products_are_right_as_users_compile_them():
     plain = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
     done = subprocess.run([sys.executable, "-c", code], env=plain, capture_output=True, text=True, check=False)
     assert done.stdout.strip() == "[0, 0, 0, 0]", done.stderr
+
+
+@pytest.mark.parametrize(("asked", "taken"), [(None, "float32"), ("tensorfloat32", "tensorfloat32")])
+def test_products_are_of_whole_single_precision_unless_asked(asked, taken):
+    """On a GPU, too, whose default is less; a user's choice stands."""
+    environment = {name: value for name, value in os.environ.items() if name != "JAX_DEFAULT_MATMUL_PRECISION"}
+    environment |= {} if asked is None else {"JAX_DEFAULT_MATMUL_PRECISION": asked}
+    code = "import retrim, jax; print(jax.config.jax_default_matmul_precision)"
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
+    assert done.stdout.strip() == taken, done.stderr
 
 
 def test_the_excluded_version_is_not_installed_and_cannot_be():

@@ -12,9 +12,11 @@ from importlib.metadata import version
 
 import lazy_loader
 
-# Both must be set before the package that reads them is first imported; a value of the user's stands.
+# All must be set before the package that reads them is first imported; a value of the user's stands.
 # XLA reports every program that its compile cache loads on a machine whose tuning flags differ.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+# GPUs round the factors of products to ten bits unless told otherwise: flights would not be those of a CPU.
+os.environ.setdefault("JAX_DEFAULT_MATMUL_PRECISION", "float32")
 # The plant crazyflow needs SciPy to follow the array API, and says so where SciPy came first.
 if "scipy" not in sys.modules:
     os.environ.setdefault("SCIPY_ARRAY_API", "1")

@@ -26,7 +26,8 @@ Made by `retrim bench`. Each work runs in a process of its own, from an empty co
 otherwise; where one core is given, the process was kept on one. Times are medians. A unit is what this machine takes,
 on as many cores and in the same seconds, for 1,000 products of 10 rows with a matrix of 512 x 512 in a scan, so units
 compare machines where seconds do not. of the limit: how long the products of an update would take at the rate of a
-unit, as a share of what it took. paper: reported for an RTX 4090. peak: memory of the process, JAX included."""
+unit, as a share of what it took. Where there is an accelerator, the process of all cores uses it, and that of one core
+does not. paper: reported for an RTX 4090. peak: memory of the process, JAX included."""
 
 
 def bench(run: Run, reporter: Reporter, *, works: Sequence[str] = tuple(WORKS)) -> bool:
@@ -99,8 +100,9 @@ def _measured(name: str, cache: Path) -> dict[str, Any]:
 
 
 def _process(name: str, cores: str, environment: dict[str, str]) -> dict[str, Any]:
-    """What a process of its own prints."""
+    """What a process of its own prints; on one core it has no accelerator, and else all that it needs of its memory."""
     inherited = {key: value for key, value in os.environ.items() if key != "JAX_COMPILATION_CACHE_DIR"}
+    inherited |= {"JAX_PLATFORMS": "cpu"} if cores == "one" else {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
     ran = subprocess.run(
         [sys.executable, "-m", "retrim.bench.works", name, cores],
         env=inherited | environment,
