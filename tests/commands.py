@@ -79,8 +79,8 @@ def started(words, cwd, setup=""):
     )
 
 
-def interrupted(words, cwd, *, after, setup=""):
-    """Run, send Ctrl-C once the output shows ``after`` or that file is there; return exit code and output."""
+def interrupted(words, cwd, *, after, setup="", by=signal.SIGINT):
+    """Run, send a signal, Ctrl-C by default, once the output shows ``after`` or that file is there; return exit code and output."""
     process, seen = started(words, cwd, setup), b""
     deadline = time.monotonic() + 180
     while time.monotonic() < deadline and process.poll() is None:
@@ -90,6 +90,6 @@ def interrupted(words, cwd, *, after, setup=""):
             time.sleep(0.005)
         if after in seen if isinstance(after, bytes) else after.exists():
             break
-    process.send_signal(signal.SIGINT)
+    process.send_signal(by)
     rest, _ = process.communicate(timeout=120)
     return process.returncode, (seen + rest).decode()

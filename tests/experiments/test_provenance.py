@@ -70,10 +70,11 @@ def test_ctrl_c_is_remembered_and_raises_where_it_may(tmp_path):
     assert run.interrupted
     assert run.exit_code == 130
     assert not (tmp_path / "never").exists()
-    stop = threading.Event()
-    with interrupts_only_set(stop):
-        signal.raise_signal(signal.SIGINT)
-    assert stop.is_set()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        stop = threading.Event()
+        with interrupts_only_set(stop):
+            signal.raise_signal(number)
+        assert stop.is_set()
     with pytest.raises(KeyboardInterrupt):
         signal.raise_signal(signal.SIGINT)
 

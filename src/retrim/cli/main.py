@@ -37,7 +37,7 @@ HELP = "\n".join(
         "",
         "  --version, --help",
         "",
-        "Ctrl-C stops a command and keeps what is done.",
+        "Ctrl-C, or SIGTERM, stops a command and keeps what is done.",
     ]
 )
 
@@ -127,7 +127,10 @@ def _command(name: str, words: list[str], stop: threading.Event) -> int:
 
 @contextlib.contextmanager
 def _stop_on_interrupt(stop: threading.Event) -> Iterator[None]:
-    """Let Ctrl-C set the stop token and raise: a KeyboardInterrupt that JAX swallows is not lost, and not told."""
+    """Let Ctrl-C set the stop token and raise: a KeyboardInterrupt that JAX swallows is not lost, and not told.
+
+    Schedulers of clusters, and ``timeout``, say SIGTERM.
+    """
 
     def handle(number: int, frame: FrameType | None) -> None:
         stop.set()
@@ -140,10 +143,12 @@ def _stop_on_interrupt(stop: threading.Event) -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before, hook = signal.signal(signal.SIGINT, handle), sys.unraisablehook
+    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    hook = sys.unraisablehook
     sys.unraisablehook = swallowed
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
         sys.unraisablehook = hook

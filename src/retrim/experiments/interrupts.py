@@ -1,4 +1,4 @@
-"""Ctrl-C at moments when it must not raise."""
+"""Ctrl-C and SIGTERM at moments when they must not raise."""
 
 import contextlib
 import signal
@@ -8,15 +8,17 @@ from collections.abc import Iterator
 
 @contextlib.contextmanager
 def interrupts_only_set(stop: threading.Event) -> Iterator[None]:
-    """Let Ctrl-C set ``stop`` and nothing else, so that what is done is written whole.
+    """Let Ctrl-C and SIGTERM set ``stop`` and nothing else, so that what is done is written whole.
 
-    Only the main thread receives a Ctrl-C; in any other this does nothing.
+    Only the main thread receives signals; in any other this does nothing.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.signal(signal.SIGINT, lambda number, frame: stop.set())
+    numbers = signal.SIGINT, signal.SIGTERM
+    before = {number: signal.signal(number, lambda *_: stop.set()) for number in numbers}
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
