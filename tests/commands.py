@@ -80,7 +80,7 @@ def started(words, cwd, setup=""):
 
 
 def interrupted(words, cwd, *, after, setup="", by=signal.SIGINT):
-    """Run, send a signal, Ctrl-C by default, once the output shows ``after`` or that file is there; return exit code and output."""
+    """Run, send a signal once the output shows ``after`` or that file is there; return exit code and output."""
     process, seen = started(words, cwd, setup), b""
     deadline = time.monotonic() + 180
     while time.monotonic() < deadline and process.poll() is None:
