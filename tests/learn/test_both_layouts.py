@@ -31,6 +31,18 @@ def test_a_layer_in_both_layouts_is_that_layer(use_bias, key):
         np.testing.assert_allclose(found, wanted, rtol=1e-13)
 
 
+def test_stacked_layers_are_laid_out_each(key):
+    """As an ensemble is made and called."""
+    made = eqx.filter_vmap(lambda key: eqx.nn.MLP(4, 2, 3, 1, key=key))(random.split(key, 5))
+
+    @eqx.filter_jit
+    def members(made, x):
+        return eqx.filter_vmap(lambda one, x: one(x), in_axes=(eqx.if_array(0), None))(made, x)
+
+    x = random.normal(key, (4,))
+    np.testing.assert_allclose(members(both_layouts(made), x), members(made, x), rtol=1e-14)
+
+
 def test_layers_anywhere_are_laid_out_and_all_else_stays(key):
     """Whatever holds them; a layer of scalars has no matrix."""
     scalar = eqx.nn.Linear("scalar", 3, key=key)

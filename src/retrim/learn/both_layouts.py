@@ -18,13 +18,13 @@ Tree = TypeVar("Tree")
 class BothLayouts(eqx.nn.Linear):
     """A linear layer that holds its weight transposed, too; its gradients are those of the layer."""
 
-    transposed: Float[Array, "fan_in fan_out"]
+    transposed: Float[Array, "*members fan_in fan_out"]
 
     def __init__(self, layer: eqx.nn.Linear) -> None:
-        """Lay out a layer's weight."""
+        """Lay out the weight of a layer, or of several stacked ones, as ``jax.vmap`` makes and calls them."""
         self.weight, self.bias, self.use_bias = layer.weight, layer.bias, layer.use_bias
         self.in_features, self.out_features = layer.in_features, layer.out_features
-        self.transposed = layer.weight.T
+        self.transposed = layer.weight.mT
 
     def __call__(self, x: Float[Array, " fan_in"], *, key: Key[Array, ""] | None = None) -> Float[Array, " fan_out"]:
         """Return the layer's output for one input; the key is ignored, as that of the layer."""
