@@ -127,10 +127,7 @@ def _command(name: str, words: list[str], stop: threading.Event) -> int:
 
 @contextlib.contextmanager
 def _stop_on_interrupt(stop: threading.Event) -> Iterator[None]:
-    """Let Ctrl-C set the stop token and raise: a KeyboardInterrupt that JAX swallows is not lost, and not told.
-
-    Schedulers of clusters, and ``timeout``, say SIGTERM.
-    """
+    """Let Ctrl-C and SIGTERM set the stop token and raise: a KeyboardInterrupt that JAX swallows is not lost or told."""
 
     def handle(number: int, frame: FrameType | None) -> None:
         stop.set()
@@ -144,8 +141,7 @@ def _stop_on_interrupt(stop: threading.Event) -> Iterator[None]:
         yield
         return
     before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
-    hook = sys.unraisablehook
-    sys.unraisablehook = swallowed
+    hook, sys.unraisablehook = sys.unraisablehook, swallowed
     try:
         yield
     finally:
