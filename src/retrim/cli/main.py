@@ -127,7 +127,7 @@ def _command(name: str, words: list[str], stop: threading.Event) -> int:
 
 @contextlib.contextmanager
 def _stop_on_interrupt(stop: threading.Event) -> Iterator[None]:
-    """Let Ctrl-C and SIGTERM set the stop token and raise: a KeyboardInterrupt that JAX swallows is not lost or told."""
+    """Let Ctrl-C and SIGTERM set the stop token and raise: a KeyboardInterrupt that JAX swallows is not lost."""
 
     def handle(number: int, frame: FrameType | None) -> None:
         stop.set()
