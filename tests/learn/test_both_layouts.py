@@ -44,9 +44,15 @@ def test_stacked_layers_are_laid_out_each(key):
 
 
 def test_layers_anywhere_are_laid_out_and_all_else_stays(key):
-    """Whatever holds them; a layer of scalars has no matrix."""
+    """Whatever holds them; a layer of scalars has no matrix, and one that derives from a layer may be another."""
+
+    class Doubled(eqx.nn.Linear):
+        def __call__(self, x, *, key=None):
+            return 2.0 * super().__call__(x)
+
     scalar = eqx.nn.Linear("scalar", 3, key=key)
     tree = {"deep": [eqx.nn.Linear(2, 2, key=key), jnp.ones(3)], "scalar": scalar, "word": "w"}
+    assert type(both_layouts(Doubled(2, 2, key=key))) is Doubled
     laid = both_layouts(tree)
     assert isinstance(laid["deep"][0], BothLayouts)
     assert laid["deep"][1] is tree["deep"][1]

@@ -5,7 +5,7 @@ A CPU multiplies ten rows by the transpose of a stored matrix at half to a third
 in a scan it would do so at every tick. So both are laid out once, before the scan.
 """
 
-from typing import TypeVar
+from typing import TypeGuard, TypeVar
 
 import equinox as eqx
 import jax
@@ -33,17 +33,15 @@ class BothLayouts(eqx.nn.Linear):
 
 
 def both_layouts(tree: Tree) -> Tree:
-    """Return the same tree, policy, model or environment, with every linear layer in both layouts."""
+    """Return the same tree, policy, model or environment, with every linear layer in both layouts.
 
-    def is_layer(leaf: object) -> bool:
-        return isinstance(leaf, eqx.nn.Linear)
+    A class of one's own that derives from a linear layer may compute something else, and stays as it is.
+    """
 
-    def laid_out(leaf: object) -> object:
-        if not isinstance(leaf, eqx.nn.Linear) or "scalar" in (leaf.in_features, leaf.out_features):
-            return leaf
-        return BothLayouts(leaf)
+    def is_layer(leaf: object) -> TypeGuard[eqx.nn.Linear]:
+        return type(leaf) is eqx.nn.Linear and "scalar" not in (leaf.in_features, leaf.out_features)
 
-    laid: Tree = jax.tree.map(laid_out, tree, is_leaf=is_layer)
+    laid: Tree = jax.tree.map(lambda leaf: BothLayouts(leaf) if is_layer(leaf) else leaf, tree, is_leaf=is_layer)
     return laid
 
 
