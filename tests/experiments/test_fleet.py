@@ -18,6 +18,7 @@ from retrim import ConfigError, Fleet, PlantError, Scenario, Setup, enable_compi
 from retrim.config.loading import dump
 from retrim.experiments import fleet as fleet_module
 from retrim.experiments import flying, gathering, jobs, lots
+from retrim.experiments.flights import FlightSpec
 from retrim.experiments.jobs import setup_for
 from retrim.physics import State
 
@@ -96,6 +97,20 @@ def test_one_thread_and_two_processes_fly_the_same(fleet, flights):
         np.testing.assert_array_equal(there.log.p, here.log.p)
         assert there.events == here.events
         assert (there.learnt is None) == (here.learnt is None)
+
+
+@pytest.mark.parametrize("cores", [1, 2, 3, 8, 16, 64])
+@pytest.mark.parametrize("n", [1, 2, 3, 5, 7, 8, 9, 24, 65])
+def test_no_flight_of_a_program_is_left_by_itself(monkeypatch, n, cores):
+    """However many cores there are: Python steps a single flight, and that uses one of them."""
+    monkeypatch.setattr(lots, "lanes", lambda: cores)
+    group = [FlightSpec(Scenario("small"), "base", start) for start in range(n)]
+    found = lots.in_lots([group], lambda specs: "program")
+    assert sorted((spec for lot in found for spec in lot.specs), key=group.index) == group
+    sizes = [len(lot.specs) for lot in found]
+    assert n == 1 or min(sizes) > 1
+    assert max(sizes) <= max(2, -(-n // cores)) + 1
+    assert [len(lot.specs) for lot in lots.in_lots([group], lambda specs: None)] == [1] * n
 
 
 def test_lots_fly_the_same_to_rounding_and_land_once(fleet, flights, monkeypatch):
@@ -264,7 +279,7 @@ def test_what_was_learnt_before_reaches_every_flight(monkeypatch):
     setup = Setup.of(preset)
     policy = setup.new_policy(jax.random.key(0))
     state = setup.learner.init(policy, jax.random.key(1))
-    fleet = Fleet(preset, policy, SCENARIOS[:1], methods=("full",), starts=3, seconds=1.2, state=state)
+    fleet = Fleet(preset, policy, SCENARIOS[:1], methods=("full",), starts=2, seconds=1.2, state=state)
 
     def flies(kind, answer):
         def flown(*_, state=None, **__):
@@ -273,12 +288,10 @@ def test_what_was_learnt_before_reaches_every_flight(monkeypatch):
 
         return flown
 
-    monkeypatch.setattr(lots, "LOT", 2)
-    monkeypatch.setattr(lots, "lanes", lambda: 1)
     for module in (fleet_module, jobs):
         monkeypatch.setattr(module, "fly_lot", flies("lot", []))
         monkeypatch.setattr(module, "fly_one", flies("one", made_up.flight(0.1)))
-    for lot in fleet.lots(fleet.specs):
+    for lot in (*fleet.lots(fleet.specs), *fleet.lots(fleet.specs[:1])):
         fleet._fly(lot, lambda share: None, threading.Event())
         jobs.fly_job(fleet._job(lot.specs, True))
     assert [kind for kind, _ in told] == ["lot", "lot", "one", "one"]

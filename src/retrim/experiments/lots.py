@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Callable, Hashable, Iterable
+from itertools import pairwise
 from typing import NamedTuple
 
 import jax
@@ -10,6 +11,7 @@ from .flights import FlightSpec
 from .provenance import cores
 
 LOT, LARGE = 64, 2048  # flights of one program: on one CPU, on one accelerator
+SMALL = 2  # a flight by itself is stepped by Python, which uses one core however many there are
 
 
 class Lot(NamedTuple):
@@ -34,9 +36,7 @@ def in_lots(groups: Iterable[list[FlightSpec]], program: Callable[[list[FlightSp
     first, others = dict[Hashable, Lot](), list[Lot]()
     for group in groups:
         of_group = program(group)
-        size = 1 if of_group is None else min(largest(), -(-len(group) // lanes()))
-        for i in range(0, len(group), size):
-            part = group[i : i + size]
+        for part in _parts(group, 1 if of_group is None else min(largest(), max(SMALL, -(-len(group) // lanes())))):
             if len(part) == 1:
                 others.append(Lot(part, None))
             elif (of_group, len(part)) in first:
@@ -44,6 +44,14 @@ def in_lots(groups: Iterable[list[FlightSpec]], program: Callable[[list[FlightSp
             else:
                 first[of_group, len(part)] = Lot(part, threading.Event(), compiles=True)
     return [*first.values(), *others]
+
+
+def _parts(group: list[FlightSpec], size: int) -> list[list[FlightSpec]]:
+    """Divide a group; no flight is left over by itself."""
+    bounds = [*range(0, len(group), size), len(group)]
+    if size > 1 and len(bounds) > 2 and bounds[-1] - bounds[-2] == 1:
+        del bounds[-2]
+    return [group[a:b] for a, b in pairwise(bounds)]
 
 
 def largest() -> int:
