@@ -113,6 +113,30 @@ def test_no_flight_of_a_program_is_left_by_itself(monkeypatch, n, cores):
     assert [len(lot.specs) for lot in lots.in_lots([group], lambda specs: None)] == [1] * n
 
 
+def test_other_lots_of_a_program_wait_until_it_is_compiled_not_until_it_has_landed(monkeypatch):
+    preset = brief_preset()
+    policy = Setup.of(preset).new_policy(jax.random.key(0))
+    fleet = Fleet(preset, policy, SCENARIOS[:1], methods=("base",), starts=4, seconds=2.0)
+    order, other = [], threading.Event()
+
+    def flown(setup, policies, specs, *_, progress, cold, **__):
+        order.append("first" if cold else "other")
+        if cold:
+            progress(0.1)
+            assert not other.wait(0.1)
+            progress(0.6)
+            assert other.wait(20.0)
+        other.set()
+        order.append("first landed" if cold else "other landed")
+        return [made_up.flight(0.1, spec=spec) for spec in specs]
+
+    monkeypatch.setattr(lots, "lanes", lambda: 2)
+    monkeypatch.setattr(fleet_module, "lanes", lambda: 2)
+    monkeypatch.setattr(fleet_module, "fly_lot", flown)
+    fleet.run()
+    assert order[:2] == ["first", "other"]
+
+
 def test_lots_fly_the_same_to_rounding_and_land_once(fleet, flights, monkeypatch):
     """Two flights of a scenario and a method are one program; a third one is left for itself."""
     monkeypatch.setattr(lots, "LOT", 2)

@@ -24,6 +24,8 @@ from .jobs import Job, fly_job
 from .limits import check_flights, check_seeds
 from .lots import Lot, in_lots, lanes
 
+COMPILED_AFTER = 1.0  # [s] of flight: all programs of a lot have run by then
+
 
 class Fleet:
     """Flies every combination of scenarios, methods, policies (one per seed) and starts."""
@@ -189,17 +191,23 @@ class Fleet:
                 setup, policies[0], first, starts[0], seconds, latency=self._latency, state=state, stop=stop
             )
             return [alone]
+        compiled, cold = lot.compiled, lot.compiles
+
+        def told(share: float) -> None:
+            if share * seconds > COMPILED_AFTER:
+                compiled.set()
+            aloft(share)
+
         try:
-            if not lot.compiles:
-                lot.compiled.wait()
-            cold = lot.compiles
             if cold:
                 release_programs()
+            else:
+                compiled.wait()
             return fly_lot(
-                setup, policies, lot.specs, starts, seconds, state=state, progress=aloft, stop=stop, cold=cold
+                setup, policies, lot.specs, starts, seconds, state=state, progress=told, stop=stop, cold=cold
             )
         finally:
-            lot.compiled.set()
+            compiled.set()
 
     def _job(self, specs: Sequence[FlightSpec], learnt: bool) -> Job:
         policies = tuple(self.policies[spec.seed] for spec in specs)

@@ -19,7 +19,7 @@ class Lot(NamedTuple):
 
     specs: list[FlightSpec]
     compiled: threading.Event | None
-    """Set when the first lot of its program has landed; None for a flight by itself."""
+    """Set when the first lot of its program has compiled it; None for a flight by itself."""
     compiles: bool = False
     """It is the first lot of its program."""
 
