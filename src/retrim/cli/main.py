@@ -84,17 +84,16 @@ def _run(words: list[str]) -> int:
 
 
 def _command(name: str, words: list[str], stop: threading.Event) -> int:
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # before jax: its cache otherwise reports every program it loads
     import importlib
 
     import tyro
 
     from ..config.registry import told_of_own_module
     from ..errors import RetrimError
-    from ..experiments.compile_cache import enable_compile_cache
+    from ..experiments.compile_flags import compile_for
     from .console import console, refuse
 
-    enable_compile_cache()
+    compile_for(name)
     command = importlib.import_module(f".{name}", PACKAGE)
     try:
         if hasattr(command, "COMMANDS"):
