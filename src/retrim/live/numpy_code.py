@@ -104,7 +104,7 @@ class _Writer:
     def _write(self, eqn: Any, operands: list[Ref]) -> list[Ref]:
         text = EXPRESSIONS[eqn.primitive.name](eqn, *(name for name, _ in operands))
         for name, kind in operands:
-            if text == name:  # nothing happens to it
+            if text == name and not eqn.primitive.multiple_results:  # nothing happens to it
                 return [(name, kind)]
         if not eqn.primitive.multiple_results:
             return [self._line(text, operands)]
@@ -136,13 +136,13 @@ class _Writer:
     def _unrolled(self, eqn: Any, operands: list[Ref]) -> list[Ref]:
         """Write the body of a loop of known length once for each of its steps."""
         params = eqn.params
-        length, held, carried = params["length"], params["num_consts"], params["num_consts"] + params["num_carry"]
+        length, (held, carry, taken) = params["length"], _parts(params, operands)
         if not 0 < length <= LONGEST:
             raise no_form(f"a loop of {length} steps, not of 1 to {LONGEST},")
-        carry, rows = operands[held:carried], [list[Ref]() for _ in range(length)]
+        rows = [list[Ref]() for _ in range(length)]
         for i in reversed(range(length)) if params["reverse"] else range(length):
-            given = [self._line(f"{each[0]}[{i}]", [each]) for each in operands[carried:]]
-            after = self.inline(params["jaxpr"], [*operands[:held], *carry, *given])
+            given = [self._line(f"{each[0]}[{i}]", [each]) for each in taken]
+            after = self.inline(params["jaxpr"], [*held, *carry, *given])
             carry, rows[i] = after[: len(carry)], after[len(carry) :]
         columns = zip(*rows, strict=True)
         return [*carry, *(self._line(f"np.stack([{', '.join(n for n, _ in c)}])", c) for c in columns)]
@@ -171,3 +171,11 @@ class _Writer:
         lines += [f"    return [{', '.join(passed)}]", "", "def step(prepared, inputs):"]
         lines += [*unpacked(passed, "prepared"), *unpacked(inputs, "inputs"), *body(INPUT)]
         return "\n".join([*lines, f"    return [{', '.join(name for name, _ in outputs)}]", ""])
+
+
+def _parts(params: dict[str, Any], operands: list[Ref]) -> tuple[list[Ref], ...]:
+    """Divide what goes into a loop: what it keeps, what it carries, and what it takes a row of at each step."""
+    if "ft_in" in params:  # since jax 0.11
+        return tuple(list(part) for part in params["ft_in"].update(operands).unpack())
+    held, carried = params["num_consts"], params["num_consts"] + params["num_carry"]
+    return operands[:held], operands[held:carried], operands[carried:]

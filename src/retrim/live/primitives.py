@@ -182,6 +182,11 @@ def _split(eqn: Any, x: str) -> str:
     return f"np.split({x}, {np.cumsum(eqn.params['sizes'])[:-1].tolist()}, axis={eqn.params['axis']})"
 
 
+def _unstack(eqn: Any, x: str) -> str:
+    axis = eqn.params["axis"]
+    return x if axis == 0 else f"np.moveaxis({x}, {axis}, 0)"
+
+
 def _pad(eqn: Any, x: str, value: str) -> str:
     return f"lax.pad({x}, {value}, {tuple(tuple(int(n) for n in axis) for axis in eqn.params['padding_config'])})"
 
@@ -231,6 +236,7 @@ EXPRESSIONS: dict[str, Expression] = {
     "rev": lambda eqn, x: f"np.flip({x}, {tuple(eqn.params['dimensions'])})",
     "slice": _slice,
     "split": _split,
+    "unstack": _unstack,  # since jax 0.11
     "concatenate": lambda eqn, *xs: f"np.concatenate(({', '.join(xs)},), axis={eqn.params['dimension']})",
     "stack": _stack,
     "tile": lambda eqn, x: f"np.tile({x}, {tuple(eqn.params['reps'])})",
