@@ -62,7 +62,8 @@ OPERATIONS = {
         lax.pad(x, p, ((0, 0, 0), (-1, 2, 1), (1, -1, 0))), jnp.split(x, [1, 3], axis=2), jnp.tile(x, (1, 2, 1)),
         jnp.squeeze(x[:1]), x[:, None], jnp.arange(5) * p, jnp.eye(3) * p, x[1, 2, 3], p * x[1, 0, 2] + x[0, 1, 1],
         jnp.stack([x[1, 2, 3], x[0, 0, 1], p]), jnp.stack([x[0, 0] > p, x[1, 1] > p]),
-        (p + x[0, 1])[2] * x[:1, 1:2, 2:3],
+        (p + x[0, 1])[2] * x[:1, 1:2, 2:3], [*x], jnp.unstack(p + x[0], axis=1), [*(p * x[0, 0])],
+        jnp.unstack(p + x[:1]),
     ],
     "sums": lambda p, x: [
         x.sum(), x.sum((0, 2)), x.max(1), x.min((1, 2)), x.mean(0), x.prod(2),

@@ -5,8 +5,8 @@ from importlib.metadata import entry_points, version
 
 from .compile_cache import enable_compile_cache
 
-LONG = ("reproduce", "sweep", "bench")
-"""Commands that compute for minutes or hours."""
+LONG = ("reproduce", "sweep", "gauntlet", "bench")
+"""Commands that compute for minutes or hours. Workers of a cluster, which no command starts, compile as they do."""
 QUICK = ("--xla_cpu_use_fusion_emitters=false", "--xla_backend_optimization_level=1")
 KNOWN = ("0.8.", "0.9.", "0.10.")
 """Releases of jaxlib that were tried: later ones end a process for the first of these flags."""
