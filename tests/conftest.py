@@ -8,9 +8,8 @@ from importlib.metadata import version
 from pathlib import Path
 
 # Nearly all of the suite's time is compiling, and half of that is optimisation that a short test never earns back. A
-# program in one piece takes fewer memory maps. The commands that tests start inherit this. What users run, optimised,
-# is what `make demo` and `make wheel` fly.
-# jaxlib 0.11 and later end the process for a flag that they do not know.
+# program in one piece takes fewer memory maps. The commands that tests start inherit this. What users run is what
+# `make demo` and `make wheel` fly. jaxlib 0.11 and later end the process for a flag that they do not know.
 os.environ["XLA_FLAGS"] = " ".join(
     dict.fromkeys(
         [

@@ -40,7 +40,7 @@ def test_nothing_changes_for_long_commands_unknown_compilers_and_accelerators(to
     assert told(command, "--xla_dump_to=x", **about) == ["--xla_dump_to=x"]
 
 
-def test_the_installed_compiler_knows_the_flags(as_a_user):
+def test_the_installed_compiler_knows_the_flags():
     """One that does not ends the process."""
     code = (
         "from retrim.experiments.compile_flags import compile_for; compile_for('fly')\n"

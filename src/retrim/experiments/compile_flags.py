@@ -15,7 +15,7 @@ KNOWN = ("0.8.", "0.9.", "0.10.")
 def compile_for(command: str) -> None:
     """Keep compiled programs in the user's cache, and have those of a short command compiled quickly.
 
-    Compiling takes half the time then, and what is compiled runs up to a tenth slower; most commands are over in
+    Compiling takes half the time then, and what is compiled runs up to a sixth slower; most commands are over in
     seconds. What ``XLA_FLAGS`` says already stands. Nothing changes where JAX has an accelerator's plugin.
 
     Args:
