@@ -22,17 +22,25 @@ ablation, gauntlet, levels, plants, reversing = (
 SEEDS, STARTS, SECONDS = (0, 3), 2, 30.0
 
 
-def test_the_gauntlet_flies_every_condition_and_shows_means_and_the_worst(tmp_path, imagine, drawn, monkeypatch):
-    """Methods in the order asked; a flight that crashed is infinite in its mean, and counted."""
-    ramp = np.linspace(0.0, 3.0, 1501)
+@pytest.mark.parametrize(("cores", "together"), [(2, (("step",), ("none",))), (16, (("step", "none"),))])
+def test_the_gauntlet_flies_every_condition_and_shows_means_and_the_worst(
+    tmp_path, imagine, drawn, monkeypatch, cores, together
+):
+    """Methods in the order asked; a flight that crashed is infinite in its mean, and counted. Many cores fly more."""
+    ramp, make = np.linspace(0.0, 3.0, 1501), Scenario.make
+
+    def installed(scenario, *words, **more):
+        if scenario.disturbance == "large":
+            raise PlantError("its package is not here")
+        return make(scenario, *words, **more)
 
     def error(spec):
-        if spec.scenario.disturbance == "large":
-            raise PlantError("its package is not here")
         if spec.method == "indi":
             return None if (spec.seed, spec.start) == (3, 1) else 0.2
         return ramp if spec.start else 0.1 * (1 + spec.seed)
 
+    monkeypatch.setattr(Scenario, "make", installed)
+    monkeypatch.setattr(gauntlet, "cores", lambda: cores)
     said = drawn(gauntlet, "heat_map", "panel_figure")
     monkeypatch.setattr(gauntlet.plots, "save", lambda figure, folder, stem: (folder / f"{stem}.png", folder / stem))
     done = imagine(gauntlet, error)
@@ -41,8 +49,8 @@ def test_the_gauntlet_flies_every_condition_and_shows_means_and_the_worst(tmp_pa
         Run("test", tmp_path), Silent(), only=names, methods=methods, seeds=SEEDS, seconds=SECONDS, starts=STARTS
     )
     assert [seeds for _, seeds in done.trained] == [SEEDS]
-    assert [(s[0].disturbance, *how) for _, s, *how in done.flown] == [
-        (name, methods, STARTS, SECONDS) for name in names
+    assert [(tuple(each.disturbance for each in s), *how) for _, s, *how in done.flown] == [
+        (each, methods, STARTS, SECONDS) for each in together
     ]
     found = {(row["scenario"], row["method"], row["metric"]): row for row in results(tmp_path, "results.json")["rows"]}
     assert list(dict.fromkeys(key[0] for key in found)) == ["step", "none"]
@@ -74,6 +82,17 @@ def test_the_gauntlet_flies_every_condition_and_shows_means_and_the_worst(tmp_pa
     assert [curve.label for curve in best.curves] == ["indi", "base"]
     np.testing.assert_allclose(best.curves[1].y, 100.0)  # [mm]
     np.testing.assert_allclose(worst.curves[1].y[-1], 3000.0)
+
+
+def test_a_gauntlet_of_plants_that_are_not_installed_is_refused_before_training(tmp_path, imagine, monkeypatch):
+    def lacking(*_, **__):
+        raise PlantError("its package is not here")
+
+    monkeypatch.setattr(Scenario, "make", lacking)
+    done = imagine(gauntlet, lambda spec: 0.0)
+    with pytest.raises(PlantError, match="its package is not here"):
+        gauntlet.gauntlet(Run("test", tmp_path), Silent(), only=("none", "step"), methods=("base",), starts=1)
+    assert not done.trained
 
 
 def test_the_gauntlet_tells_recoveries_from_each_change(tmp_path, imagine, drawn, monkeypatch):

@@ -1,6 +1,6 @@
 """The gauntlet: one policy under everything that changes."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -8,12 +8,15 @@ import numpy as np
 from ...config.conditions import conditions
 from ...config.loading import load
 from ...config.methods import find_method
+from ...config.presets import Preset
+from ...config.scenario import Scenario
 from ...config.setup import Setup
 from ...errors import ConfigError, JobError, PlantError
 from ...viz import plots
 from ...viz.panels import Curve, Panel, heat_map, panel_figure
 from ..flights import Flight
 from ..metrics import metres
+from ..provenance import cores
 from ..recovery import change_times, recoveries
 from ..reporter import Reporter
 from ..run import Run
@@ -25,6 +28,7 @@ METHODS: dict[str, tuple[str, ...]] = {
     "track": ("base", "base-i", "base-do", "geometric-i", "indi", "full"),
     "vision": ("base", "base-do", "full"),  # what every preset can fly
 }
+CORES = 2  # that a condition keeps busy: its adapting flights, of a few starts, are all that takes long
 METRICS = {"steady": "[m]", "late": "[m]", "peak": "[m]", "recovery_5cm": "[s]", "recovery_2cm": "[s]"}
 INTRO = """\
 Made by `retrim gauntlet`. The preset's own vehicle on plant `bem`, with {sensors} sensors, unless the row says
@@ -69,31 +73,51 @@ def gauntlet(
     known = conditions(loaded, sensors)
     if unknown := [name for name in only if name not in known]:
         raise ConfigError(f"no condition {unknown[0]!r}; there are {', '.join(known)}")
-    chosen = [known[name] for name in only or known]
-    refuse_misfits(loaded, chosen, methods=methods, starts=starts, seconds=seconds)
+    chosen, left_out = _installed(loaded, {name: known[name] for name in only or known})
+    refuse_misfits(loaded, list(chosen.values()), methods=methods, starts=starts, seconds=seconds)
     intro = INTRO.format(sensors=sensors)
     document = Document(run, "gauntlet", "The gauntlet", intro, seeds, reporter, data="results")
     study = train_all(loaded, seeds, run, reporter)
-    home, flown, left_out = Setup.of(loaded).flown.home(), dict[str, list[Flight]](), list[str]()
-    found = list[dict[str, Any]]()
-    for name in only or known:
+    home, flown, found = Setup.of(loaded).flown.home(), dict[str, list[Flight]](), list[dict[str, Any]]()
+    names, at_once = list(chosen), max(1, cores() // CORES)
+    for together in (names[n : n + at_once] for n in range(0, len(names), at_once)):
         if run.interrupted:
             break
+        reporter.say(f"condition {', '.join(together)}")
+        scenarios = [chosen[name] for name in together]
         try:
-            reporter.say(f"condition {name}")
-            flights = fly_all(
-                study, [known[name]], run, reporter, methods=methods, starts=starts, seconds=seconds
-            ).flown
-        except (PlantError, JobError) as error:
-            left_out.append(f"{name}: {error}")
+            flights = fly_all(study, scenarios, run, reporter, methods=methods, starts=starts, seconds=seconds).flown
+        except JobError as error:
+            left_out.append(f"{', '.join(together)}: {error}")
             continue
-        if flights:
-            flown[name] = flights
-            found += rows_of(name, flights, change_times(known[name].disturbance, home, seconds))
-            run.write_results(found, seeds=seeds)  # a kill loses one condition
+        for name, scenario in zip(together, scenarios, strict=True):
+            if own := [flight for flight in flights if flight.spec.scenario == scenario]:
+                flown[name] = own
+                found += rows_of(name, own, change_times(scenario.disturbance, home, seconds))
+        if found:
+            run.write_results(found, seeds=seeds)  # a kill loses what is in the air
     if found:
         document.add(_section(found, methods, flown, run, study.about(), left_out), found)
     document.write()
+
+
+def _installed(preset: Preset, asked: Mapping[str, Scenario]) -> tuple[dict[str, Scenario], list[str]]:
+    """Return the conditions whose plants are installed, and a line on each other one.
+
+    Raises:
+        PlantError: None of them is.
+    """
+    found, lacking, why = dict[str, Scenario](), list[str](), None
+    for name, scenario in asked.items():
+        try:
+            scenario.make(preset.vehicle, dt=preset.dt)
+            found[name] = scenario
+        except PlantError as error:
+            lacking.append(f"{name}: {error}")
+            why = error
+    if why is not None and not found:
+        raise why
+    return found, lacking
 
 
 def rows_of(name: str, flights: Sequence[Flight], changes: Sequence[float]) -> list[dict[str, Any]]:
