@@ -75,6 +75,8 @@ def gauntlet(
         raise ConfigError(f"no condition {unknown[0]!r}; there are {', '.join(known)}")
     chosen, left_out = _installed(loaded, {name: known[name] for name in only or known})
     refuse_misfits(loaded, list(chosen.values()), methods=methods, starts=starts, seconds=seconds)
+    for line in left_out:
+        reporter.say(f"left out: {line}")
     intro = INTRO.format(sensors=sensors)
     document = Document(run, "gauntlet", "The gauntlet", intro, seeds, reporter, data="results")
     study = train_all(loaded, seeds, run, reporter)
