@@ -58,7 +58,7 @@ class Imaginary:
         self.trained.append((preset, tuple(seeds)))
         return Study(preset, {seed: f"policy {seed}" for seed in seeds}, tuple(0.001 * (1 + s) for s in seeds))
 
-    def fly(self, study, scenarios, run, reporter, *, methods=("base", "full"), starts, seconds):
+    def fly(self, study, scenarios, run, reporter, *, methods=("base", "full"), starts, seconds, keep=True):
         self.flown.append((study, tuple(scenarios), tuple(methods), starts, seconds))
         specs = [
             FlightSpec(scenario, method, start, seed)

@@ -175,7 +175,7 @@ def test_a_report_has_a_row_for_each_combination_and_bars_for_each_flight(tmp_pa
                 if method == "indi" and error is None:
                     row |= {"failed": "OSError: gone"}
                 kept.append({"preset": "p", **row})
-    found = sweep._report(asked, kept, Run("test", tmp_path), Silent(), 0)
+    found = sweep._report(asked, kept, Run("test", tmp_path), Silent())
     assert [(row["disturbance"], row["method"], row["n"], row["crashes"]) for row in found] == [
         ("none", "base", 4, 0), ("none", "indi", 4, 0), ("large", "base", 4, 1), ("large", "indi", 4, 0)
     ]  # fmt: skip
@@ -191,7 +191,9 @@ def test_a_report_has_a_row_for_each_combination_and_bars_for_each_flight(tmp_pa
         "large": {"base": [0.1, 0.2, 0.4, float("inf")], "indi": [0.1, 0.2, 0.4]},
     }
     one = [row for row in kept if row["disturbance"] == "large"]
-    sweep._report(asked, one, Run("test", tmp_path), Silent(), 3)
+    run = Run("test", tmp_path)
+    run.taken_over = 3
+    sweep._report(asked, one, run, Silent())
     assert "An earlier run had made 3 of the parts" in (tmp_path / "sweep.md").read_text()
     assert list(shown[1]) == ["large"]  # where nothing varies, the disturbance is the label
 

@@ -74,7 +74,7 @@ def demonstrate(
     study = Study(preset, {seed: policy}, (nominal_error(setup, policy),))
     reporter.say(f"hover error in its own model: {1000 * study.errors[0]:.1f} mm")
     scenarios = [replace(scenario, disturbance=level) for level in LEVELS]
-    flights = fly_all(study, scenarios, run, reporter, starts=starts, seconds=seconds).flown
+    flights = fly_all(study, scenarios, run, reporter, starts=starts, seconds=seconds, keep=False).flown
     found = rows(flights)
     with interrupts_only_set(run.stop):
         run.write_results(found, seeds=[seed], preset=preset.name, losses=losses)

@@ -112,8 +112,8 @@ def run_sweep(sweep: Sweep, run: Run, reporter: Reporter) -> Rows:
         if run.interrupted:
             break
     every = [key for of_fleet in keys for key in of_fleet.values()]
-    earlier = len(kept.earlier.intersection(every))
-    return _report(sweep, [kept.rows[key] for key in every if key in kept.rows], run, reporter, earlier)
+    run.taken_over += len(kept.earlier.intersection(every))
+    return _report(sweep, [kept.rows[key] for key in every if key in kept.rows], run, reporter)
 
 
 def _fleet(preset: Preset, policies: Mapping[int, Policy], sweep: Sweep) -> Fleet:
@@ -208,7 +208,7 @@ def _key(preset: Preset, spec: FlightSpec, seconds: float) -> str:
 GROUP = ("preset", "plant", "vehicle", "sensors", "reference", "disturbance", "method")
 
 
-def _report(sweep: Sweep, kept: Sequence[dict[str, Any]], run: Run, reporter: Reporter, earlier: int) -> Rows:
+def _report(sweep: Sweep, kept: Sequence[dict[str, Any]], run: Run, reporter: Reporter) -> Rows:
     """Write the documents of the flights that are over, in the order of the sweep."""
     groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
     for row in kept:
@@ -222,9 +222,8 @@ def _report(sweep: Sweep, kept: Sequence[dict[str, Any]], run: Run, reporter: Re
         figures = (none if row[name] is None else metres(row[name]) for name in ("median", "max"))
         cells.append((*(str(flights[0][name]) for name in varied), cell(row), *figures))
     intro = "Made by `retrim sweep`. Error [m] over the last seconds of each flight, over seeds and starts."
-    document = Document(
-        run, "sweep", "Sweep", intro, sweep.seeds, reporter, {"sweep": dataclasses.asdict(sweep)}, earlier=earlier
-    )
+    more = {"sweep": dataclasses.asdict(sweep)}
+    document = Document(run, "sweep", "Sweep", intro, sweep.seeds, reporter, more)
     if cells:
         drawn = save(bars("Error at the end of the flights [m]", _bar_groups(groups)), run.folder, "sweep")
         columns = (*varied, "mean ± std [m]", "median [m]", "maximum [m]")

@@ -18,6 +18,7 @@ from ..reporter import Reporter
 from ..run import Run
 from .document import Document, TableSection
 from .kept import keep, kept
+from .kept_flights import forget_flights
 from .study import Study, fly_all, train_all
 
 Task = Literal["hover", "track"]
@@ -65,12 +66,12 @@ def ablation(
             )  # fmt: skip
             if (made := kept(run, key)) is not None:
                 reporter.say(f"{name}: {lever.label.strip('*')}, as an earlier run of this folder has made it")
-                document.earlier += 1
             else:
                 reporter.say(f"{name}: {lever.label.strip('*')}")
                 made = _flown(preset, lever, task, studies, document, starts=starts, seconds=seconds)
                 if not run.interrupted:
                     keep(run, key, *made)
+                    forget_flights(run)
             if not run.interrupted:
                 lines += made[0].rows
             found += made[1]

@@ -50,8 +50,6 @@ class Document:
     """Name of the JSON file; that of the document by default."""
     sections: list[TableSection] = field(default_factory=list)
     """What was added."""
-    earlier: int = 0
-    """How many parts, sections or lines of them, an earlier run of the folder had made."""
     _rows: list[dict[str, Any]] = field(default_factory=list)
 
     def add(self, section: TableSection, rows: Sequence[dict[str, Any]] = ()) -> None:
@@ -70,8 +68,8 @@ class Document:
         head += [f"{describe_code()}; {describe_hardware()}{trained}.", ""]
         body = [line for section in self.sections for line in section.markdown()]
         foot = self.run.watch.sentence() + (" Interrupted: incomplete." if self.run.interrupted else "")
-        if self.earlier:
-            foot += f" An earlier run had made {self.earlier} of the parts; its time is not counted."
+        if self.run.taken_over:
+            foot += f" An earlier run had made {self.run.taken_over} of the parts; its time is not counted."
         self.run.write_results(self._rows, seeds=self.seeds, name=self.data or self.name, **self.more)
         page = self.run.write_text(f"{self.name}.md", "\n".join([*head, *body, foot, ""]))
         if page not in self.run.pages:

@@ -78,7 +78,7 @@ def everything(run: Run, reporter: Reporter, *, quick: bool = False) -> None:
         before = json.loads(done.read_text()) if done.is_file() and page.is_file() else None
         if before is not None and before.pop("page") == digest_of(page):
             reporter.say(f"{name}: as an earlier run of this folder has made it")
-            document.earlier += 1
+            run.taken_over += 1
             row |= before
         else:
             try:

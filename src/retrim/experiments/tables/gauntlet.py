@@ -21,6 +21,7 @@ from ..recovery import change_times, recoveries
 from ..reporter import Reporter
 from ..run import Run
 from .document import Document, TableSection
+from .kept_flights import forget_flights
 from .study import fly_all, refuse_misfits, table_presets, train_all
 
 METHODS: dict[str, tuple[str, ...]] = {
@@ -101,6 +102,8 @@ def gauntlet(
     if found:
         document.add(_section(found, methods, flown, run, study.about(), left_out), found)
     document.write()
+    if not run.interrupted:
+        forget_flights(run)
 
 
 def _installed(preset: Preset, asked: Mapping[str, Scenario]) -> tuple[dict[str, Scenario], list[str]]:

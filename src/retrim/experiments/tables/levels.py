@@ -21,6 +21,7 @@ from ..run import Run
 from .beside import figures_table
 from .document import Document, TableSection
 from .kept import files_behind, keep, kept, named_by, named_in
+from .kept_flights import forget_flights
 from .study import Study, fly_all, refuse_misfits, train_all
 
 LEVELS = {"none": "no disturbance", "small": "small, 0.5 m/s² per axis", "large": "large, 2 m/s² per axis"}
@@ -96,7 +97,6 @@ def fly_levels(
         )  # fmt: skip
         if (made := kept(run, name)) is not None:
             reporter.say(f"{section.title}: as an earlier run of this folder has made it")
-            document.earlier += 1
             document.add(*made)
             document.add(figures_table(made[1], section.title, section.levels))
             continue
@@ -117,6 +117,7 @@ def fly_levels(
             break
         if made is not None:
             keep(run, name, *made)
+            forget_flights(run)
     document.write()
 
 

@@ -9,6 +9,7 @@ from ..metrics import cell, metres, rows
 from ..reporter import Reporter
 from ..run import Run
 from .document import Document, TableSection
+from .kept_flights import forget_flights
 from .study import fly_all, table_presets, train_all
 
 METHODS = ("base", "base-i", "base-do", "indi", "full")
@@ -107,3 +108,5 @@ def plants(
             lines.append((name, *cells, "-" if peak is None else metres(peak), f"{crashes} of {n}"))
         document.add(TableSection(COLUMNS, tuple(lines), title), found)
     document.write()
+    if not run.interrupted:
+        forget_flights(run)

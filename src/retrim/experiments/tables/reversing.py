@@ -15,6 +15,7 @@ from ..metrics import mean_and_deviation, metres, rows
 from ..reporter import Reporter
 from ..run import Run
 from .document import Document, TableSection
+from .kept_flights import forget_flights
 from .study import fly_all, table_presets, train_all
 
 PERIOD = 15.0  # [s]
@@ -82,6 +83,8 @@ def reversing(
     drawn = picture(pictured, Setup.of(loaded), scenario, run.folder)
     document.more = {"moments_s": moments.tolist(), "errors_m": {m: np.array(e).tolist() for m, e in errors.items()}}
     document.add(_section(errors, moments, updates, about, drawn[0] if drawn else None), found)
+    if not run.interrupted:
+        forget_flights(run)
 
 
 def _peak(row: dict[str, Any]) -> str:

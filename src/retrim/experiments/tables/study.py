@@ -1,7 +1,7 @@
 """What every table does: train policies, fly them, lay methods and disturbances out as the paper does."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from jax import random
@@ -18,6 +18,7 @@ from ..limits import check_flights, check_seeds
 from ..reporter import Reporter
 from ..run import Run
 from ..training import nominal_error, train, trained_elsewhere
+from .kept_flights import KeptFlights
 
 
 @dataclass(frozen=True)
@@ -90,8 +91,19 @@ def fly_all(
     methods: Sequence[str] = ("base", "full"),
     starts: int,
     seconds: float | None,
+    keep: bool = True,
 ) -> Flights:
     """Fly every combination, with progress.
+
+    Args:
+        study: What flies.
+        scenarios: Where.
+        run: Its folder keeps the flights, and those that an earlier run has kept there are not flown again.
+        reporter: Receives progress.
+        methods: How they fly.
+        starts: Flights per scenario, method and seed.
+        seconds: Length of a flight [s]; the task's own by default.
+        keep: Keep them, until the table forgets them; what a flight has learnt is not kept.
 
     Raises:
         PlantError: The package of a plant is not installed.
@@ -100,11 +112,21 @@ def fly_all(
     if not study.policies or run.interrupted:
         return Flights([], interrupted=True)
     fleet = Fleet(study.preset, study.policies, scenarios, methods=methods, starts=starts, seconds=seconds)
-    flights = Flights([], interrupted=True)
-    with run.interruptible(), reporter.progress("flying") as advance:
-        advance(0.0, "compiling the programs of a flight (kept in a cache for the next time)")
-        flights = fleet.run(run.executor, stop=run.stop, progress=told_by(advance), by_lot=True)
+    kept = KeptFlights(run, fleet) if keep else None
+    earlier = {} if kept is None else kept.earlier
+    left = [spec for spec in fleet.specs if spec not in earlier]
+    if earlier:
+        reporter.say(f"{len(earlier)} of {len(fleet.specs)} flights: as an earlier run of this folder has flown them")
+    flights = Flights([], interrupted=bool(left))
+    if left:
+        with run.interruptible(), reporter.progress("flying") as advance:
+            advance(0.0, "compiling the programs of a flight (kept in a cache for the next time)")
+            landed = None if kept is None else kept.landed
+            flights = fleet.run(
+                run.executor, stop=run.stop, progress=told_by(advance), landed=landed, only=left, by_lot=True
+            )
     if flights.failed:
         why = next(iter(flights.failed.values()))
         raise JobError(f"{len(flights.failed)} of {len(fleet.specs)} flights failed elsewhere, the first by {why}")
-    return flights
+    flown = earlier | {flight.spec: flight for flight in flights.flown}
+    return replace(flights, flown=[flown[spec] for spec in fleet.specs if spec in flown])

@@ -1,0 +1,63 @@
+"""Flights as one NPZ file, to the last bit; what each has learnt is not in it."""
+
+import io
+import json
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ..runtime.events import Event
+from ..runtime.flight import Log, States
+from .flights import Flight, FlightSpec
+
+SCALARS = ("vehicle", "metric", "steady_seconds")
+
+
+def packed(flights: Sequence[Flight]) -> bytes:
+    """Return flights as an NPZ file.
+
+    Args:
+        flights: Their specifications are not in it.
+    """
+    arrays, about = dict[str, Any](), list[dict[str, Any]]()
+    for i, flight in enumerate(flights):
+        log = flight.log
+        parts: dict[str, Any] = {"t": log.t, "u": log.u, "age": log.age}
+        parts |= {"error": flight.error, "cross": flight.cross, "target": flight.target}
+        for name, states in (("true", log.true), ("measured", log.measured)):
+            parts |= {f"{name}.{part}": value for part, value in states._asdict().items()}
+        arrays |= {f"{i}.{name}": value for name, value in parts.items() if value is not None}
+        scalars = {name: getattr(flight, name) for name in SCALARS}
+        about.append({"flight": scalars, "dt": log.dt, "terminated": log.terminated, "events": log.events})
+    file = io.BytesIO()
+    np.savez(file, about=np.array(json.dumps(about)), **arrays)
+    return file.getvalue()
+
+
+def unpacked(data: bytes, specs: Sequence[FlightSpec]) -> list[Flight]:
+    """Return the flights of :func:`packed`.
+
+    Args:
+        data: The file.
+        specs: Their specifications.
+
+    Raises:
+        ValueError: It has another number of flights; what is no such file raises what NumPy's reading of it does.
+    """
+    with np.load(io.BytesIO(data), allow_pickle=False) as file:
+        arrays: dict[str, np.ndarray] = dict(file)
+    about = json.loads(str(arrays.pop("about")))
+    return [
+        _flight({name.partition(".")[2]: value for name, value in arrays.items() if name.startswith(f"{i}.")}, spec, a)
+        for i, (spec, a) in enumerate(zip(specs, about, strict=True))
+    ]
+
+
+def _flight(parts: dict[str, np.ndarray], spec: FlightSpec, about: dict[str, Any]) -> Flight:
+    true, measured = (States(*(parts[f"{name}.{part}"] for part in States._fields)) for name in ("true", "measured"))
+    events = tuple(Event(*event) for event in about["events"])
+    cross, target, age = parts.get("cross"), parts.get("target"), parts["age"]
+    old = age if age.ndim else float(age)
+    log = Log(parts["t"], true, measured, parts["u"], about["dt"], about["terminated"], events, old)
+    return Flight(spec, log=log, error=parts["error"], cross=cross, target=target, **about["flight"])
