@@ -1,9 +1,11 @@
 """The tables of the baselines' settings and of the design study, at reduced size."""
 
+import contextlib
 import importlib
 import inspect
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +13,7 @@ import numpy as np
 import pytest
 from jax import random
 
-from commands import retrim
+from commands import results, retrim
 from helpers import brief_preset, random_command, random_state, tiny_preset
 from retrim import ConfigError, PlantError, Setup, changed
 from retrim.cli.reproduce import COMMANDS
@@ -165,6 +167,35 @@ def test_all_tables_go_on_where_they_were_killed(tmp_path, monkeypatch):
     (tmp_path / "one" / "one.md").unlink()
     table(False)
     assert made[5:] == [("one", 9)]
+
+
+def test_what_an_interrupted_table_took_is_counted_and_what_a_killed_one_took_is_not_known(tmp_path, monkeypatch):
+    ends = iter(("interrupted", "interrupted", "done", "killed", "interrupted", "done"))
+
+    def one(run, reporter):
+        run.watch = SimpleNamespace(total_s=60.0, sentence=str)
+        end = next(ends)
+        if end == "killed":
+            raise RuntimeError
+        if end == "interrupted":
+            run.stop.set()
+        run.write_text("one.md", end)
+
+    monkeypatch.setattr(everything, "PLAN", ((one, "Table", {}),))
+
+    def told():
+        with contextlib.suppress(RuntimeError):
+            everything.everything(Run("test", tmp_path), Silent())
+        return (tmp_path / "everything.md").read_text().count("| 3.0 |"), results(tmp_path, "everything.json")["rows"]
+
+    told(), told()
+    assert told() == (2, [{"table": "one", "what": "Table", "page": "one/one.md", "s": 180.0, "at_least": False}])
+    assert told()[0] == 2  # it is made
+    (tmp_path / "one" / "one.md").unlink()
+    told(), told()
+    (row,) = told()[1]
+    assert (row["s"], row["at_least"]) == (120.0, True)
+    assert "| at least 2.0 |" in (tmp_path / "everything.md").read_text()
 
 
 def test_a_page_that_other_code_made_since_is_made_again(tmp_path, monkeypatch):

@@ -1,7 +1,7 @@
 """All tables of the paper, one after another."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from ...errors import PlantError
@@ -33,8 +33,8 @@ PLAN: tuple[tuple[Callable[..., None], str, Options], ...] = (
     (reversing, "Sec. IV-B.3", SEEDS),
     (model, "the plant", {}),
     (raptor, "beside RAPTOR", {}),
-    (track, "Table II", {**SEEDS, "presets": ("track/retrim",), "methods": WITH_DATT, "seconds": 30.0}),
-    (transfer, "Sec. IV-D", {}),
+    (track, "Table II", {**SEEDS, "presets": ("track/retrim",), "methods": WITH_DATT, "seconds": 24.0}),
+    (transfer, "Sec. IV-D", {"seconds": 24.0}),
     (hover, "Table I", {**SEEDS, "presets": ("hover/retrim", "hover/paper"), "methods": WITH_DATT}),
     (vision, "Table III", {**SEEDS, "presets": ("vision/retrim",)}),
     (phase, "Table II, the paper's formulation", {}),
@@ -43,7 +43,7 @@ PLAN: tuple[tuple[Callable[..., None], str, Options], ...] = (
 """Table, what of the paper it is, and its options. What is timed comes first, when the machine is least busy."""
 QUICK_LEAVES_OUT = (phase, plants)
 AT_LEAST = "at least "
-"""Where an earlier run had made a part, whose time nobody has noted."""
+"""Where an earlier run was killed, whose time nobody has noted; one that was interrupted is counted."""
 
 
 def everything(run: Run, reporter: Reporter, *, quick: bool = False) -> None:
@@ -73,29 +73,56 @@ def everything(run: Run, reporter: Reporter, *, quick: bool = False) -> None:
         row: dict[str, Any] = {"table": name, "what": what, "page": f"{folder}/{name}.md"}
         place = run.folder / folder
         part = Run("reproduce", place, stop=run.stop, remark=remark, trained=run.folder, executor=run.executor)
-        done = run.folder / PARTS / f"{section_key(table=name, options=options)}.done"
+        key = f"{PARTS}/{section_key(table=name, options=options)}"
+        done, begun = f"{key}.done", f"{key}.begun"
         page = run.folder / row["page"]
-        before = json.loads(done.read_text()) if done.is_file() and page.is_file() else None
+        before = _read(run, done) if page.is_file() else None
         if before is not None and before.pop("page") == digest_of(page):
             reporter.say(f"{name}: as an earlier run of this folder has made it")
             run.taken_over += 1
             row |= before
         else:
+            took = _read(run, begun) or {"s": 0.0, "at_least": False}
+            _write(run, begun, took | {"at_least": True})  # unless this run comes to tell how long it took
             try:
                 make(part, reporter, **options)
             except PlantError as error:
+                (run.folder / begun).unlink()
                 rows.append({"table": name, "what": what, "left_out": str(error)})
                 continue
-            took = {"s": round(part.watch.total_s, 1), "at_least": part.taken_over > 0}
+            took |= {"s": round(took["s"] + part.watch.total_s, 1)}
             row |= took
-            if not run.interrupted and page.is_file():
-                made = {**took, "page": digest_of(page)}  # of other code or options another page may be there one day
-                run.write_text(str(done.relative_to(run.folder)), json.dumps(made) + "\n")
+            if run.interrupted:
+                _write(run, begun, took)
+            else:
+                (run.folder / begun).unlink()
+                if page.is_file():  # of other code or options another page may be there one day
+                    _write(run, done, took | {"page": digest_of(page)})
         rows.append(row)
-    lines = tuple(
+    lines = [
         (row["what"], f"{row['table']}, left out: {row['left_out']}", "-")
         if "left_out" in row
-        else (row["what"], f"[{row['table']}]({row['page']})", f"{AT_LEAST * row['at_least']}{row['s'] / 60:.1f}")
+        else (row["what"], f"[{row['table']}]({row['page']})", _minutes([row]))
         for row in rows
-    )
-    document.add(TableSection(("of the paper", "table", "minutes"), lines), rows)
+    ]
+    lines.append(("", "together", _minutes([row for row in rows if "left_out" not in row])))
+    document.add(TableSection(("of the paper", "table", "minutes"), tuple(lines)), rows)
+
+
+def _minutes(rows: Sequence[dict[str, Any]]) -> str:
+    """Return how long tables took together."""
+    at_least = any(row["at_least"] for row in rows)
+    return f"{AT_LEAST * at_least}{sum(row['s'] for row in rows) / 60:.1f}"
+
+
+def _read(run: Run, name: str) -> dict[str, Any] | None:
+    """Return what an earlier run has noted; None if it did not."""
+    try:
+        noted: dict[str, Any] = json.loads((run.folder / name).read_text())
+    except OSError:
+        return None
+    return noted
+
+
+def _write(run: Run, name: str, noted: dict[str, Any]) -> None:
+    run.write_text(name, json.dumps(noted) + "\n")

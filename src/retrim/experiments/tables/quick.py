@@ -29,7 +29,9 @@ QUICK: dict[str, Options] = {
 """By table: options that are smaller."""
 ALONE = ("model", "efficiency", "buses", "tuning", "design", "scaling")
 """Tables that this process makes alone."""
-GO_ON = ("hover", "track", "phase", "vision", "fast", "transfer", "raptor", "ablation", "everything")
+GO_ON = (
+    "hover", "track", "phase", "vision", "fast", "transfer", "raptor", "ablation", "reversing", "plants", "everything"
+)  # fmt: skip
 """Tables that are made in parts, and whose command goes on where it was killed."""
 REMARK = "A quick look, smaller than the table: figures to look at, not to quote."
 
