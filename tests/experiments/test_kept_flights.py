@@ -73,6 +73,7 @@ def test_only_the_same_is_taken_and_nothing_once_it_is_forgotten(study, tmp_path
     taken = lambda study=study, **how: flown(study, tmp_path, **how)[1]  # noqa: E731
     assert taken(methods=("base",)) == 0
     assert taken(methods=("indi", "base")) == 2
+    assert taken(methods=("base", "base")) == 2
     assert taken(starts=3) == 0
     assert taken(Study(study.preset, {0: study.policies[0], 1: study.policies[0]}, ())) == 0
     assert taken(Study(brief_preset(adapt={"update_every": 0.4}), study.policies, ())) == 0

@@ -82,7 +82,6 @@ def trained_datt(
         if path.is_file():
             try:
                 nets[seed] = eqx.combine(wire.unpack(path.read_bytes(), arrays, kind="datt", source=str(path)), fixed)
-                run.taken_over += 1
                 continue
             except MessageError as error:
                 reporter.say(f"{error}; trained again")

@@ -56,7 +56,7 @@ class Run:
         self.pages: list[Path] = []  # that its documents have written
         self.watch = Stopwatch()
         self.taken_over = 0
-        """Parts, flights, and networks that take long to train, that an earlier run had made."""
+        """Parts, and groups of flights, that an earlier run had made."""
         self.stop = stop or threading.Event()
         commit(), code()  # as they are now: the run may last for hours
         check_writable(self.folder)

@@ -35,7 +35,7 @@ class KeptFlights:
         """Find what an earlier run of the folder has flown of the same fleet, by the same code."""
         self._run, self._over = run, dict[FlightSpec, Flight]()
         self._groups = dict[tuple[Scenario, str], list[FlightSpec]]()
-        for spec in fleet.specs:
+        for spec in dict.fromkeys(fleet.specs):  # who names a method twice has its flights once
             self._groups.setdefault((spec.scenario, spec.method), []).append(spec)
         policies = {str(seed): _digest_of(policy) for seed, policy in fleet.policies.items()}
         about = {"preset": dump(fleet.preset), "policies": policies, "seconds": fleet.seconds}
