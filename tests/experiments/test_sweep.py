@@ -17,6 +17,7 @@ from retrim.experiments.gathering import Flights
 from retrim.experiments.metrics import record
 from retrim.experiments.reporter import Silent
 from retrim.experiments.sweep import Sweep, read_sweep, run_sweep
+from retrim.experiments.tables import kept_policies
 
 pytestmark = pytest.mark.usefixtures("as_a_user")
 
@@ -116,8 +117,8 @@ def test_policies_and_flights_are_of_the_code_and_the_files_that_made_them(tmp_p
     trained = []
     monkeypatch.setattr(sweep, "bars", lambda *_: None)
     monkeypatch.setattr(sweep, "save", lambda figure, folder, stem: (folder / f"{stem}.png", folder / f"{stem}.svg"))
-    made = sweep.train
-    monkeypatch.setattr(sweep, "train", lambda *a, **k: trained.append(0) or made(*a, **k))
+    made = kept_policies.train
+    monkeypatch.setattr(kept_policies, "train", lambda *a, **k: trained.append(0) or made(*a, **k))
 
     def fly():
         trained.clear()
@@ -129,7 +130,8 @@ def test_policies_and_flights_are_of_the_code_and_the_files_that_made_them(tmp_p
     monkeypatch.setattr(provenance, "code", lambda: "changed")
     assert fly() == (1, 2)
     assert results(tmp_path / "out", "sweep.json")["rows"][0]["n"] == 1
-    monkeypatch.setattr(sweep, "files_behind", lambda *names: {"mine.csv": "changed"})
+    for module in (sweep, kept_policies):
+        monkeypatch.setattr(module, "files_behind", lambda *names: {"mine.csv": "changed"})
     assert fly() == (1, 3)
 
 

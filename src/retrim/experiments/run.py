@@ -43,7 +43,7 @@ class Run:
             out: The folder.
             stop: Set when the run should end early.
             remark: What its documents say of how they were made.
-            trained: Folder of networks that take long to train, for several runs; the run's own by default.
+            trained: Folder of what is trained, for several runs; the run's own by default.
             executor: Who trains and flies, in other processes; by default this one does.
 
         Raises:

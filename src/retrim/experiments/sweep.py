@@ -18,7 +18,6 @@ from ..config.validation import read_toml, validated
 from ..config.vehicle_file import VehicleSpec
 from ..control.policy import Policy
 from ..io.files import write_whole
-from ..io.trained import load_policy, save_policy
 from ..viz.panels import bars
 from ..viz.plots import save
 from .fleet import Fleet
@@ -31,7 +30,7 @@ from .reporter import Reporter
 from .run import Run
 from .tables.document import Document, TableSection
 from .tables.kept import files_behind, named_by, named_in
-from .training import train, trained_elsewhere
+from .tables.kept_policies import trained_policies
 
 STRICT = ConfigDict(extra="forbid")
 
@@ -108,7 +107,9 @@ def run_sweep(sweep: Sweep, run: Run, reporter: Reporter) -> Rows:
     keys = [{spec: _key(fleet.preset, spec, fleet.seconds) for spec in fleet.specs} for fleet in fleets]
     for preset, of_fleet in zip(presets, keys, strict=True):
         with run.interruptible():
-            _fly(_fleet(preset, _trained(preset, sweep, run, reporter), sweep), of_fleet, kept, run, reporter)
+            policies = trained_policies(preset, sweep.seeds, run, reporter)
+            if not run.interrupted:
+                _fly(_fleet(preset, policies, sweep), of_fleet, kept, run, reporter)
         if run.interrupted:
             break
     every = [key for of_fleet in keys for key in of_fleet.values()]
@@ -147,37 +148,6 @@ def _fly(fleet: Fleet, keys: Mapping[FlightSpec, str], kept: "_Kept", run: Run, 
         run.failed = True
         why = next(iter(flights.failed.values()))
         reporter.say(f"{len(flights.failed)} flights failed elsewhere, the first by {why}; the same command flies them")
-
-
-def _trained(preset: Preset, sweep: Sweep, run: Run, reporter: Reporter) -> dict[int, Policy]:
-    """Return trained policies by seed, from the run's folder where they are there.
-
-    Raises:
-        KeyboardInterrupt: The run was interrupted before all were trained.
-    """
-    digest = section_key(preset=dump(preset), files=files_behind(*named_in(preset)))
-    stem = f"{preset.name.replace('/', '-')}-{digest[:8]}"
-    paths = {seed: run.folder / "policies" / f"{stem}-seed{seed}.safetensors" for seed in sweep.seeds}
-    found = {seed: load_policy(path)[0] for seed, path in paths.items() if path.is_file()}
-    missing = [seed for seed in sweep.seeds if seed not in found]
-    if missing and run.executor is not None:
-
-        def keep(seed: int, policy: Policy) -> None:
-            save_policy(paths[seed], policy, preset)
-            found[seed] = policy
-
-        trained_elsewhere(preset, missing, run.executor, reporter=reporter, stop=run.stop, landed=keep)
-        if run.interrupted:
-            raise KeyboardInterrupt
-        missing = []
-    for seed in missing:
-        reporter.say(f"preset {preset.name}, seed {seed}")
-        policy, _ = train(Setup.of(preset), seed, reporter=reporter, stop=run.stop)
-        if run.interrupted:
-            raise KeyboardInterrupt
-        save_policy(paths[seed], policy, preset)
-        found[seed] = policy
-    return {seed: found[seed] for seed in sweep.seeds}
 
 
 class _Kept:

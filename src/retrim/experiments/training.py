@@ -68,7 +68,7 @@ def trained_elsewhere(
     reporter: Reporter,
     stop: threading.Event,
     landed: Callable[[int, Policy], None] = lambda seed, policy: None,
-) -> dict[int, tuple[Policy, float]]:
+) -> dict[int, Policy]:
     """Pretrain a policy for each seed, all at once, in other processes.
 
     Args:
@@ -80,13 +80,13 @@ def trained_elsewhere(
         landed: Receives each policy as it comes.
 
     Returns:
-        By seed: the policy, and its error in its own model [m]. Complete, but after ``stop``.
+        By seed. Complete, but after ``stop``.
 
     Raises:
         JobError: A training failed; told once the others have come.
     """
     jobs = {executor.submit(train_job, dump(preset), seed): seed for seed in seeds}
-    found, failed, waiting = dict[int, tuple[Policy, float]](), list[str](), set(jobs)
+    found, failed, waiting = dict[int, Policy](), list[str](), set(jobs)
     try:
         with reporter.progress(f"pretraining {preset.name} elsewhere") as advance:
             while waiting and not stop.is_set():
@@ -97,7 +97,7 @@ def trained_elsewhere(
                         failed.append(f"seed {jobs[job]}: {' '.join(str(error).split())}")
                         continue
                     found[jobs[job]] = job.result()
-                    landed(jobs[job], found[jobs[job]][0])
+                    landed(jobs[job], found[jobs[job]])
             advance(len(found) / len(jobs), f"{len(found)} of {len(jobs)} seeds")
     except KeyboardInterrupt:
         stop.set()
@@ -109,11 +109,9 @@ def trained_elsewhere(
     return {seed: found[seed] for seed in seeds if seed in found}
 
 
-def train_job(preset: str, seed: int) -> tuple[Policy, float]:
-    """Pretrain a policy of a preset (JSON), in another process; return it with its error in its own model [m]."""
-    setup = Setup.of(parse(preset, source="preset"))
-    policy, _ = train(setup, seed)
-    return policy, nominal_error(setup, policy)
+def train_job(preset: str, seed: int) -> Policy:
+    """Pretrain a policy of a preset (JSON), in another process."""
+    return train(Setup.of(parse(preset, source="preset")), seed).policy
 
 
 def nominal_error(setup: Setup, policy: Policy, *, n: int = 64, seed: int = 1) -> float:

@@ -17,8 +17,9 @@ from ..gathering import Flights, told_by
 from ..limits import check_flights, check_seeds
 from ..reporter import Reporter
 from ..run import Run
-from ..training import nominal_error, train, trained_elsewhere
+from ..training import nominal_error
 from .kept_flights import KeptFlights
+from .kept_policies import trained_policies
 
 
 @dataclass(frozen=True)
@@ -50,20 +51,14 @@ def table_presets(
 
 
 def train_all(preset: Preset, seeds: Sequence[int], run: Run, reporter: Reporter) -> Study:
-    """Train a policy for each seed; an interruption leaves those that are complete."""
-    if run.executor is not None:
-        found = trained_elsewhere(preset, seeds, run.executor, reporter=reporter, stop=run.stop)
-        return Study(preset, {s: policy for s, (policy, _) in found.items()}, tuple(e for _, e in found.values()))
+    """Train a policy for each seed, or take it from the run; an interruption leaves those that are complete."""
     setup, policies, errors = Setup.of(preset), dict[int, Policy](), list[float]()
-    for seed in seeds:
+    for seed, policy in trained_policies(preset, seeds, run, reporter).items():
         if run.interrupted:
             break
-        reporter.say(f"preset {preset.name}, seed {seed}")
-        policy, _ = train(setup, seed, reporter=reporter, stop=run.stop)
-        if not run.interrupted:
-            with run.interruptible():
-                errors.append(nominal_error(setup, policy))
-                policies[seed] = policy
+        with run.interruptible():
+            errors.append(nominal_error(setup, policy))
+            policies[seed] = policy
     return Study(preset, policies, tuple(errors))
 
 
