@@ -12,7 +12,7 @@ from retrim.control.datt import SIZE, Datt, DattNet, _along, datt_command, datt_
 from retrim.estimation.l1 import L1Estimator
 from retrim.estimation.prediction import Prediction
 from retrim.learn.datt import KNOWN, DattProblem, reference_bank, ticks_of
-from retrim.learn.ppo import PpoSettings, ppo
+from retrim.learn.ppo import PpoSettings, PpoState, ppo
 from retrim.physics import Command, State, small
 from retrim.testing import check_controller
 
@@ -82,7 +82,8 @@ def test_it_learns_and_is_a_controller(key):
     """Every part of the network moves; that PPO finds what it should is shown on a task with a known answer."""
     made, fresh = problem(4), eqx.filter_jit(lambda key: DattNet.of(key=key))(key)
     settings = PpoSettings(envs=16, steps=8, minibatches=2, epochs=2)
-    ((net, told),) = ppo(made, fresh, key, settings, steps=16 * 8)
+    ((after, told),) = ppo(made, PpoState.of(made, fresh, key, settings), settings, steps=16 * 8)
+    net = after.net
     assert np.isfinite(list(told.values())).all()
     for before, after in zip(jax.tree.leaves(fresh), jax.tree.leaves(net), strict=True):
         assert not eqx.is_array(before) or (not np.array_equal(before, after) and np.isfinite(after).all())

@@ -242,15 +242,44 @@ def test_datt_is_trained_once_for_a_folder(tmp_path, monkeypatch):
         rivals.check_rival(changed(preset, dt=0.025))
 
 
+@pytest.mark.usefixtures("small_datt")
+def test_a_training_of_datt_that_is_cut_goes_on_where_it_was(tmp_path):
+    """To the same network, to the bit; also where its state cannot be read, when it begins anew."""
+    preset, size, said = load("hover/retrim"), rivals.DATT_PPO["envs"] * rivals.DATT_PPO["steps"], []
+
+    def train(name, stops_at=2.0):
+        run = Run("test", tmp_path / name)
+        watching = Watching(lambda share: share > stops_at and run.stop.set())
+        watching.say = said.append
+        nets = rivals.trained_datt(preset, [0], run, watching, steps=4 * size)
+        return nets, [round(4 * share) for share in watching.shares]
+
+    (whole, shares), (nothing, first) = train("whole"), train("cut", stops_at=0.4)
+    assert (shares, nothing, first) == ([1, 2, 3, 4], {}, [1, 2])
+    (partly,) = (tmp_path / "cut").glob("*.partly")
+    kept = partly.read_bytes()
+    again, rest = train("cut")
+    assert (rest, said) == ([3, 4], ["DATT, seed 0: goes on after 2 of 4 updates"])
+    assert not partly.exists()
+    (made,) = (tmp_path / "cut").glob("datt_*")
+    made.unlink()
+    partly.write_bytes(kept[:-50])
+    afresh, shares = train("cut")
+    assert (shares, "trained again" in said[1]) == ([1, 2, 3, 4], True)
+    for other in (again, afresh):
+        jax.tree.map(np.testing.assert_array_equal, *(eqx.filter(n[0], eqx.is_array) for n in (whole, other)))
+
+
 def test_a_network_of_datt_is_of_its_vehicle_its_lag_its_steps_and_its_seed(tmp_path, monkeypatch):
     """Another of these is another file; what is learnt goes on from update to update."""
     preset, watching, asked = load("hover/retrim"), Watching(), []
 
-    def ppo(problem, net, key, settings, *, steps):
-        asked.append((problem, tuple(jax.random.key_data(key).tolist()), steps))
+    def ppo(problem, state, settings, *, steps):
+        asked.append((problem, tuple(jax.random.key_data(state.key).tolist()), steps))
         for i in range(settings.updates(steps)):
-            net = jax.tree.map(lambda leaf: leaf + 1.0 if eqx.is_array(leaf) else leaf, net)
-            yield net, {"reward": i}
+            net = jax.tree.map(lambda leaf: leaf + 1.0 if eqx.is_array(leaf) else leaf, state.net)
+            state = dataclasses.replace(state, net=net, made=state.made + 1)
+            yield state, {"reward": i}
 
     monkeypatch.setattr(rivals, "ppo", ppo)
     size = rivals.DATT_PPO["envs"] * rivals.DATT_PPO["steps"]

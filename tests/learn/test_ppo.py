@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from jax import random
 
-from retrim.learn.ppo import PpoSettings, Seen, advantages, log_prob, ppo
+from retrim.learn.advantages import Seen, advantages
+from retrim.learn.ppo import PpoSettings, PpoState, log_prob, ppo
 from retrim.learn.problem import Outcome
 
 pytestmark = pytest.mark.usefixtures("optax_promotion")
@@ -53,8 +54,8 @@ def optimum():
 def test_it_solves_a_regulator_with_a_known_answer(key):
     settings = PpoSettings(envs=64, steps=32, minibatches=4, epochs=4, learning_rate=0.02, discount=DISCOUNT)
     net = Gain(jnp.zeros(1), jnp.zeros(2), jnp.full(1, -1.0))
-    learnt = list(ppo(Linear(), net, key, settings, steps=64 * 32 * 160))
-    net, figures = learnt[-1][0], [told for _, told in learnt]
+    learnt = list(ppo(Linear(), PpoState.of(Linear(), net, key, settings), settings, steps=64 * 32 * 160))
+    net, figures = learnt[-1][0].net, [told for _, told in learnt]
     gain, curvature = optimum()
     assert float(net.gain[0]) == pytest.approx(gain, rel=0.1)
     assert float(net.value[1]) == pytest.approx(curvature, rel=0.25)

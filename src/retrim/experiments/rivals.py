@@ -1,6 +1,8 @@
 """Baselines that are trained before they fly: DATT, by reinforcement learning."""
 
+import time
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -11,11 +13,10 @@ from ..config.baselines import prediction_of
 from ..config.presets import Preset
 from ..config.setup import Setup
 from ..control.datt import APART, DattNet
-from ..errors import ConfigError, MessageError
-from ..io.files import write_whole
+from ..errors import ConfigError
 from ..learn.datt import DattProblem, discount, reference_bank
-from ..learn.ppo import PpoSettings, ppo
-from ..transport import wire
+from ..learn.ppo import PpoSettings, PpoState, ppo
+from .kept_trees import keep_tree, kept_tree
 from .provenance import section_key
 from .reporter import Reporter
 from .run import Run
@@ -23,6 +24,10 @@ from .run import Run
 DATT_STEPS = 20_000_000  # the paper's
 DATT_PPO: dict[str, Any] = {"envs": 64, "steps": 256, "minibatches": 8, "epochs": 6, "learning_rate": 2e-3}
 DATT_TAG = 2**30 + 5  # folded into a seed: DATT shares no key with the policies
+PARTLY = ".partly"
+"""Ending of a file with the state of a training that was cut."""
+KEEP_EVERY = 30.0
+"""Time between two states of a training that are kept [s]."""
 
 
 def check_steps(steps: int) -> None:
@@ -63,7 +68,8 @@ def trained_datt(
     Args:
         preset: Vehicle, control period and declared lag.
         seeds: Seeds of networks, references and episodes.
-        run: Its ``trained`` keeps the networks; an interruption leaves out the seeds that are not complete.
+        run: Its ``trained`` keeps the networks, and the state of a training that is cut, which goes on from there; an
+            interruption leaves out the seeds that are not complete.
         reporter: Receives progress.
         steps: Steps of training.
     """
@@ -78,27 +84,44 @@ def trained_datt(
         key = random.fold_in(random.key(seed), DATT_TAG)
         k_net, k_learn = random.split(key)
         net: DattNet = eqx.filter_jit(DattNet.of)(key=k_net)
-        arrays, fixed = eqx.partition(net, eqx.is_array)
-        if path.is_file():
-            try:
-                nets[seed] = eqx.combine(wire.unpack(path.read_bytes(), arrays, kind="datt", source=str(path)), fixed)
-                continue
-            except MessageError as error:
-                reporter.say(f"{error}; trained again")
+        if (kept := kept_tree(path, net, kind="datt", reporter=reporter)) is not None:
+            nets[seed] = kept
+            continue
         low, high = setup.vehicle.command_min, setup.vehicle.command_max
         problem = DattProblem(jnp.asarray(reference_bank(seed, dt=preset.dt), low.c.dtype), tau, low, high, preset.dt)
         settings = PpoSettings(discount=discount(preset.dt), **DATT_PPO)
-        with run.interruptible(), reporter.progress(f"DATT, seed {seed}, {steps:,} steps") as advance:
-            for i, (after, told) in enumerate(ppo(problem, net, k_learn, settings, steps=steps)):
-                advance((i + 1) / settings.updates(steps), f"reward {told['reward']:.3f}")
-                net = after
-                if run.interrupted:
-                    break
-        if run.interrupted:
+        state = _trained(problem, PpoState.of(problem, net, k_learn, settings), settings, steps, path, run, reporter)
+        if state is None:
             break
-        write_whole(path, wire.pack(eqx.filter(net, eqx.is_array), kind="datt", about=about))
-        nets[seed] = net
+        keep_tree(path, state.net, kind="datt", about=about)
+        path.with_suffix(PARTLY).unlink(missing_ok=True)
+        nets[seed] = state.net
     return nets
+
+
+def _trained(
+    problem: DattProblem, state: PpoState, settings: PpoSettings, steps: int, path: Path, run: Run, reporter: Reporter
+) -> PpoState | None:
+    """Learn, from where an earlier run was cut; None if this one is, too. Its state is beside ``path`` then."""
+    partly, updates = path.with_suffix(PARTLY), settings.updates(steps)
+    title = f"DATT, seed {path.stem.rpartition('_seed')[2]}"
+    if (kept := kept_tree(partly, state, kind="ppo", reporter=reporter)) is not None:
+        state = kept
+        reporter.say(f"{title}: goes on after {int(state.made)} of {updates} updates")
+    with run.interruptible(), reporter.progress(f"{title}, {steps:,} steps") as advance:
+        written = time.monotonic()
+        for after, told in ppo(problem, state, settings, steps=steps):
+            state = after
+            advance(int(state.made) / updates, f"reward {told['reward']:.3f}")
+            if run.interrupted:
+                break
+            if time.monotonic() - written > KEEP_EVERY:
+                keep_tree(partly, state, kind="ppo")
+                written = time.monotonic()
+    if run.interrupted:
+        keep_tree(partly, state, kind="ppo")
+        return None
+    return state
 
 
 RIVALS = {"datt": trained_datt}

@@ -9,7 +9,7 @@ so that they are of the size of a reward whatever the discount.
 import functools
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -18,7 +18,8 @@ import optax
 from jax import lax, random
 from jaxtyping import Array, Float, Int, Key
 
-from .problem import Outcome, Problem
+from .advantages import Seen, advantages
+from .problem import Problem
 
 
 @runtime_checkable
@@ -72,42 +73,37 @@ class PpoState(eqx.Module):
     envs: Any
     """States of the environments."""
     key: Key[Array, ""]
+    made: Int[Array, ""]
+    """Updates so far."""
 
-
-class Seen(NamedTuple):
-    """Samples, with leading axes of steps and environments."""
-
-    o: Float[Array, "... o"]
-    action: Float[Array, "... a"]
-    log_prob: Float[Array, "..."]
-    value: Float[Array, "..."]
-    outcome: Outcome
-    """Its reward is scaled by 1 - gamma, and has what a truncated episode would have gone on to win."""
+    @classmethod
+    def of(cls, problem: Problem[Any], net: Any, key: Key[Array, ""], settings: PpoSettings) -> "PpoState":
+        """Return the state before the first update, of a network and a key, which is consumed."""
+        k_reset, k_learn = random.split(key)
+        envs = jax.jit(jax.vmap(problem.reset))(random.split(k_reset, settings.envs))
+        moments = _optimiser(settings, 1).init(eqx.filter(net, eqx.is_inexact_array))  # the same for any number
+        return cls(net, moments, envs, k_learn, jnp.array(0))
 
 
 def ppo(
-    problem: Problem[Any], net: Any, key: Key[Array, ""], settings: PpoSettings, *, steps: int
-) -> Iterator[tuple[Any, dict[str, float]]]:
+    problem: Problem[Any], state: PpoState, settings: PpoSettings, *, steps: int
+) -> Iterator[tuple[PpoState, dict[str, float]]]:
     """Learn.
 
     Args:
         problem: The environment.
-        net: Where learning begins: an :class:`ActorCritic`.
-        key: Consumed.
+        state: Where learning begins, or goes on; as if it had never been left, to the bit.
         settings: Sizes and rates.
-        steps: Steps of all environments together.
+        steps: Steps of all environments together, from the first update on.
 
     Yields:
-        After each update the network, and figures: mean reward of a step, loss, and the share of clipped samples.
+        After each update the state, and figures: mean reward of a step, loss, and the share of clipped samples.
     """
     updates = settings.updates(steps)
     optimiser = _optimiser(settings, updates)
-    k_reset, k_learn = random.split(key)
-    envs = jax.jit(jax.vmap(problem.reset))(random.split(k_reset, settings.envs))
-    state = PpoState(net, optimiser.init(eqx.filter(net, eqx.is_inexact_array)), envs, k_learn)
-    for _ in range(updates):
+    for _ in range(int(state.made), updates):
         state, figures = update(problem, state, optimiser, settings)
-        yield state.net, {name: float(value) for name, value in figures.items()}
+        yield state, {name: float(value) for name, value in figures.items()}
 
 
 @functools.lru_cache(maxsize=32)
@@ -144,31 +140,8 @@ def update(
     keys = random.split(k_epochs, settings.epochs)
     (arrays, moments), figures = lax.scan(epoch, (arrays, state.optimiser), keys)
     mean = {name: jnp.mean(values) for name, values in figures.items()}
-    after = PpoState(eqx.combine(arrays, fixed), moments, envs, k_next)
+    after = PpoState(eqx.combine(arrays, fixed), moments, envs, k_next, state.made + 1)
     return after, {"reward": reward, **mean}
-
-
-def advantages(seen: Seen, last: Float[Array, " envs"], discount: float, trace: float) -> Float[Array, "steps envs"]:
-    """Return the generalised advantage estimates (Schulman et al. 2016, Eq. 16).
-
-    Args:
-        seen: Samples; an episode that ends in one does not go on in the next.
-        last: Value of the states after the last step.
-        discount: gamma.
-        trace: lambda.
-    """
-    over = seen.outcome.terminated | seen.outcome.truncated
-
-    def back(carry: Any, row: Any) -> tuple[Any, Array]:
-        later, value_later = carry
-        reward, over, value = row
-        goes_on = jnp.where(over, 0.0, discount)
-        advantage = reward + goes_on * value_later - value + goes_on * trace * later
-        return (advantage, value), advantage
-
-    rows = (seen.outcome.reward, over, seen.value)
-    found: Array = lax.scan(back, (jnp.zeros_like(last), last), rows, reverse=True)[1]
-    return found
 
 
 def log_prob(action: Float[Array, " a"], mean: Float[Array, " a"], log_std: Float[Array, " a"]) -> Float[Array, ""]:
