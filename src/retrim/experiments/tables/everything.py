@@ -40,8 +40,7 @@ PLAN: tuple[tuple[Callable[..., None], str, Options], ...] = (
     (raptor, "beside RAPTOR", {}),
     (track, "Table II", {**SEEDS, "presets": ("track/retrim",), "methods": WITH_DATT, "seconds": 24.0}),
 )
-"""Table, what of the paper it is, and its options. What is timed comes first, when the machine is least busy, and
-what takes longest, last."""
+"""Table, what of the paper it is, and its options. What is timed comes first, when the machine is least busy."""
 QUICK_LEAVES_OUT = (phase, plants)
 AT_LEAST = "at least "
 """Where an earlier run was killed, whose time nobody has noted; one that was interrupted is counted."""

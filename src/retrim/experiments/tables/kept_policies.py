@@ -54,11 +54,12 @@ def trained_policies(preset: Preset, seeds: Sequence[int], run: Run, reporter: R
     if missing and run.executor is not None and not run.interrupted:
         trained_elsewhere(preset, missing, run.executor, reporter=reporter, stop=run.stop, landed=landed)
         missing = []
+    setup = Setup.of(preset)  # one: its programs are shared by the seeds
     for seed in missing:
         if run.interrupted:
             break
         reporter.say(f"preset {preset.name}, seed {seed}")
-        policy, _ = train(Setup.of(preset), seed, reporter=reporter, stop=run.stop)
+        policy, _ = train(setup, seed, reporter=reporter, stop=run.stop)
         if not run.interrupted:
             landed(seed, policy)
     return {seed: found[seed] for seed in paths if seed in found}
