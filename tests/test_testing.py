@@ -42,6 +42,8 @@ class Wrapped(Plant):
         measurement, accepted = self._inner.step(u)
         if self._fault == "time":
             measurement = measurement._replace(t=2 * measurement.t)
+        if self._fault == "degrees":
+            measurement = measurement._replace(omega=jnp.rad2deg(measurement.omega))
         return measurement, accepted
 
     def stop(self):
@@ -56,6 +58,7 @@ class Wrapped(Plant):
         ("nan", "not finite is refused"),
         ("thrust", "more thrust accelerates"),
         ("time", "a tick takes dt"),
+        ("degrees", "they tell a turn about x"),
         ("stop", "a stopped plant refuses"),
     ],
 )

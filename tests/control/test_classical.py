@@ -20,6 +20,7 @@ from retrim.tasks.shapes import figure8
 
 DT, TAU = 0.02, 0.033
 PREDICTION = Prediction(jnp.array(TAU), DT, 1)
+LIMITS = small().command_min, small().command_max
 
 
 def gains(integral=0.0):
@@ -28,8 +29,8 @@ def gains(integral=0.0):
 
 def made(kind, task):
     if kind == "indi":
-        return Incremental(task, gains(), PREDICTION, jnp.array(0.08))
-    return Geometric(task, gains(12.0 if kind == "geometric-i" else 0.0), PREDICTION, jnp.array(6.0))
+        return Incremental(task, gains(), PREDICTION, jnp.array(0.08), *LIMITS)
+    return Geometric(task, gains(12.0 if kind == "geometric-i" else 0.0), PREDICTION, jnp.array(6.0), *LIMITS)
 
 
 @eqx.filter_jit
@@ -88,6 +89,19 @@ def test_indi_believes_the_accelerometer():
     pulled, _ = plain.sensing(jnp.zeros(3), jnp.array([0.0, 0.0, -1.0]))(memory, jnp.array(DT), x)
     share = 1.0 - np.exp(-DT / 0.08)  # of 1 m/s^2; and the vehicle will have fallen a little until it is answered
     assert share < float(pulled.c - level.c) < 1.2 * share
+
+
+@pytest.mark.parametrize("kind", ["geometric", "indi"])
+def test_it_asks_for_nothing_that_the_vehicle_refuses(kind):
+    """Far away and upside down: both limits of the thrust, and those of the rates."""
+    controller, low, high = made(kind, hover_task()), *(limit.vector() for limit in LIMITS)
+    told = set()
+    for R, z in ((jnp.eye(3), -9.0), (so3.exp(jnp.array([2.8, 0.4, 0.0])), 9.0)):
+        x = State(jnp.array([6.0, -6.0, z]), R, jnp.zeros(3))
+        u = controller(controller.init(x), jnp.array(0.0), x)[0].vector()
+        assert bool(jnp.all((low <= u) & (u <= high)))
+        told |= {("low", k) for k in np.flatnonzero(u == low)} | {("high", k) for k in np.flatnonzero(u == high)}
+    assert {0, 1} <= {k for _, k in told}
 
 
 @pytest.mark.parametrize("kind", ["geometric", "geometric-i", "indi"])

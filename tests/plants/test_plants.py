@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
@@ -111,6 +112,38 @@ def test_rates_turn_it_about_its_own_axes(plant, axis):
     turned = so3.log(after(plant, 20, omega=jnp.zeros(3).at[axis].set(1.0)).R)
     assert 0.25 < float(turned[axis]) < 0.4
     assert float(jnp.linalg.norm(turned)) == pytest.approx(float(turned[axis]), rel=0.05)
+
+
+def test_it_measures_how_fast_it_turns_and_how_it_is_accelerated(plant):
+    """Rates at the end of a tick, the mean acceleration over it: its attitudes and velocities say so, too."""
+    passed = [plant.reset(START)]
+    for k in range(16):
+        rates = jnp.array([1.5, -1.0, 0.5]) * (1.0 if k < 8 else -1.0)
+        passed.append(plant.step(Command(jnp.array(11.0), rates))[0])
+    for before, now in pairwise(passed):
+        turned = so3.log(before.R.T @ now.R) / plant.dt
+        ends = np.stack([before.omega, now.omega])
+        slack = 0.15 + 0.25 * np.ptp(ends, axis=0)  # it may have turned faster within the tick
+        assert np.all(turned > ends.min(axis=0) - slack)
+        assert np.all(turned < ends.max(axis=0) + slack)
+        np.testing.assert_allclose(now.a, (now.v - before.v) / plant.dt, atol=0.02)
+    assert float(jnp.linalg.norm(passed[8].omega)) > 1.0
+    assert float(passed[-1].omega @ passed[8].omega) < 0.0
+
+
+def test_what_is_beyond_its_limits_does_what_is_accepted(plant):
+    low, high = small().command_min, small().command_max
+    for asked in (Command(jnp.array(500.0), 1e3 * high.omega), Command(jnp.array(-5.0), 1e3 * low.omega)):
+        plant.reset(START)
+        plant.step(asked)
+        _, accepted = plant.step(asked)
+        assert 0.0 <= float(accepted.c) < 150.0
+        beyond = plant.step(asked)[0]
+        plant.reset(START)
+        for _ in range(3):
+            told, again = plant.step(accepted)
+            assert again is accepted
+        np.testing.assert_array_equal(beyond.x.vector(), told.x.vector())
 
 
 def test_thrust_is_per_mass(plant):

@@ -76,11 +76,27 @@ def _gains(s: Settings) -> Gains:
 
 
 def _geometric(setup: "Setup", s: Settings, key: Key[Array, ""]) -> Geometric:
-    return Geometric(setup.flown, _gains(s), prediction_of(setup), jnp.array(INTEGRAL_LIMIT))
+    vehicle = setup.vehicle
+    return Geometric(
+        setup.flown,
+        _gains(s),
+        prediction_of(setup),
+        jnp.array(INTEGRAL_LIMIT),
+        vehicle.command_min,
+        vehicle.command_max,
+    )
 
 
 def _indi(setup: "Setup", s: Settings, key: Key[Array, ""]) -> Incremental:
-    return Incremental(setup.flown, _gains(s), prediction_of(setup), jnp.array(s["filter"]))
+    vehicle = setup.vehicle
+    return Incremental(
+        setup.flown,
+        _gains(s),
+        prediction_of(setup),
+        jnp.array(s["filter"]),
+        vehicle.command_min,
+        vehicle.command_max,
+    )
 
 
 def _mppi(setup: "Setup", s: Settings, key: Key[Array, ""]) -> Mppi:

@@ -90,7 +90,7 @@ def datt_command(action: Float[Array, "4"], low: Command, high: Command) -> Comm
     """Return the command of an action, within the limits; zero is hover."""
     hover = jnp.array([STANDARD_GRAVITY, 0.0, 0.0, 0.0], dtype=action.dtype)
     wanted = hover + jnp.array(SCALE, dtype=action.dtype) * action
-    return Command.of(jnp.clip(wanted, low.vector().astype(action.dtype), high.vector().astype(action.dtype)))
+    return Command.of(wanted).within(low, high)
 
 
 class DattState(eqx.Module):

@@ -59,6 +59,10 @@ class Geometric(AbstractController[GeometricState]):
     prediction: Prediction
     limit: Float[Array, ""]
     """Of what integral action asks for, per axis [m/s^2]."""
+    low: Command
+    """Smallest command that the vehicle accepts."""
+    high: Command
+    """Largest command that it accepts."""
 
     def aged(self, age: float | Float[Array, ""]) -> "Geometric":
         """Return the same for measurements that are ``age`` old [s]."""
@@ -76,7 +80,7 @@ class Geometric(AbstractController[GeometricState]):
         bound = self.limit / jnp.maximum(gain, 1e-6)
         integral = jnp.clip(memory.integral + dt * (wanted.p - x.p), -bound, bound)
         acceleration = self.gains.acceleration(x, wanted, integral)
-        u = command_for(x, thrust_of(acceleration), wanted, self.gains.turning())
+        u = command_for(x, thrust_of(acceleration), wanted, self.gains.turning()).within(self.low, self.high)
         return u, GeometricState(self.prediction.issued(memory.underway, u), integral)
 
     def accepted(self, memory: GeometricState, u: Command) -> GeometricState:

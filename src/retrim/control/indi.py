@@ -42,6 +42,10 @@ class Incremental(AbstractController[IncrementalState]):
     prediction: Prediction
     tau: Float[Array, ""]
     """Time constant of the filter of acceleration and thrust [s]."""
+    low: Command
+    """Smallest command that the vehicle accepts."""
+    high: Command
+    """Largest command that it accepts."""
     omega: Float[Array, "3"] | None = None
     """Measured body rates [rad/s]; None: those that the commands give."""
     a: Float[Array, "3"] | None = None
@@ -73,7 +77,8 @@ class Incremental(AbstractController[IncrementalState]):
         soon, _ = self.prediction(memory.underway, x, -excess, self.omega)
         wanted = self.task.wanted(t + self.prediction.delay_ticks * dt)
         acceleration = self.gains.acceleration(soon, wanted, jnp.zeros_like(x.p))
-        u = command_for(soon, thrust_of(acceleration) + excess, wanted, self.gains.turning())
+        asked = command_for(soon, thrust_of(acceleration) + excess, wanted, self.gains.turning())
+        u = asked.within(self.low, self.high)
         return u, IncrementalState(self.prediction.issued(memory.underway, u), x, excess, t.astype(a.dtype))
 
     def accepted(self, memory: IncrementalState, u: Command) -> IncrementalState:

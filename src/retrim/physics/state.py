@@ -73,6 +73,13 @@ class Command(eqx.Module):
         """Return the command of a vector; the inverse of :meth:`vector`."""
         return cls(vector[0], vector[1:])
 
+    def within(self, low: "Command", high: "Command") -> "Command":
+        """Return the command clipped to limits, entry by entry, in its own precision."""
+        return Command(
+            jnp.clip(self.c, low.c.astype(self.c.dtype), high.c.astype(self.c.dtype)),
+            jnp.clip(self.omega, low.omega.astype(self.omega.dtype), high.omega.astype(self.omega.dtype)),
+        )
+
 
 def where(condition: Array, yes: T, no: T) -> T:
     """Apply ``jnp.where`` leaf by leaf, for a scalar condition."""

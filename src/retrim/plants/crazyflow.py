@@ -13,7 +13,7 @@ import numpy as np
 from ..physics.disturbance import Disturbance
 from ..physics.effects import ExternalEffects
 from ..physics.state import STANDARD_GRAVITY
-from .external import ExternalPlant, Pose, whole_steps
+from .external import ExternalPlant, Pose, thrust_limits, whole_steps
 from .extras import import_extra
 
 DRONE = "cf21B_500"
@@ -42,11 +42,11 @@ class CrazyflowPlant(ExternalPlant):
     """
 
     def __init__(self, disturbance: Disturbance, *, dt: float = 0.02) -> None:
-        super().__init__(disturbance, dt)
         steps = whole_steps(dt, 1.0 / FREQUENCY)
         with _building, _its_jax():
-            self._hovering, self._step = _simulator(steps)
+            self._hovering, self._step, thrusts = _simulator(steps)
         self._mass = float(self._hovering.params.mass[0])
+        super().__init__(disturbance, dt, limits=thrust_limits(*(4.0 * thrusts / self._mass)))
         self._rotation = import_extra("scipy.spatial.transform", "crazyflow").Rotation
 
     def _launch(self, x: Pose) -> None:
@@ -62,8 +62,9 @@ class CrazyflowPlant(ExternalPlant):
         with _its_jax():
             self._data = self._step(self._data, command.astype(np.float32), first)
         states = self._data.states
-        p, q, v = (np.asarray(a, dtype=np.float64)[0, 0] for a in (states.pos, states.quat, states.vel))
-        return Pose(p, self._rotation.from_quat(q).as_matrix(), v)
+        moving = (states.pos, states.quat, states.vel, states.ang_vel)
+        p, q, v, omega = (np.asarray(a, dtype=np.float64)[0, 0] for a in moving)
+        return Pose(p, self._rotation.from_quat(q).as_matrix(), v, omega)
 
 
 def _device() -> jax.Device:
@@ -72,8 +73,11 @@ def _device() -> jax.Device:
 
 
 @functools.cache
-def _simulator(steps: int) -> tuple[Any, Callable[[Any, np.ndarray, ExternalEffects], Any]]:
-    """Hovering Crazyflie, and the compiled function that flies it ``steps`` steps; the same for all plants."""
+def _simulator(steps: int) -> tuple[Any, Callable[[Any, np.ndarray, ExternalEffects], Any], np.ndarray]:
+    """Hovering Crazyflie, the compiled function that flies it ``steps`` steps, and a rotor's least and most thrust [N].
+
+    They are the same for all plants.
+    """
     sim = import_extra("crazyflow.sim.sim", "crazyflow")
     parts, functional = (
         import_extra("crazyflow.sim.data", "crazyflow"),
@@ -126,4 +130,5 @@ def _simulator(steps: int) -> tuple[Any, Callable[[Any, np.ndarray, ExternalEffe
         after, _ = jax.lax.scan(step, data.replace(params=loaded), length=steps)
         return after.replace(params=data.params)
 
-    return data, fly
+    thrusts = sim.load_dynamics_params(dynamics, drone)
+    return data, fly, np.array([thrusts["thrust_min"], thrusts["thrust_max"]], dtype=np.float64)

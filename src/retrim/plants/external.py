@@ -11,7 +11,7 @@ from ..errors import PlantError
 from ..physics.disturbance import Disturbance, effects_at
 from ..physics.effects import ExternalEffects
 from ..physics.state import STANDARD_GRAVITY, Command, State
-from .plant import Measurement, Plant, check_command
+from .plant import Measurement, Plant, as_numpy, check_command, limited
 
 HOVER = np.array([STANDARD_GRAVITY, 0.0, 0.0, 0.0])
 
@@ -25,20 +25,26 @@ class Pose(NamedTuple):
     """Body to world."""
     v: np.ndarray
     """World [m/s]."""
+    omega: np.ndarray
+    """Body rates [rad/s]."""
 
 
 class ExternalPlant(Plant, abc.ABC):
     """A simulator that steps on its own, one command late: the command of a tick acts in the next one.
 
     A simulator gives :meth:`_launch` and :meth:`_advance`. The disturbance is evaluated at ``instants`` evenly spaced
-    times of each tick, in the state at its beginning.
+    times of each tick, in the state at its beginning. Commands beyond the ``limits`` of [c, omega] are clipped.
     """
 
-    def __init__(self, disturbance: Disturbance, dt: float, *, instants: int = 1) -> None:
+    def __init__(
+        self, disturbance: Disturbance, dt: float, *, limits: tuple[np.ndarray, np.ndarray], instants: int = 1
+    ) -> None:
         self.dt = dt
+        self._limits = limits
         self._disturbance = disturbance
         self._instants = dt * np.arange(instants) / instants
         self._x: State | None = None
+        self._v = np.zeros(3)
         self._held = HOVER
         self._ticks = 0
 
@@ -56,9 +62,11 @@ class ExternalPlant(Plant, abc.ABC):
     def reset(self, x0: State | None) -> Measurement:
         """Hover at ``x0``; without one, 1 m above the ground."""
         start = State.at(jnp.array([0.0, 0.0, 1.0])) if x0 is None else x0
-        self._launch(Pose(*(np.asarray(a, dtype=np.float64) for a in (start.p, start.R, start.v))))
-        self._x, self._held, self._ticks = start, HOVER, 0
-        return Measurement(0.0, start, truth=start)
+        at_rest = jnp.zeros_like(start.p)
+        pose = Pose(*(np.asarray(a, dtype=np.float64) for a in (start.p, start.R, start.v, at_rest)))
+        self._launch(pose)
+        self._x, self._v, self._held, self._ticks = start, pose.v, HOVER, 0
+        return Measurement(0.0, start, at_rest, at_rest, truth=start)
 
     def step(self, u: Command) -> tuple[Measurement, Command]:
         """Advance the simulator by one tick."""
@@ -70,10 +78,13 @@ class ExternalPlant(Plant, abc.ABC):
         effects = jax.tree.map(np.asarray, effects_at(times, self._x, self._disturbance))
         after = self._advance(self._held, effects)
         dtype = self._x.p.dtype
-        self._x = State(*(jnp.asarray(a, dtype=dtype) for a in after))
-        self._held = wanted.astype(np.float64)
+        acceleration = (after.v - self._v) / self.dt  # of its own precision: a difference of two loses half of another
+        *state, omega, a = (jnp.asarray(value, dtype=dtype) for value in (*after, acceleration))
+        self._x, self._v = State(*state), after.v
+        accepted = limited(u, wanted, *self._limits)
+        self._held = as_numpy(accepted).astype(np.float64)
         self._ticks += 1
-        return Measurement(self._ticks * self.dt, self._x, truth=self._x), u
+        return Measurement(self._ticks * self.dt, self._x, omega, a, truth=self._x), accepted
 
     def disturb(self, disturbance: Disturbance) -> None:
         """Fly on under another disturbance; one of the same kind with other numbers compiles nothing."""
@@ -82,6 +93,12 @@ class ExternalPlant(Plant, abc.ABC):
     def stop(self) -> None:
         """Forget the flight."""
         self._x = None
+
+
+def thrust_limits(least: float, most: float) -> tuple[np.ndarray, np.ndarray]:
+    """Limits of [c, omega] of a vehicle that is known by its thrust alone, mass-normalised [m/s^2]."""
+    free = np.full(3, np.inf)
+    return np.append(least, -free), np.append(most, free)
 
 
 def whole_steps(dt: float, step: float) -> int:

@@ -12,6 +12,7 @@ from ..physics.substep import SIGNS
 from ..physics.vehicle import Vehicle
 from .external import ExternalPlant, Pose, whole_steps
 from .extras import import_extra
+from .plant import as_numpy
 
 STEP = 2e-3  # [s]
 RATE_GAIN = 20.0  # [1/s]
@@ -58,11 +59,11 @@ class MujocoPlant(ExternalPlant):
     """
 
     def __init__(self, vehicle: Vehicle, disturbance: Disturbance, *, dt: float = 0.02) -> None:
-        super().__init__(disturbance, dt, instants=whole_steps(dt, STEP))
         low, high = vehicle.command_min, vehicle.command_max
+        limits = as_numpy(low).astype(np.float64), as_numpy(high).astype(np.float64)
+        super().__init__(disturbance, dt, limits=limits, instants=whole_steps(dt, STEP))
         self._mass = float(vehicle.mass)
         self._inertia = np.asarray(vehicle.inertia, dtype=np.float64)
-        self._rates_max = np.asarray(vehicle.omega_max, dtype=np.float64)
         arm = np.asarray(vehicle.arm, dtype=np.float64)
         self._levers = np.array([arm[1], arm[0], float(vehicle.torque_ratio)])
         # As much as two rotors at full thrust and two at rest give:
@@ -94,18 +95,17 @@ class MujocoPlant(ExternalPlant):
         self._carry(load)
         model.actuator_gainprm[0, 0] = gain.mean()
         uneven = self._levers * (np.array(SIGNS) @ gain) / 4.0  # torque per thrust [m]; zero for equal gains
-        rates = np.clip(u[1:], -self._rates_max, self._rates_max)
         data.ctrl[0] = u[0] * self._mass
         for push, wind in zip(effects.push, effects.wind, strict=True):
             omega = data.qvel[3:]  # body frame
-            torque = self._inertia * RATE_GAIN * (rates - omega) + np.cross(omega, self._inertia * omega)
+            torque = self._inertia * RATE_GAIN * (u[1:] - omega) + np.cross(omega, self._inertia * omega)
             data.ctrl[1:] = np.clip(torque, -self._torque_max, self._torque_max) + uneven * data.act[0]
             data.xfrc_applied[1, :3] = (self._mass + load[0]) * push
             model.opt.wind[:] = wind
             self._mujoco.mj_step(model, data)
         R = np.empty(9)
         self._mujoco.mju_quat2Mat(R, data.qpos[3:])
-        return Pose(data.qpos[:3].copy(), R.reshape(3, 3), data.qvel[:3].copy())
+        return Pose(data.qpos[:3].copy(), R.reshape(3, 3), data.qvel[:3].copy(), data.qvel[3:].copy())
 
     def _carry(self, load: np.ndarray) -> None:
         """Let the body weigh ``load`` = [mass [kg], inertia [kg m^2]] more than the vehicle."""

@@ -8,7 +8,7 @@ from ..errors import PlantError
 from ..physics.disturbance import Disturbance
 from ..physics.effects import ExternalEffects
 from ..physics.state import STANDARD_GRAVITY
-from .external import ExternalPlant, Pose
+from .external import ExternalPlant, Pose, thrust_limits
 from .extras import import_extra
 
 RATE_GAIN = 20.0  # [1/s]; rotorpy's own default, 1 1/s, lets the rates lag by a second
@@ -23,8 +23,9 @@ class RotorpyPlant(ExternalPlant):
     """
 
     def __init__(self, disturbance: Disturbance, *, dt: float = 0.02) -> None:
-        super().__init__(disturbance, dt)
         params = import_extra("rotorpy.vehicles.hummingbird_params", "rotorpy").quad_params
+        speeds = np.array([params["rotor_speed_min"], params["rotor_speed_max"]])
+        super().__init__(disturbance, dt, limits=thrust_limits(*(4.0 * params["k_eta"] * speeds**2 / params["mass"])))
         multirotor = import_extra("rotorpy.vehicles.multirotor", "rotorpy").Multirotor
         self._rotation = import_extra("scipy.spatial.transform", "rotorpy").Rotation
         self._quad = multirotor({**params, "k_w": RATE_GAIN}, control_abstraction="cmd_ctbr", aero=True)
@@ -43,4 +44,5 @@ class RotorpyPlant(ExternalPlant):
         command = {"cmd_thrust": u[0] * quad.mass, "cmd_w": u[1:]}
         for _ in range(STEPS):
             self._state = quad.step(self._state, command, self.dt / STEPS)
-        return Pose(self._state["x"], self._rotation.from_quat(self._state["q"]).as_matrix(), self._state["v"])
+        attitude = self._rotation.from_quat(self._state["q"]).as_matrix()
+        return Pose(self._state["x"], attitude, self._state["v"], self._state["w"])

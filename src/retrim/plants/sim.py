@@ -135,10 +135,7 @@ class Simulation(eqx.Module):
 
     def within_limits(self, u: Command) -> Command:
         """Return ``u`` as the vehicle accepts it."""
-        if self.model.command_limits is None:
-            return u
-        low, high = self.model.command_limits
-        return jax.tree.map(jnp.clip, u, low, high)  # type: ignore[no-any-return]
+        return u if self.model.command_limits is None else u.within(*self.model.command_limits)
 
 
 def _calm(t: Float[Array, ""], x: State) -> ExternalEffects:

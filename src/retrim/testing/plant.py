@@ -53,11 +53,15 @@ def check_plant(make: Callable[[], Plant], *, x0: State | None = None, settle_s:
     higher = _after(plant, start, Command(jnp.array(STANDARD_GRAVITY + 3.0), jnp.zeros(3)), ticks)
     require(float(higher.v[2] - hovered.v[2]) > 0.3 * 3.0 * settle_s, "more thrust accelerates it upwards, per mass")
     for axis, name in enumerate("xyz"):
-        turned = _after(plant, start, Command(jnp.array(STANDARD_GRAVITY), jnp.zeros(3).at[axis].set(1.0)), ticks)
+        turning = Command(jnp.array(STANDARD_GRAVITY), jnp.zeros(3).at[axis].set(1.0))
+        turned = _after(plant, start, turning, ticks)
         angle = so3.log(start.R.T @ turned.R)
         require(0.3 * settle_s < float(angle[axis]) < 1.2 * settle_s, f"a body rate about {name} turns it about {name}")
         others = float(jnp.linalg.norm(jnp.delete(angle, axis, assume_unique_indices=True)))
         require(others < 0.3 * float(angle[axis]), f"a body rate about {name} turns it about no other axis")
+        omega = plant.step(turning)[0].omega
+        if omega is not None:
+            close(omega, turning.omega, 0.5, f"where body rates are measured, they tell a turn about {name}")
 
     plant.stop()
     plant.stop()
