@@ -101,7 +101,8 @@ def test_it_asks_for_nothing_that_the_vehicle_refuses(kind):
         u = controller(controller.init(x), jnp.array(0.0), x)[0].vector()
         assert bool(jnp.all((low <= u) & (u <= high)))
         told |= {("low", k) for k in np.flatnonzero(u == low)} | {("high", k) for k in np.flatnonzero(u == high)}
-    assert {0, 1} <= {k for _, k in told}
+    assert {("low", 0), ("high", 0)} <= told
+    assert told & {("low", 1), ("high", 1)}
 
 
 @pytest.mark.parametrize("kind", ["geometric", "geometric-i", "indi"])

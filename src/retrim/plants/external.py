@@ -78,7 +78,7 @@ class ExternalPlant(Plant, abc.ABC):
         effects = jax.tree.map(np.asarray, effects_at(times, self._x, self._disturbance))
         after = self._advance(self._held, effects)
         dtype = self._x.p.dtype
-        acceleration = (after.v - self._v) / self.dt  # of its own precision: a difference of two loses half of another
+        acceleration = (after.v - self._v) / self.dt  # in double precision: single leaves few digits of a difference
         *state, omega, a = (jnp.asarray(value, dtype=dtype) for value in (*after, acceleration))
         self._x, self._v = State(*state), after.v
         accepted = limited(u, wanted, *self._limits)
