@@ -24,9 +24,17 @@ class Verdict(eqx.Module):
     """Cost of the candidate: minus the mean reward of its roll-outs."""
     incumbent: Float[Array, ""]
     """Cost of the policy that flies."""
+    trusted: Bool[Array, ""] = eqx.field(default_factory=lambda: jnp.array(True))
+    """Enough measurements of the window are consistent with each other."""
+
+    def provided(self, trusted: Bool[Array, ""]) -> "Verdict":
+        """Return the verdict that admits the candidate only if the measurements are trusted, too."""
+        return Verdict(self.admitted & trusted, self.finite, self.candidate, self.incumbent, trusted)
 
     def reason(self) -> str:
         """Return the grounds in words, for the log."""
+        if not self.trusted:
+            return "most measurements of the window contradict each other"
         if not self.finite:
             return "a weight is not finite"
         costs = f"{float(self.candidate):.4f} against {float(self.incumbent):.4f}"

@@ -1,12 +1,13 @@
 """The online learner: pure functions of a window of flight, without state of its own and without a clock."""
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import random
-from jaxtyping import Array, Bool, Float, Key
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..control.lora import LoraPolicy
 from ..control.policy import Policy
@@ -14,6 +15,7 @@ from ..learn.bptt import PolicyState, bptt
 from ..learn.env import Env
 from ..learn.residuals.model import FittedResidual, ResidualModel
 from ..learn.residuals.targets import residual_targets
+from ..learn.screening import screen
 from ..learn.window import Window
 from ..physics.state import where
 from .gate import Verdict, all_finite, judge
@@ -40,6 +42,8 @@ class FitReport(eqx.Module):
     """Root mean square of the error over the window [m/s^2]."""
     accepted: Bool[Array, ""]
     """False if the fit is not finite or no tick of the window could be used; the old state is then kept."""
+    contradictions: Int[Array, "5"]
+    """Steps of the window that were left out, by reason; see :class:`~retrim.learn.screening.Screening`."""
 
 
 class OnlineLearner(eqx.Module):
@@ -82,6 +86,8 @@ class OnlineLearner(eqx.Module):
     def fit_residual(self, state: Any, window: Window) -> tuple[Any, FitReport]:
         """Fit the residual model to a window, from where the last fit ended.
 
+        Measurements that contradict each other are left out, and with more than half of them nothing is learned.
+
         Args:
             state: State of the residual model.
             window: Ticks of flight.
@@ -89,10 +95,11 @@ class OnlineLearner(eqx.Module):
         Returns:
             The new state, or ``state`` if the fit is not finite or had no data, and a report.
         """
-        rows = residual_targets(window, self.env.dynamics, delay_ticks=self.plant_delay_ticks)
+        screening, delay = screen(window, self.env.dynamics.dt), self.plant_delay_ticks
+        rows = residual_targets(window, self.env.dynamics, delay_ticks=delay, consistent=screening.steps)
         fitted, rms = self.residual_model.fit(state, rows)
-        accepted = all_finite(fitted) & jnp.any(rows.valid)
-        return where(accepted, fitted, state), FitReport(rms, accepted)
+        accepted = all_finite(fitted) & jnp.any(rows.valid) & screening.trusted
+        return where(accepted, fitted, state), FitReport(rms, accepted, screening.counts)
 
     @eqx.filter_jit
     def update_policy(
@@ -106,7 +113,8 @@ class OnlineLearner(eqx.Module):
         """Re-train the policy by back-propagation in the corrected model, and judge the result.
 
         Gradients flow through the analytical model only. The gate flies eight starts that the update did not train
-        on: four states of the window, four random starts of the task.
+        on: four states of the window, four random starts of the task. No start is a measurement that contradicts its
+        neighbours, and the gate refuses every policy while more than half of the measurements do.
 
         Args:
             state: Policy to start from.
@@ -118,6 +126,9 @@ class OnlineLearner(eqx.Module):
         Returns:
             The trained policy, and the gate's verdict on it.
         """
+        screening = screen(window, self.env.dynamics.dt)
+        usable = jnp.where(jnp.any(screening.samples), screening.samples, window.valid)
+        window = dataclasses.replace(window, valid=usable)
         corrected = self.view(self.env, FittedResidual(self.residual_model, residual))
         k_train, k_gate, k_window = random.split(key, 3)
         x0 = self.starts(self.env.task, window, k_train, self.num_updates, self.num_envs)
@@ -131,7 +142,8 @@ class OnlineLearner(eqx.Module):
             drawn(window, k_window, (HELD_OUT // 2,)),
         )
         incumbent = state.policy if flown is None else flown
-        return trained, judge(trained.policy.merged(), incumbent.merged(), corrected, held_out)
+        verdict = judge(trained.policy.merged(), incumbent.merged(), corrected, held_out)
+        return trained, verdict.provided(screening.trusted)
 
 
 @eqx.filter_jit

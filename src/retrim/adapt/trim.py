@@ -48,7 +48,8 @@ class RestTrim(AbstractTrim):
 
     def __call__(self, policy: Policy | LoraPolicy, env: Env, window: Window) -> Policy | LoraPolicy:
         """Return the shifted policy."""
-        home, R = env.task.home(), window.x.R[-1]
+        home, newest = env.task.home(), jnp.max(jnp.where(window.valid, jnp.arange(window.valid.shape[0]), 0))
+        R = window.x.R[newest]
         hover = Command.hover(home.dtype)
         frame = env.frame(State.at(home), hover)
         if frame is not None:

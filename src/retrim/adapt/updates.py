@@ -7,11 +7,14 @@ from typing import Any, Literal, get_args
 
 from ..errors import MessageError
 from ..learn.bptt import PolicyState
+from ..learn.screening import REASONS, describe_counts
 from ..transport import wire
 from .learner import LearnerState
 
 Layer = Literal["residual", "policy"]
 """The two layers of learning."""
+Counts = tuple[int, ...]
+NOTHING: Counts = (0,) * len(REASONS)
 
 
 @dataclass(frozen=True)
@@ -24,10 +27,13 @@ class ResidualUpdate:
     """Root mean square of the fit's error [m/s^2]."""
     state: Any
     """New state of the residual model."""
+    excluded: Counts = NOTHING
+    """Numbers of steps that were excluded from the fit, by reason, see :class:`~retrim.learn.screening.Screening`."""
 
     def note(self) -> str:
         """Return one line for the log."""
-        return f"rms error {self.rms_error:.3f} m/s^2"
+        fit = f"rms error {self.rms_error:.3f} m/s^2"
+        return f"{fit}; measurements excluded: {described}" if (described := describe_counts(self.excluded)) else fit
 
 
 @dataclass(frozen=True)
@@ -117,11 +123,18 @@ def _checked(plain: Any, cls: type) -> dict[str, Any]:
     wanted = {f.name: f.type for f in fields(cls) if f.name != "state"}
     if not isinstance(plain, dict) or plain.keys() != wanted.keys():
         raise TypeError(f"expected {', '.join(wanted)}")
-    for name, value in plain.items():
-        if wanted[name] is float:
-            # A policy may replace one whose cost was not finite.
-            if type(value) not in (int, float) or not (math.isfinite(value) or name == "incumbent_cost"):
-                raise ValueError(f"{name} = {value!r} is no finite number")
-        elif not isinstance(value, str) or (wanted[name] is Layer and value not in get_args(Layer)):
-            raise ValueError(f"{name} = {value!r}")
-    return plain
+    return {name: _field(name, value, wanted[name]) for name, value in plain.items()}
+
+
+def _field(name: str, value: Any, wanted: Any) -> Any:
+    if wanted is float:
+        # A policy may replace one whose cost was not finite.
+        if type(value) not in (int, float) or not (math.isfinite(value) or name == "incumbent_cost"):
+            raise ValueError(f"{name} = {value!r} is no finite number")
+    elif wanted is Counts:
+        if type(value) is not list or len(value) != len(REASONS) or any(type(n) is not int or n < 0 for n in value):
+            raise ValueError(f"{name} must be {len(REASONS)} whole numbers of at least 0")
+        return tuple(value)
+    elif not isinstance(value, str) or (wanted is Layer and value not in get_args(Layer)):
+        raise ValueError(f"{name} = {value!r}")
+    return value

@@ -7,12 +7,14 @@ the way (a new flight, a lost message) never becomes the base of the next one.
 from typing import Any, Protocol, runtime_checkable
 
 import jax
+import numpy as np
 from jax import random
 from jaxtyping import Array, Key
 
 from ..control.lora import LoraPolicy
 from ..control.policy import Policy
 from ..learn.bptt import PolicyState
+from ..learn.screening import describe_counts
 from ..learn.window import Window
 from .gate import Verdict
 from .learner import FitReport, LearnerState, OnlineLearner
@@ -36,10 +38,14 @@ class Worker(Protocol):
 
 def residual_update(computed_from: float, state: Any, report: FitReport) -> ResidualUpdate | Rejection:
     """Return the message of a fit that has ended."""
+    excluded = describe_counts(report.contradictions)
     if not report.accepted:
         reason = "the residual's fit is not finite, or no tick of the window can be used"
-        return Rejection(computed_from, "residual", reason)
-    return ResidualUpdate(computed_from, float(report.rms_error), state)
+        return Rejection(
+            computed_from, "residual", f"{reason} (measurements excluded: {excluded})" if excluded else reason
+        )
+    counts = tuple(np.asarray(report.contradictions).tolist())
+    return ResidualUpdate(computed_from, float(report.rms_error), state, counts)
 
 
 def policy_update(computed_from: float, state: PolicyState, verdict: Verdict) -> PolicyUpdate | Rejection:

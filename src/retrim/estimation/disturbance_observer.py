@@ -13,6 +13,11 @@ observer is a first-order low-pass of what the model missed in each tick.
 
 While a command at a limit acts, what the vehicle does is no disturbance: d and r are held, and v is what is measured.
 So it is at the first measurement and after a tick that was missed, since what changed then is not of one tick.
+
+Measurements that contradict each other (:mod:`retrim.estimation.consistency`) say nothing of the disturbance: d is held
+during such a tick and the next one. The more of the last ticks were such, the faster d decays, since an estimate
+without measurements is a push of its own. A correction within one tick is limited, so that a wrong velocity that no
+test finds has little effect.
 """
 
 import dataclasses
@@ -26,9 +31,12 @@ from ..physics import so3
 from ..physics.actuators import is_followed, lagged
 from ..physics.dynamics import AbstractDynamics
 from ..physics.state import Command, State, where
+from .consistency import Consistency
 from .latency import follows
 
 NOISE_TAU = 1.0  # [s], memory of the estimated noise
+DECAY_TAU = 0.1  # [s], decay of the estimate if all of them do
+CORRECTION, SPREADS = 0.08, 6.0  # [m/s] and standard deviations of the noise: largest innovation of a tick
 SECOND_DIFFERENCE = 1.954  # mean magnitude of the second difference of white noise, in standard deviations
 
 
@@ -51,6 +59,7 @@ class ObserverState(eqx.Module):
     """Estimated standard deviation of a measured velocity per axis [m/s]."""
     thrust: Float[Array, ""]
     """Thrust that acts at the end of the last tick, behind the lag [m/s^2]."""
+    consistency: Consistency
 
 
 class DisturbanceObserver(eqx.Module):
@@ -75,7 +84,8 @@ class DisturbanceObserver(eqx.Module):
         zero = jnp.zeros_like(x.p)
         commands = (Command.hover(x.p.dtype),) * (self.delay_ticks + 1)
         never = jnp.full_like(x.p[0], -jnp.inf)
-        return ObserverState(x, never, commands, x.v, zero, zero, jnp.zeros_like(x.p[0]), commands[0].c)
+        thrust = commands[0].c
+        return ObserverState(x, never, commands, x.v, zero, zero, zero[0], thrust, Consistency.start(x))
 
     def __call__(self, s: ObserverState, t: Float[Array, ""], x: State) -> ObserverState:
         """Return the memory with the estimate corrected by what was newly measured.
@@ -100,13 +110,21 @@ class DisturbanceObserver(eqx.Module):
         w = jnp.maximum(jnp.exp(-dt / self.tau), z)
         predicted = s.v + gained + dt * s.d_hat
         innovation = x.v - predicted
+        size = jnp.sqrt(jnp.sum(innovation * innovation) + 1e-20)
+        innovation = innovation * jnp.minimum(1.0, (CORRECTION + SPREADS * noise) / size)
         d_hat = s.d_hat + (1.0 - z) * (1.0 - w) * innovation / dt
         norm = jnp.sqrt(jnp.sum(d_hat * d_hat) + 1e-12)
         d_hat = d_hat * jnp.minimum(1.0, self.limit / norm)
         t = t.astype(x.p.dtype)
-        after = ObserverState(x, t, s.commands, predicted + (1.0 - z * w) * innovation, d_hat, missed, noise, thrust)
-        held = dataclasses.replace(after, v=x.v, d_hat=s.d_hat, missed=s.missed, noise=s.noise)
         comparable = follows(t, s.t, dt)
+        consistency = s.consistency.after(s.last, x, dt, comparable)
+        after = ObserverState(
+            x, t, s.commands, predicted + (1.0 - z * w) * innovation, d_hat, missed, noise, thrust, consistency
+        )
+        doubted = jnp.exp(-dt / DECAY_TAU * consistency.doubt**2)
+        decay = jnp.where(consistency.certain, 1.0, doubted).astype(x.p.dtype)
+        held = dataclasses.replace(after, v=x.v, d_hat=decay * s.d_hat, missed=s.missed, noise=s.noise)
+        comparable &= consistency.certain
         if self.limits is not None:
             comparable &= is_followed(given, self.limits)
         return where(comparable, after, held)

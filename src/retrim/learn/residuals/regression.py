@@ -19,6 +19,10 @@ SIZE = 10
 """Parameters: constant push (3), thrust gain (1), linear drag (3), quadratic drag (3)."""
 BLOCK = 8
 """Rows that are compared at once in the search for a change."""
+TAIL = 4.0
+"""Rows that miss the fit by more than so many standard deviations lose weight (Huber's likelihood)."""
+PASSES = 2
+"""Passes of iteratively reweighted least squares. Gross errors are excluded before, so that few are enough."""
 SURPRISE = 21.1
 """Of a chi-squared variable of three degrees of freedom, passed once in 10,000."""
 
@@ -47,7 +51,8 @@ class RegressionModel(eqx.Module):
     which d is. A fit is exact, takes less than a millisecond, and depends on the window alone, not on earlier fits.
 
     Rows whose command is at a limit do not count: a gain that explains what a mixer does there reverses what thrust
-    does.
+    does. The likelihood has heavy tails: a row that the fit misses by more than four standard deviations counts less,
+    and a window without such rows has the fit of a normal likelihood.
     """
 
     prior: Float[Array, "10"]
@@ -112,6 +117,8 @@ class RegressionModel(eqx.Module):
         features = jax.vmap(features_of)(rows.x, rows.u)
         weight = self._weight(features, rows)
         posterior = self._posterior(features, rows.a_res, weight)
+        for _ in range(PASSES):
+            posterior = self._posterior(features, rows.a_res, weight * self._tail(features, rows, weight, posterior))
         error = jnp.sum((rows.a_res - features @ posterior.mean) ** 2, axis=1)
         rms = jnp.sqrt(jnp.sum(weight * error) / jnp.maximum(jnp.sum(weight), 1e-6))
         fitted = RegressionState(posterior.mean, posterior.covariance, self.rates.fit(rows))
@@ -123,6 +130,17 @@ class RegressionModel(eqx.Module):
         recent = self._posterior(features, rows.a_res, jnp.where(age < BLOCK, valid, 0.0))
         newer = self._unchanged(recent, features, rows.a_res, valid, age // BLOCK)
         return jnp.exp(-self.dt * age.astype(valid.dtype) / self.memory) * valid * newer
+
+    def _tail(
+        self, features: Float[Array, "n 3 10"], rows: Targets, weight: Float[Array, " n"], fitted: Normal
+    ) -> Float[Array, " n"]:
+        """Return by which factor each row counts: one within the tail, falling with the square of the error beyond."""
+        missed = jnp.sqrt(jnp.sum((rows.a_res - features @ fitted.mean) ** 2, axis=1))
+        count = jnp.sum(weight > 0.0)
+        ordered = jnp.sort(jnp.where(weight > 0.0, missed, jnp.inf))
+        median = jnp.where(count > 0, ordered[jnp.maximum(count // 2, 1) - 1], 0.0)
+        limit = TAIL * jnp.maximum(self.noise, median)
+        return jnp.where(missed > limit, (limit / jnp.maximum(missed, limit)) ** 2, 1.0)
 
     def _posterior(
         self, features: Float[Array, "n 3 10"], target: Float[Array, "n 3"], weight: Float[Array, " n"]

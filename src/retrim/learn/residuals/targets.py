@@ -36,6 +36,7 @@ def residual_targets(
     *,
     delay_ticks: int = 0,
     a_gt: Float[Array, "n 3"] | None = None,
+    consistent: Bool[Array, " steps"] | None = None,
 ) -> Targets:
     """Compute a_res = a_gt - a_hat of each tick.
 
@@ -51,6 +52,8 @@ def residual_targets(
         delay_ticks: Declared command delay of the plant [ticks].
         a_gt: Measured accelerations, the mean over the tick that begins in each row, world [m/s^2]; by default the
             differences of velocity.
+        consistent: Whether each of the n - 1 steps from one measurement to the next can be learned from; None: all of
+            them can.
 
     Returns:
         n - 1 - ``delay_ticks`` rows.
@@ -77,7 +80,13 @@ def residual_targets(
     _, a_res = lax.scan(tick, first, (x, u, v_next))
     omega = jax.vmap(_turned)(x.R, window.x.R[delay_ticks + 1 :]) / nominal.dt
     settled = _settled(window, nominal.settling_ticks)[:rows]
-    return Targets(x, u, a_res, omega, known & _regular(window, nominal.dt, delay_ticks, before) & settled)
+    valid = known & _regular(window, nominal.dt, delay_ticks, before) & settled
+    if consistent is not None:
+        valid &= consistent[delay_ticks : delay_ticks + rows]
+        a_res = jnp.where(
+            valid[:, None], a_res, 0.0
+        )  # a row that is not finite must not enter a sum, even with weight 0
+    return Targets(x, u, a_res, omega, valid)
 
 
 def _acting(

@@ -1,0 +1,173 @@
+"""Consistency of two successive measurements: whether a rigid body can have moved from one to the other.
+
+A single wrong velocity enters two accelerations with opposite signs and 50 times its size (at 50 Hz), so that one
+sample in a window can outweigh all others. These tests need no model of the vehicle and no history, and they have one
+definition for the disturbance observer, which sees a pair per tick, and for the learners, which see a window.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from ..physics import so3
+from ..physics.state import State, where
+
+SPEED = 0.25  # [m/s] between a velocity and the derivative of the position that is no fault, as a small bias
+SPREADS = 4.0  # of the noise beyond it; a normal distribution has fewer than 1 in 10^4 there
+NOISE_PRIOR = 1e-3  # [m], before anything was measured
+NOISE_LIMIT = 3e-3  # [m]: a larger noise is a fault, or every fault would look like noise
+NOISE_TAU = 1.0  # [s], memory of the noise
+JUMP = 3.0**0.5  # of the mean size of the change of a gap to that of a gap, where positions have white noise
+ACCELERATION = 150.0  # [m/s^2], beyond any vehicle of this kind, a push and a collision with air included
+RATE = 40.0  # [rad/s], beyond any rate that a vehicle of this kind is commanded
+REST = 1e-3  # [m/s]: a vehicle slower than this may well be measured twice in the same state
+SCALE = 0.25  # as a share: so far the motion may differ from what the velocities say
+CORRELATED = 0.5  # squared correlation of gaps and steps, at least, of a wrong scale
+MOTION, OVER_NOISE = 0.15, 3.0  # [m/s] and times the noise of gaps: mean motion that shows a scale
+SCALE_TAU = 1.0  # [s], memory of the moments that show a scale
+DOUBT_TAU = 0.3  # [s], memory of the share of steps that cannot be used
+SKEW = 0.1  # largest entry of R^T R - I of a rotation
+
+
+class Findings(eqx.Module):
+    """Contradictions between two successive measurements; all false for a possible motion."""
+
+    repeated: Bool[Array, ""]
+    """The second one is the first one again, to the bit, although the vehicle moves."""
+    velocity: Bool[Array, ""]
+    """The velocity is not the derivative of the position."""
+    acceleration: Bool[Array, ""]
+    """The acceleration is beyond what a vehicle can do."""
+    attitude: Bool[Array, ""]
+    """An attitude is no rotation, or the vehicle turned faster than it can."""
+    not_finite: Bool[Array, ""]
+
+    @property
+    def any(self) -> Bool[Array, "..."]:
+        """Whether there is a contradiction."""
+        found: Bool[Array, ...] = jnp.any(jnp.stack(jax.tree.leaves(self)), axis=0)
+        return found
+
+
+def gap(before: State, after: State, dt: float) -> Float[Array, "3"]:
+    """Return the step of the position without the mean of the velocities at its ends, world [m].
+
+    The trapezoidal rule is exact to dt^3 / 12 times the jerk, which is 0.1 mm at 50 Hz in the most agile flight.
+    """
+    return after.p - before.p - 0.5 * dt * (before.v + after.v)
+
+
+def gap_noise(before: Float[Array, "3"], after: Float[Array, "3"]) -> Float[Array, ""]:
+    """Return the noise that two successive gaps show [m].
+
+    Velocities with a bias or a wrong scale have gaps that hardly change, which are no noise.
+    """
+    return jnp.sqrt(jnp.sum((after - before) ** 2) + 1e-20) / JUMP
+
+
+class Scale(eqx.Module):
+    """Moments of gaps and of steps by velocity, whose covariance shows a wrong scale of the velocities."""
+
+    gap: Float[Array, "3"]
+    """Mean gap, world [m]."""
+    step: Float[Array, "3"]
+    """Mean step, world [m]."""
+    product: Float[Array, ""]
+    """Mean of gap times step [m^2]."""
+    squares: Float[Array, "2"]
+    """Means of the squared gap and step [m^2]."""
+
+    @classmethod
+    def of(cls, missing: Float[Array, "3"], v: Float[Array, "3"], dt: float) -> "Scale":
+        """Return the moments of one step with the :func:`gap` ``missing`` and the velocity ``v``."""
+        step = dt * v
+        return cls(missing, step, jnp.sum(missing * step), jnp.stack([jnp.sum(missing**2), jnp.sum(step**2)]))
+
+    def verdict(self, dt: float, noise: Float[Array, ""]) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
+        """Return whether the vehicle moved enough to show the scale, and whether the scale is wrong then.
+
+        Constant errors of the velocity do not count: the moments are centred.
+
+        Args:
+            dt: Control tick [s].
+            noise: Typical size of a gap by noise [m].
+        """
+        covariance = self.product - jnp.sum(self.gap * self.step)
+        gaps = self.squares[0] - jnp.sum(self.gap**2)
+        steps = self.squares[1] - jnp.sum(self.step**2)
+        shows = gaps + steps > (MOTION * dt) ** 2 + (OVER_NOISE * jnp.minimum(noise, NOISE_LIMIT)) ** 2
+        wrong = (jnp.abs(covariance) > SCALE * steps) & (covariance**2 > CORRELATED * gaps * steps)
+        return shows, wrong
+
+
+def contradictions(before: State, after: State, dt: float, noise: Float[Array, ""]) -> Findings:
+    """Return what contradicts the motion from one measurement to the next.
+
+    Args:
+        before: First measurement.
+        after: Measurement one tick later.
+        dt: Control tick [s].
+        noise: Typical size of a :func:`gap` by noise in this flight, see :func:`gap_noise` [m].
+    """
+    same = [jnp.all(a == b) for a, b in ((before.p, after.p), (before.R, after.R), (before.v, after.v))]
+    slack = SPEED * dt + SPREADS * jnp.minimum(noise, NOISE_LIMIT)
+    missed, a = gap(before, after, dt), (after.v - before.v) / dt
+    skew = jnp.max(jnp.abs(so3.mul(after.R.T, after.R) - jnp.eye(3, dtype=after.R.dtype)))
+    rate = so3.log(so3.mul(before.R.T, after.R)) / dt
+    finite = jnp.isfinite(jnp.sum(after.p) + jnp.sum(after.R) + jnp.sum(after.v))
+    return Findings(
+        repeated=same[0] & same[1] & same[2] & (jnp.sum(before.v * before.v) > REST**2),
+        velocity=jnp.sum(missed * missed) > slack * slack,
+        acceleration=jnp.sum(a * a) > ACCELERATION**2,
+        attitude=(skew > SKEW) | (jnp.sum(rate * rate) > RATE**2),
+        not_finite=~finite,
+    )
+
+
+class Consistency(eqx.Module):
+    """Memory of the tests in flight, tick by tick."""
+
+    gap: Float[Array, "3"]
+    """Last :func:`gap`, world [m]."""
+    noise: Float[Array, ""]
+    """Typical size of a gap by noise [m]."""
+    scale: Scale
+    """Moments of the last second."""
+    scaled: Bool[Array, ""]
+    """Whether velocities had a wrong scale when the vehicle moved last."""
+    possible: Bool[Array, ""]
+    """Whether the last measurement did not contradict the one before it."""
+    certain: Bool[Array, ""]
+    """Whether the step to the last measurement can be used: neither of its ends contradicts the measurement before."""
+    doubt: Float[Array, ""]
+    """Share of the last steps that could not be used."""
+
+    @classmethod
+    def start(cls, x: State) -> "Consistency":
+        """Return the memory before the first measurement ``x``."""
+        zero, yes = jnp.zeros_like(x.p[0]), jnp.array(True)
+        scale = Scale(jnp.zeros_like(x.p), jnp.zeros_like(x.p), zero, jnp.zeros_like(x.p[:2]))
+        return cls(jnp.zeros_like(x.p), jnp.full_like(zero, NOISE_PRIOR), scale, ~yes, yes, yes, zero)
+
+    def after(self, before: State, x: State, dt: float, successive: Bool[Array, ""]) -> "Consistency":
+        """Return the memory after a new measurement.
+
+        Args:
+            before: Last measurement.
+            x: New measurement.
+            dt: Control tick [s].
+            successive: Whether there is one tick between them; if not, they are not compared.
+        """
+        missing, v = gap(before, x, dt), 0.5 * (before.v + x.v)
+        possible = ~(successive & contradictions(before, x, dt, self.noise).any)
+        moving = jax.tree.map(lambda old, new: old + dt / SCALE_TAU * (new - old), self.scale, Scale.of(missing, v, dt))
+        scale = where(successive & possible & self.possible, moving, self.scale)
+        shows, wrong = scale.verdict(dt, self.noise)
+        scaled = jnp.where(shows, wrong, self.scaled)
+        certain = possible & self.possible & ~scaled
+        doubt = self.doubt + dt / DOUBT_TAU * (jnp.where(certain, 0.0, 1.0) - self.doubt)
+        new = jnp.minimum(gap_noise(self.gap, missing), NOISE_LIMIT)
+        noise = self.noise + (1.0 - jnp.exp(-dt / NOISE_TAU)) * (new - self.noise)
+        noise = jnp.where(successive & possible & self.possible, noise, self.noise)
+        return Consistency(missing, noise, scale, scaled, possible, certain, doubt)

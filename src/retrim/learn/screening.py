@@ -1,0 +1,88 @@
+"""Screening of a window: its measurements that contradict each other, and its ticks that a learner can use."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
+
+from ..estimation.consistency import Findings, Scale, contradictions, gap, gap_noise
+from ..physics.state import State
+from .window import Window
+
+
+class Screening(eqx.Module):
+    """Result of a screening. A window of n measurements has n - 1 steps."""
+
+    steps: Bool[Array, " steps"]
+    """Steps from one measurement to the next that no test contradicts; those of invalid ticks are not tested."""
+    samples: Bool[Array, " n"]
+    """Measurements at one end of such a step at least."""
+    counts: Int[Array, "5"]
+    """Contradicted steps by reason, in the order of :class:`~retrim.estimation.consistency.Findings`."""
+    trusted: Bool[Array, ""]
+    """Whether at least half of the steps are left to learn from, and velocities have the scale of the positions."""
+
+    def note(self) -> str:
+        """Return the reasons and their counts in words; empty without a contradiction."""
+        return describe_counts(self.counts)
+
+
+REASONS = (
+    "repeated",
+    "velocity is not the derivative of position",
+    "acceleration out of range",
+    "attitude out of range",
+    "not finite",
+)
+
+
+def describe_counts(counts: Int[ArrayLike, "5"] | Sequence[int]) -> str:
+    """Return the reasons with their counts in words; empty if all are zero."""
+    found = zip(REASONS, np.asarray(counts, dtype=int).tolist(), strict=False)
+    return ", ".join(f"{name}: {n}" for name, n in found if n)
+
+
+def screen(window: Window, dt: float) -> Screening:
+    """Return which measurements of a window can be learned from.
+
+    The noise of the flight is a median over its steps, up to half of which may be spoilt. The step after a repeated
+    measurement has the motion of two ticks, so it does not count either.
+
+    Args:
+        window: Ticks of flight.
+        dt: Control tick [s].
+    """
+    before, after = (_rows(window.x, part) for part in (slice(None, -1), slice(1, None)))
+    valid = window.valid[:-1] & window.valid[1:]
+    gaps = jax.vmap(lambda a, b: gap(a, b, dt))(before, after)
+    noise = _median(jax.vmap(gap_noise)(gaps[:-1], gaps[1:]), valid[:-1] & valid[1:])
+    found: Findings = jax.vmap(lambda a, b: contradictions(a, b, dt, noise))(before, after)
+    stale = jnp.concatenate([jnp.zeros(1, dtype=bool), found.repeated[:-1]])
+    bad = found.any | stale
+    moments = jax.vmap(lambda missing, a, b: Scale.of(missing, 0.5 * (a.v + b.v), dt))(gaps, before, after)
+    n = jnp.maximum(jnp.sum(valid & ~bad), 1).astype(noise.dtype)
+    scale = jax.vmap(lambda good, each: jax.tree.map(lambda leaf: jnp.where(good, leaf, 0.0), each))(
+        valid & ~bad, moments
+    )
+    shows, wrong = jax.tree.map(lambda leaf: jnp.sum(leaf, axis=0) / n, scale).verdict(dt, noise)
+    counts = jnp.stack([jnp.sum(leaf & valid) for leaf in jax.tree.leaves(found)])
+    good, nothing = valid & ~bad, jnp.zeros(1, dtype=bool)
+    beside = jnp.concatenate([nothing, good]) | jnp.concatenate([good, nothing])
+    judged = jnp.concatenate([nothing, valid]) | jnp.concatenate([valid, nothing])
+    samples = window.valid & (beside | ~judged)
+    trusted = ~(shows & wrong) & (jnp.sum(bad & valid) <= jnp.sum(valid) // 2)  # of the majority is learned, or nothing
+    return Screening(~(bad & valid), samples, counts, trusted)
+
+
+def _rows(x: State, part: slice) -> State:
+    return jax.tree.map(lambda leaf: leaf[part], x)  # type: ignore[no-any-return]
+
+
+def _median(values: Float[Array, " n"], counts: Bool[Array, " n"]) -> Float[Array, ""]:
+    """Return the median of the values that count; zero if none does."""
+    ordered = jnp.sort(jnp.where(counts & jnp.isfinite(values), values, jnp.inf))
+    middle = ordered[(jnp.sum(counts) - 1) // 2]  # the last value, which is infinite, if none counts
+    return jnp.where(jnp.isfinite(middle), middle, 0.0)

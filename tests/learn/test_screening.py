@@ -1,0 +1,94 @@
+"""Screening of windows: the wrong measurements are found, with their reasons, and the others stay."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import random
+
+from retrim.learn import Window
+from retrim.learn.screening import REASONS, describe_counts, screen
+from retrim.physics import Command, PointMass, State
+
+DT, N = 0.02, 60
+screened = eqx.filter_jit(lambda window: screen(window, DT))
+
+
+@pytest.fixture(scope="module")
+def window():
+    """A flight with a changing command, without noise."""
+    model = PointMass(DT)
+
+    def tick(x, k):
+        u = Command(9.81 + random.normal(k, ()), random.normal(random.fold_in(k, 1), (3,)))
+        return model.step(x, u, jnp.array([0.5, 0.0, 0.0])), (x, u)
+
+    _, (x, u) = jax.lax.scan(tick, State.at(jnp.array([0.0, 0.0, 1.0])), random.split(random.key(0), N))
+    return Window(DT * jnp.arange(float(N)), x, u, jnp.ones(N, dtype=bool), None)
+
+
+def changed(window, **fields):
+    whole = {name: getattr(window.x, name) for name in ("p", "R", "v")} | fields
+    return dataclasses.replace(window, x=jax.vmap(State)(*(whole[name] for name in ("p", "R", "v"))))
+
+
+def counts(found):
+    return dict(zip(REASONS, np.asarray(found.counts).tolist(), strict=True))
+
+
+def test_a_clean_window_loses_nothing(window):
+    found = screened(window)
+    assert found.steps.all()
+    assert found.samples.all()
+    assert found.trusted
+    assert found.note() == ""
+
+
+@pytest.mark.parametrize("noise", [1e-3, 2e-3])
+def test_noise_loses_next_to_nothing(window, noise):
+    p = window.x.p + noise * random.normal(random.key(1), (N, 3))
+    v = window.x.v + 10.0 * noise * random.normal(random.key(2), (N, 3))
+    found = screened(changed(window, p=p, v=v))
+    assert int((~found.steps).sum()) <= 1
+    assert found.trusted
+
+
+@pytest.mark.parametrize("rows", [[20], [5, 30, 50]])
+def test_a_wrong_velocity_loses_the_steps_to_and_from_it_and_no_other(window, rows):
+    at = jnp.array(rows)
+    found = screened(changed(window, v=window.x.v.at[at, 0].add(2.0)))
+    np.testing.assert_array_equal(np.flatnonzero(~found.steps), sorted([*(at - 1).tolist(), *at.tolist()]))
+    np.testing.assert_array_equal(np.flatnonzero(~found.samples), rows)
+    assert counts(found)["velocity is not the derivative of position"] == 2 * len(rows)
+    assert found.trusted
+
+
+def test_the_step_after_a_repeated_measurement_does_not_count(window):
+    x = jax.tree.map(lambda leaf: leaf.at[31].set(leaf[30]), window.x)
+    found = screened(dataclasses.replace(window, x=x))
+    assert not found.steps[30]
+    assert not found.steps[31]
+    assert int((~found.steps).sum()) == 2
+    assert counts(found)["repeated"] == 1
+
+
+def test_nothing_is_learned_if_most_steps_contradict(window):
+    wrong = screened(changed(window, v=2.0 * window.x.v + 1.0))
+    assert not wrong.trusted
+    assert int((~wrong.steps).sum()) > N // 2
+
+
+def test_invalid_ticks_are_not_judged(window):
+    valid = jnp.arange(N) >= 30
+    found = screened(dataclasses.replace(changed(window, v=window.x.v.at[10, 0].add(5.0)), valid=valid))
+    assert int(found.counts.sum()) == 0
+    np.testing.assert_array_equal(found.samples, valid)
+    assert found.trusted
+
+
+def test_counts_in_words():
+    assert describe_counts(jnp.zeros(5, int)) == ""
+    assert describe_counts([3, 0, 1, 0, 0]) == "repeated: 3, acceleration out of range: 1"
