@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ..physics.vehicle import Vehicle, small
+from .faults import FAULTS, NO_FAULT
 from .presets import Preset
 from .scenario import Scenario
 from .vehicle_file import VehicleSpec
@@ -61,6 +62,26 @@ FLOWN = {
     "gusts-rough": ("gusts", "rough"),
 }
 """On each reference: disturbance and sensors."""
+
+
+def fault_conditions(preset: Preset) -> dict[str, Scenario]:
+    """Return faults of measurements and of the vehicle, by name, each beside a small push.
+
+    Args:
+        preset: What is flown, at hover.
+    """
+    heavier = f"{PUSH}+payload={0.5 * float(make_vehicle(preset.vehicle).mass):.4g}"
+    return {name: Scenario(PUSH, fault=name) for name in FAULTS if name != NO_FAULT} | {
+        "late=2": Scenario(PUSH, fault="late=2"),
+        "late=4": Scenario(PUSH, fault="late=4"),
+        "delay-60ms": Scenario(PUSH, delay=0.06),
+        "delay-80ms": Scenario(PUSH, delay=0.08),
+        "mass+50": Scenario(heavier),
+        "thrust-50": Scenario(PUSH, thrust_error=-0.5),
+    }
+
+
+PUSH = "small"
 
 
 def _at_hover() -> dict[str, Scenario]:

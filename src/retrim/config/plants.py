@@ -19,6 +19,7 @@ from ..plants.bridges.mavlink import ADDRESS, MavlinkPlant
 from ..plants.bridges.ros import RosPlant, parts_of
 from ..plants.crazyflow import CrazyflowPlant
 from ..plants.extras import check_extra
+from ..plants.measurement_faults import AbstractMeasurementFault
 from ..plants.mujoco import MujocoPlant
 from ..plants.plant import Plant, as_numpy
 from ..plants.rotorpy import RotorpyPlant
@@ -46,6 +47,8 @@ class PlantRequest:
     """Command delay [s]."""
     address: str = ""
     """Where a vehicle is reached; what its link has by default if it is empty."""
+    fault: AbstractMeasurementFault | None = None
+    """Fault of the measurements; None for none."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +62,8 @@ class PlantEntry:
     """Name of the vehicle that it brings; None if it flies any."""
     has_sensors: bool = False
     """Whether it takes a sensor model."""
+    has_faults: bool = False
+    """Whether its measurements can be faulty."""
     has_thrust_error: bool = False
     """Whether it takes an error of the thrust map."""
     has_delay: bool = False
@@ -81,12 +86,12 @@ register_plant = PLANTS.register
 
 def _bem(r: PlantRequest) -> Plant:
     model = BemQuadrotor.of(r.vehicle, r.dt, thrust_error=r.thrust_error)
-    return SimPlant(model, r.disturbance, delay_s=r.delay, sensors=r.sensors, seed=r.seed)
+    return SimPlant(model, r.disturbance, delay_s=r.delay, sensors=r.sensors, fault=r.fault, seed=r.seed)
 
 
 def _simple(r: PlantRequest) -> Plant:
     model = LinearDragQuadrotor.of(r.vehicle, r.dt, thrust_error=r.thrust_error)
-    return SimPlant(model, r.disturbance, delay_s=r.delay, sensors=r.sensors, seed=r.seed)
+    return SimPlant(model, r.disturbance, delay_s=r.delay, sensors=r.sensors, fault=r.fault, seed=r.seed)
 
 
 def find_plant(name: str) -> tuple[object, str]:
@@ -144,6 +149,7 @@ register_plant(
         _bem,
         "blade-element rotors, firmware's rate loop, body drag, at 1 kHz, 20 ms of command delay",
         has_sensors=True,
+        has_faults=True,
         has_thrust_error=True,
         has_delay=True,
     ),
@@ -154,6 +160,7 @@ register_plant(
         _simple,
         "rotors with linear drag, at 1 kHz, 20 ms of command delay",
         has_sensors=True,
+        has_faults=True,
         has_thrust_error=True,
         has_delay=True,
     ),

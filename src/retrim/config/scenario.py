@@ -7,6 +7,7 @@ from ..errors import ConfigError, RetrimError
 from ..physics.vehicle import Vehicle
 from ..plants.plant import Plant
 from .disturbances import disturbance
+from .faults import NO_FAULT, measurement_fault
 from .plants import DELAY, PlantEntry, PlantRequest, find_plant
 from .sensors import SENSORS
 from .vehicle_file import VehicleSpec
@@ -31,6 +32,8 @@ class Scenario:
     """What a tracking policy follows; None: what it was trained on."""
     delay: float = DELAY
     """Command delay of the plant [s]; bem and simple only. The policy does not know of it."""
+    fault: str = NO_FAULT
+    """Fault of the measurements: a name, or a name with a size, as ``velocity-spikes=3``; bem and simple only."""
 
     def __post_init__(self) -> None:
         """Raise :class:`ConfigError` for an unknown name, and for a choice that the plant does not have."""
@@ -54,6 +57,11 @@ class Scenario:
             raise ConfigError(
                 f"plant {self.plant!r} measures its true state; sensors {self.sensors!r} need bem or simple"
             )
+        measurement_fault(self.fault)
+        if self.fault != NO_FAULT and not entry.has_faults:
+            raise ConfigError(
+                f"plant {self.plant!r} has no faulty measurements; fault {self.fault!r} needs bem or simple"
+            )
         if self.thrust_error != THRUST_ERROR and not entry.has_thrust_error:
             raise ConfigError(f"plant {self.plant!r} has its own thrust map; a thrust error needs bem or simple")
         if self.delay != DELAY and not entry.has_delay:
@@ -75,6 +83,7 @@ class Scenario:
             entry,
             about=(entry.__doc__ or self.plant).strip().splitlines()[0],
             has_sensors=True,
+            has_faults=True,
             has_thrust_error=True,
             has_delay=True,
         )
@@ -113,6 +122,7 @@ class Scenario:
             seed,
             self.delay,
             find_plant(self.plant)[1],
+            measurement_fault(self.fault),
         )
         try:
             plant = entry.make(request)

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from ..adapt.learner import LearnerState
+from ..config.faults import NO_FAULT
 from ..config.loading import changed, load_for, overlaid, with_vehicle
 from ..config.plants import DELAY, is_vehicle
 from ..config.presets import Preset
@@ -70,6 +71,10 @@ class Where:
     """By how much more than commanded the rotors give, as a share (bem and simple)."""
     delay: float = DELAY
     """Command delay of the plant [s], in whole milliseconds (bem and simple); the policy does not know of it."""
+    fault: str = NO_FAULT
+    """Fault of the measurements, which the policy does not know of (bem and simple): velocity-spikes, rare-spikes,
+    swapped-markers, late, frozen, repeated, scaled-velocity, velocity-bias, attitude-bias, drift, gaps, clock-jumps,
+    with a size if wanted, as late=3, or module:name."""
 
     @property
     def is_vehicle(self) -> bool:
@@ -86,7 +91,7 @@ class Where:
         usual = "none" if self.is_vehicle else "large"
         follows = flown_reference(preset, self.reference)
         scenario = Scenario(self.disturbance or usual, self.plant, self.vehicle, self.sensors, self.thrust_error,
-                            follows, self.delay)  # fmt: skip
+                            follows, self.delay, self.fault)  # fmt: skip
         if scenario.entry.needs is not None:
             scenario.entry.needs()
         return scenario

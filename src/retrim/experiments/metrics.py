@@ -20,7 +20,7 @@ class Rows(list[dict[str, Any]]):
         return pandas.DataFrame(list(self))
 
 
-CONDITIONS = ("disturbance", "method", "plant", "vehicle", "sensors", "thrust_error", "delay", "reference")
+CONDITIONS = ("disturbance", "method", "plant", "vehicle", "sensors", "thrust_error", "delay", "fault", "reference")
 """What the flights of one row have in common."""
 FIGURES = (
     "error", "peak_after_5s", "settle_s", "cross_track_m", "behind_s", "unshifted_m", "rates_rms", "rates_change_rms",
@@ -44,6 +44,7 @@ def record(flight: Flight) -> dict[str, Any]:
         "sensors": scenario.sensors,
         "thrust_error": scenario.thrust_error,
         "delay": scenario.delay,
+        "fault": scenario.fault,
         "reference": scenario.reference,
         "seed": spec.seed,
         "start": spec.start,

@@ -15,10 +15,20 @@ from ..physics.disturbance import Disturbance
 from ..physics.effects import ExternalEffects
 from ..physics.state import Command, State
 from ..physics.substep import SUBSTEP, AbstractSubstepDynamics
+from .measurement_faults import AbstractMeasurementFault
 from .plant import Measurement, Plant, as_numpy, check_command, limited
 from .sensors import SensorModel
 
-FIRST_SAMPLE, INERTIAL = 2**31 - 1, 2**31 - 2  # folded into keys; no tick has these numbers
+FIRST_SAMPLE, INERTIAL, FAULT = 2**31 - 1, 2**31 - 2, 2**31 - 3  # folded into keys; no tick has these numbers
+
+
+class Reports(eqx.Module):
+    """Memory of a faulty measurement system."""
+
+    past: State
+    """Correct measurements, oldest first."""
+    reported: State
+    """State that is reported instead of the newest one."""
 
 
 class SimState(eqx.Module):
@@ -32,6 +42,8 @@ class SimState(eqx.Module):
     """Samples of the state, oldest first: the one that has arrived, and those that the latency still holds back."""
     a: Float[Array, "3"]
     """Mean acceleration over the last tick, world [m/s^2]."""
+    reports: Reports | None = None
+    """None: measurements have no fault."""
 
 
 class Simulation(eqx.Module):
@@ -47,6 +59,8 @@ class Simulation(eqx.Module):
     """Seed of noise and dropouts, which follow from it and the tick, so that a flight repeats."""
     delay_s: float = eqx.field(static=True, default=0.02)
     """Command delay [s], a whole number of milliseconds."""
+    fault: AbstractMeasurementFault | None = None
+    """Fault of the measurements."""
 
     def __check_init__(self) -> None:
         """Raise ``ValueError`` if a time is not a whole number of steps or samples."""
@@ -75,7 +89,11 @@ class Simulation(eqx.Module):
         held = 1 if self.sensors is None else self.sensors.held
         sample = x0 if self.sensors is None else self.sensors.noisy(x0, random.fold_in(self.key, FIRST_SAMPLE))
         samples = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (held, *leaf.shape)), sample)
-        return SimState(self.model.init(x0), queue, samples, jnp.zeros_like(x0.p))
+        reports = None
+        if self.fault is not None:
+            rows = self.fault.memory + 1
+            reports = Reports(jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (rows, *leaf.shape)), sample), sample)
+        return SimState(self.model.init(x0), queue, samples, jnp.zeros_like(x0.p), reports)
 
     def advance(self, s: SimState, u: Command, tick: Int[ArrayLike, ""]) -> SimState:
         """Return the state one control tick later, in steps of 1 ms; ``u`` acts :attr:`delay_s` after the tick began.
@@ -105,14 +123,23 @@ class Simulation(eqx.Module):
             sampled = jax.tree.map(lambda leaf: leaf[sensors.period - 1 :: sensors.period], path)
             samples = sensors.received(s.samples, sampled, random.fold_in(self.key, tick))
         a = (self.model.state(inner).v - self.model.state(s.model).v) / self.model.dt
-        return SimState(inner, queue, samples, a)
+        return SimState(inner, queue, samples, a, self._reports(s.reports, samples, jnp.asarray(tick) + 1))
+
+    def _reports(self, before: Reports | None, samples: State, tick: Int[Array, ""]) -> Reports | None:
+        if before is None or self.fault is None:
+            return None
+        past = jax.tree.map(lambda old, new: jnp.concatenate([old[1:], new[:1]]), before.past, samples)
+        key = random.fold_in(random.fold_in(self.key, tick), FAULT)
+        return Reports(past, self.fault(past, tick, key))
 
     def time(self, tick: Int[ArrayLike, ""], dtype: Any) -> Float[Array, ""]:
         """Return the time since the start of the flight [s]: not a sum, which drifts off in single precision."""
         return jnp.asarray(tick, dtype) * self.model.dt
 
     def measured(self, s: SimState) -> State:
-        """Return the newest sample that has arrived."""
+        """Return the newest sample that has arrived, as it is reported."""
+        if s.reports is not None:
+            return s.reports.reported
         return jax.tree.map(lambda leaf: leaf[0], s.samples)  # type: ignore[no-any-return]
 
     def inertial(self, s: SimState, tick: Int[ArrayLike, ""]) -> tuple[Float[Array, "3"], Float[Array, "3"]] | None:
@@ -158,6 +185,7 @@ class SimPlant(Plant):
         *,
         delay_s: float = 0.02,
         sensors: SensorModel | None = None,
+        fault: AbstractMeasurementFault | None = None,
         seed: int = 0,
     ) -> None:
         """Build a plant.
@@ -167,12 +195,13 @@ class SimPlant(Plant):
             disturbance: External effects as a function of time since the reset and state.
             delay_s: Command delay [s], a whole number of milliseconds.
             sensors: None: every measurement is exact.
+            fault: Fault of the measurements; None for none.
             seed: Noise and dropouts of the sensors follow from it and the tick, so that a flight repeats.
 
         Raises:
             ValueError: The delay is no whole number of milliseconds, or a tick is no whole number of sensor periods.
         """
-        self.simulation = Simulation(model, disturbance, sensors, random.key(seed), delay_s)
+        self.simulation = Simulation(model, disturbance, sensors, random.key(seed), delay_s, fault)
         self.dt = model.dt
         limits = model.command_limits
         self._limits = None if limits is None else (as_numpy(limits[0]), as_numpy(limits[1]))
@@ -192,8 +221,12 @@ class SimPlant(Plant):
         if self._state is None:
             raise PlantError("SimPlant: not flying; call reset first")
         accepted = u if self._limits is None else limited(u, wanted, *self._limits)
-        self._state = _advance(self.simulation, self._state, accepted, np.int32(self._ticks))
-        self._ticks += 1
+        fault = self.simulation.fault
+        while True:
+            self._state = _advance(self.simulation, self._state, accepted, np.int32(self._ticks))
+            self._ticks += 1
+            if fault is None or not fault.is_missing(self._ticks):
+                break  # the vehicle goes on with the last command while no measurement arrives
         return self._measurement(), accepted
 
     def disturb(self, disturbance: Disturbance) -> None:
@@ -203,10 +236,12 @@ class SimPlant(Plant):
     def _measurement(self) -> Measurement:
         assert self._state is not None
         simulation, state = self.simulation, self._state
-        t, truth, rotors = self._ticks * self.dt, simulation.true(state), simulation.model.rotor_state(state.model)
+        t = self._ticks * self.dt + (0.0 if simulation.fault is None else simulation.fault.clock_error(self._ticks))
+        truth, rotors = simulation.true(state), simulation.model.rotor_state(state.model)
         speeds = None if rotors is None else rotors.motors
         if simulation.sensors is None:
-            return Measurement(t, truth, None if rotors is None else rotors.omega, state.a, speeds, truth=truth)
+            x = simulation.measured(state)
+            return Measurement(t, x, None if rotors is None else rotors.omega, state.a, speeds, truth=truth)
         omega, a = (
             (None, state.a) if rotors is None else _inertial(simulation.undisturbed(), state, np.int32(self._ticks))
         )

@@ -24,7 +24,8 @@ def can_fly_together(plants: Sequence[Plant], pilots: Sequence[Pilot]) -> bool:
     Such pilots fly one kind of controller, or learn by one learner on the virtual clock, with fixed latencies.
     """
     simulations = [plant.simulation for plant in plants if type(plant) is SimPlant]
-    if len(simulations) < len(plants) or not _alike(simulations):
+    interrupted = any(each.fault is not None and each.fault.interrupts for each in simulations)
+    if len(simulations) < len(plants) or interrupted or not _alike(simulations):
         return False
     controllers = [pilot.controller for pilot in pilots if type(pilot) is ControllerPilot]
     if controllers:

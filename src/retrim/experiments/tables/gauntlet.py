@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from ...config.conditions import conditions
+from ...config.conditions import conditions, fault_conditions
 from ...config.loading import load
 from ...config.methods import find_method
 from ...config.presets import Preset
@@ -22,6 +22,7 @@ from ..reporter import Reporter
 from ..run import Run
 from .document import Document, TableSection
 from .kept_flights import forget_flights
+from .promise import promise_rows, promise_section
 from .study import fly_all, refuse_misfits, table_presets, train_all
 
 METHODS: dict[str, tuple[str, ...]] = {
@@ -29,6 +30,7 @@ METHODS: dict[str, tuple[str, ...]] = {
     "track": ("base", "base-i", "base-do", "geometric-i", "indi", "full"),
     "vision": ("base", "base-do", "full"),  # what every preset can fly
 }
+FAULT_METHODS = ("base", "base-do", "geometric-i", "indi", "full", "lora")
 CORES = 2  # that a condition keeps busy: its adapting flights, of a few starts, are all that takes long
 METRICS = {"steady": "[m]", "late": "[m]", "peak": "[m]", "recovery_5cm": "[s]", "recovery_2cm": "[s]"}
 INTRO = """\
@@ -38,6 +40,14 @@ otherwise, at hover or on the reference that the row names. steady: mean error o
 until the error stays below 5 or 2 cm (without a change: from the start, 1 m away). Means over flights, and the worst
 in brackets; a flight that crashed, or did not recover, is infinite (∞). Learning is charged to flight time by the
 preset's fixed latencies."""
+
+FAULTS_INTRO = """\
+Made by `retrim gauntlet --faults`. The preset's own vehicle on plant `bem` with {sensors} sensors hovers under a push
+of 0.5 m/s^2 per axis and one fault, which the policy does not know of: of the measurements (the names are those of
+`--fault`), of the command delay, of the mass or of the thrust. steady: mean error over the last 2 s; late: mean error
+after 5 s; peak: largest error after 5 s, all of the true position; recovery: time from the start, 1 m away, until the
+error stays below 5 or 2 cm. Means over flights, and the worst in brackets; a flight that crashed, or did not recover,
+is infinite (∞). Learning is charged to flight time by the preset's fixed latencies."""
 
 
 def gauntlet(
@@ -51,6 +61,7 @@ def gauntlet(
     seconds: float = 30.0,
     starts: int = 4,
     sensors: str = "ideal",
+    faults: bool = False,
 ) -> None:
     """A policy under everything that changes: recovery, steady and worst error, as one heat map.
 
@@ -65,21 +76,26 @@ def gauntlet(
         seconds: Length of a flight [s].
         starts: Flights per condition, method and seed.
         sensors: What the conditions are measured with that name no sensors themselves: ideal, mocap, onboard or rough.
+        faults: Fly faults of measurements and vehicle at hover instead, and check that adapting is never worse than not
+            adapting; by default base, base-do, geometric-i, indi, full and lora.
     """
     task = load(preset).task
     if task not in METHODS:
         raise ConfigError(f"preset {preset!r} is for {task}; the gauntlet is flown for {', '.join(METHODS)}")
-    methods = methods or METHODS[task]
+    if faults and (task != "hover" or sensors != "ideal"):
+        raise ConfigError(f"--faults needs a preset for hover and ideal sensors, got {preset!r} and {sensors!r}")
+    methods = methods or (FAULT_METHODS if faults else METHODS[task])
     (loaded,) = table_presets([preset], task, seeds=seeds, starts=starts, seconds=seconds)
-    known = conditions(loaded, sensors)
+    known = fault_conditions(loaded) if faults else conditions(loaded, sensors)
     if unknown := [name for name in only if name not in known]:
         raise ConfigError(f"no condition {unknown[0]!r}; there are {', '.join(known)}")
     chosen, left_out = _installed(loaded, {name: known[name] for name in only or known})
     refuse_misfits(loaded, list(chosen.values()), methods=methods, starts=starts, seconds=seconds)
     for line in left_out:
         reporter.say(f"left out: {line}")
-    intro = INTRO.format(sensors=sensors)
-    document = Document(run, "gauntlet", "The gauntlet", intro, seeds, reporter, data="results")
+    name, title = ("faults", "Faults of measurements and vehicle") if faults else ("gauntlet", "The gauntlet")
+    intro = (FAULTS_INTRO if faults else INTRO).format(sensors=sensors)
+    document = Document(run, name, title, intro, seeds, reporter, data="results")
     study = train_all(loaded, seeds, run, reporter)
     home, flown, found = Setup.of(loaded).flown.home(), dict[str, list[Flight]](), list[dict[str, Any]]()
     names, at_once = list(chosen), max(1, cores() // CORES)
@@ -100,6 +116,9 @@ def gauntlet(
         if found:
             run.write_results(found, seeds=seeds)  # a kill loses what is in the air
     if found:
+        if faults:
+            document.more["promise"] = promise_rows(flown)
+            document.add(promise_section(document.more["promise"]))
         document.add(_section(found, methods, flown, run, study.about(), left_out), found)
     document.write()
     if not run.interrupted:
@@ -162,6 +181,7 @@ def rows_of(name: str, flights: Sequence[Flight], changes: Sequence[float]) -> l
                     "thrust_error": scenario.thrust_error,
                     "delay": scenario.delay,
                     "reference": scenario.reference,
+                    "fault": scenario.fault,
                 }
             )
     return found

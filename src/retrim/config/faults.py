@@ -1,0 +1,104 @@
+"""Faults of measurements by name, with a size if wanted: ``velocity-spikes=3``."""
+
+from collections.abc import Callable
+from functools import partial
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..errors import ConfigError
+from ..plants.measurement_faults import (
+    AbstractMeasurementFault,
+    Biased,
+    DriftingPosition,
+    Frozen,
+    Gaps,
+    JumpingClock,
+    Late,
+    Repeated,
+    ScaledVelocity,
+    SwappedMarkers,
+    VelocitySpikes,
+)
+from .registry import Registry
+
+NO_FAULT = "none"
+
+FaultFactory = Callable[[float | None], AbstractMeasurementFault | None]
+"""From a size (None for the default) to a fault."""
+
+FAULTS: Registry[FaultFactory] = Registry("fault", example="module:name of a function of a size")
+register_fault = FAULTS.register
+
+
+def measurement_fault(name: str) -> AbstractMeasurementFault | None:
+    """Return a fault of measurements by name.
+
+    Args:
+        name: As ``late``, or with a size, as ``late=3``; ``none`` for none.
+
+    Raises:
+        ConfigError: There is no such fault, or it has no such size.
+    """
+    kind, equals, text = name.partition("=")
+    size = None
+    if equals:
+        try:
+            size = float(text)
+        except ValueError as error:
+            raise ConfigError(f"fault {name!r}: {text!r} is not a number") from error
+    try:
+        fault = FAULTS.find(kind)(size)
+    except (TypeError, ValueError) as error:
+        raise error if isinstance(error, ConfigError) else ConfigError(f"fault {name!r}: {error}") from error
+    if fault is not None and not isinstance(fault, AbstractMeasurementFault):
+        raise ConfigError(f"fault {name!r} gives a {type(fault).__name__}, expected an AbstractMeasurementFault")
+    return fault
+
+
+def _register(
+    name: str, make: Callable[[float], AbstractMeasurementFault], default: float, low: float, high: float, unit: str
+) -> None:
+    def checked(size: float | None) -> AbstractMeasurementFault:
+        value = default if size is None else size
+        if not low <= value <= high:
+            raise ConfigError(f"fault {name!r}: the size must be between {low:g} and {high:g} {unit}, got {value:g}")
+        return make(value)
+
+    FAULTS.register(name, checked)
+
+
+def _none(size: float | None) -> None:
+    if size is not None:
+        raise ConfigError(f"fault {NO_FAULT!r} has no size, got {size:g}")
+
+
+def _along_x(size: float) -> Float[Array, "3"]:
+    return jnp.array([size, 0.0, 0.0])
+
+
+def _spikes(size: float, every: int) -> VelocitySpikes:
+    return VelocitySpikes(_along_x(size), jnp.array(every))
+
+
+def _swapped(angle: float) -> SwappedMarkers:
+    return SwappedMarkers(jnp.array([0.05, -0.03, 0.02]), jnp.array([0.0, 0.0, angle]), jnp.array(50))
+
+
+def _biased(v: float, tilt: float) -> Biased:
+    return Biased(_along_x(v), _along_x(tilt))
+
+
+FAULTS.register(NO_FAULT, _none)
+_register("velocity-spikes", partial(_spikes, every=25), 2.0, -20.0, 20.0, "m/s")
+_register("rare-spikes", partial(_spikes, every=150), 3.0, -20.0, 20.0, "m/s")
+_register("swapped-markers", _swapped, 1.5, -3.2, 3.2, "rad")
+_register("late", lambda size: Late(round(size)), 3.0, 1.0, 25.0, "ticks")
+_register("frozen", lambda size: Frozen(jnp.array(200), round(size)), 15.0, 1.0, 100.0, "ticks")
+_register("repeated", lambda size: Repeated(jnp.array(size)), 0.2, 0.0, 0.95, "of all measurements")
+_register("scaled-velocity", lambda size: ScaledVelocity(jnp.array(size)), 0.5, 0.0, 3.0, "times the velocity")
+_register("velocity-bias", lambda size: _biased(size, 0.0), 0.1, -5.0, 5.0, "m/s")
+_register("attitude-bias", lambda size: _biased(0.0, size), 0.03, -0.5, 0.5, "rad")
+_register("drift", lambda size: DriftingPosition(_along_x(size), jnp.array(250.0)), 0.1, 0.0, 5.0, "m")
+_register("gaps", lambda size: Gaps(150, round(size)), 5.0, 1.0, 50.0, "ticks")
+_register("clock-jumps", lambda size: JumpingClock(100, size), 0.1, -2.0, 2.0, "s")

@@ -1,0 +1,219 @@
+"""Faults of a measurement system: measured states that are wrong, late, repeated or missing.
+
+A fault is a pure function of the last measurements and of the number of the newest one, so that a flight repeats. No
+fault announces itself: the age and the validity of a measurement stay as the sensor model has them.
+"""
+
+import abc
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import random
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from ..physics import so3
+from ..physics.state import State, where
+
+
+class AbstractMeasurementFault(eqx.Module):
+    """What a measurement system reports instead of what it should report."""
+
+    interrupts: ClassVar[bool] = False
+    """Whether measurements are missing or have wrong times. Flights with such a fault are flown one by one."""
+
+    @property
+    def memory(self) -> int:
+        """Number of earlier measurements that the fault needs."""
+        return 0
+
+    @abc.abstractmethod
+    def __call__(self, past: State, tick: Int[Array, ""], key: Key[Array, ""]) -> State:
+        """Return the reported state.
+
+        Args:
+            past: Correct measurements, oldest first (leading axis ``memory`` + 1); the last one is due now.
+            tick: Number of the measurement since the start of the flight.
+            key: Seed of this measurement; consumed.
+        """
+
+    def is_missing(self, tick: int) -> bool:
+        """Return whether no measurement arrives at a tick."""
+        del tick
+        return False
+
+    def clock_error(self, tick: int) -> float:
+        """Return by how much the time of a measurement is wrong [s]."""
+        del tick
+        return 0.0
+
+
+class VelocitySpikes(AbstractMeasurementFault):
+    """One velocity in every so many is wrong, as after two markers of a motion-capture system were swapped."""
+
+    v: Float[Array, "3"]
+    """Error, world [m/s]."""
+    every: Int[Array, ""]
+    """[ticks]"""
+
+    def __call__(self, past: State, tick: Int[Array, ""], key: Key[Array, ""]) -> State:
+        """Add the error to the last of every ``every`` velocities."""
+        x = _newest(past)
+        return State(x.p, x.R, x.v + jnp.where(_last_of(tick, self.every), self.v, 0.0).astype(x.v.dtype))
+
+
+class SwappedMarkers(AbstractMeasurementFault):
+    """One pose in every so many is that of a rigid body whose markers were confused: turned and shifted."""
+
+    p: Float[Array, "3"]
+    """Shift, world [m]."""
+    rotation: Float[Array, "3"]
+    """Rotation vector, body frame [rad]."""
+    every: Int[Array, ""]
+    """[ticks]"""
+
+    def __call__(self, past: State, tick: Int[Array, ""], key: Key[Array, ""]) -> State:
+        """Turn and shift the last of every ``every`` poses."""
+        x = _newest(past)
+        now = _last_of(tick, self.every).astype(x.p.dtype)
+        turned = so3.mul(x.R, so3.exp(now * self.rotation.astype(x.p.dtype)))
+        return State(x.p + now * self.p.astype(x.p.dtype), turned, x.v)
+
+
+class Late(AbstractMeasurementFault):
+    """Every measurement is older than its declared age."""
+
+    ticks: int = eqx.field(static=True)
+
+    @property
+    def memory(self) -> int:
+        """Number of earlier measurements that the fault needs."""
+        return self.ticks
+
+    def __call__(self, past: State, tick: Int[Array, ""], key: Key[Array, ""]) -> State:
+        """Return the oldest measurement."""
+        return jax.tree.map(lambda leaf: leaf[0], past)  # type: ignore[no-any-return]
+
+
+class Frozen(AbstractMeasurementFault):
+    """The measurement system stops now and then and repeats its last state with new times."""
+
+    every: Int[Array, ""]
+    """Time between two stops [ticks]."""
+    duration: int = eqx.field(static=True)
+    """Length of a stop [ticks]."""
+
+    @property
+    def memory(self) -> int:
+        """Number of earlier measurements that the fault needs."""
+        return self.duration
+
+    def __call__(self, past: State, tick: Int[Array, ""], key: Key[Array, ""]) -> State:
+        """Return the state of the tick before the stop, or the newest one outside of a stop."""
+        since = tick % self.every
+        frozen = (tick >= self.every) & (since < self.duration)
+        row = self.duration - jnp.where(frozen, since + 1, 0)
+        return jax.tree.map(lambda leaf: leaf[row], past)  # type: ignore[no-any-return]
+
+
+class Repeated(AbstractMeasurementFault):
+    """A measurement is lost with some probability, and the one before it is reported again."""
+
+    probability: Float[Array, ""]
+
+    @property
+    def memory(self) -> int:
+        """Number of earlier measurements that the fault needs."""
+        return 1
+
+    def __call__(self, past: State, tick: Int[Array, ""], key: Key[Array, ""]) -> State:
+        """Return the newest measurement or the one before it."""
+        lost = random.uniform(key, (), self.probability.dtype) < self.probability
+        before, now = (jax.tree.map(lambda leaf, row=row: leaf[row], past) for row in (0, 1))
+        found: State = where(lost, before, now)
+        return found
+
+
+class ScaledVelocity(AbstractMeasurementFault):
+    """Velocities have a wrong scale."""
+
+    scale: Float[Array, ""]
+
+    def __call__(self, past: State, tick: Int[Array, ""], key: Key[Array, ""]) -> State:
+        """Scale the velocity."""
+        x = _newest(past)
+        return State(x.p, x.R, self.scale.astype(x.v.dtype) * x.v)
+
+
+class Biased(AbstractMeasurementFault):
+    """Velocity and attitude have constant errors."""
+
+    v: Float[Array, "3"]
+    """World [m/s]."""
+    rotation: Float[Array, "3"]
+    """Rotation vector, body frame [rad]."""
+
+    def __call__(self, past: State, tick: Int[Array, ""], key: Key[Array, ""]) -> State:
+        """Add the errors."""
+        x = _newest(past)
+        return State(x.p, so3.mul(x.R, so3.exp(self.rotation.astype(x.p.dtype))), x.v + self.v.astype(x.v.dtype))
+
+
+class DriftingPosition(AbstractMeasurementFault):
+    """The position drifts back and forth, as the estimate of a camera does, and the velocity does not show it."""
+
+    amplitude: Float[Array, "3"]
+    """World [m]."""
+    period: Float[Array, ""]
+    """[ticks]"""
+
+    def __call__(self, past: State, tick: Int[Array, ""], key: Key[Array, ""]) -> State:
+        """Add the drift of this tick."""
+        x = _newest(past)
+        phase = 2.0 * jnp.pi * tick.astype(x.p.dtype) / self.period.astype(x.p.dtype)
+        return State(x.p + jnp.sin(phase) * self.amplitude.astype(x.p.dtype), x.R, x.v)
+
+
+class Gaps(AbstractMeasurementFault):
+    """No measurement arrives for a while; the vehicle goes on with the last command."""
+
+    every: int = eqx.field(static=True)
+    """Time between two gaps [ticks]."""
+    duration: int = eqx.field(static=True)
+    """Length of a gap [ticks]."""
+    interrupts: ClassVar[bool] = True
+
+    def __call__(self, past: State, tick: Int[Array, ""], key: Key[Array, ""]) -> State:
+        """Return the newest measurement."""
+        return _newest(past)
+
+    def is_missing(self, tick: int) -> bool:
+        """Return whether the tick lies in a gap."""
+        return tick >= self.every and tick % self.every < self.duration
+
+
+class JumpingClock(AbstractMeasurementFault):
+    """The clock of the measurements jumps ahead, and back again later."""
+
+    every: int = eqx.field(static=True)
+    """Time between two jumps [ticks]."""
+    jump: float = eqx.field(static=True)
+    """[s]"""
+    interrupts: ClassVar[bool] = True
+
+    def __call__(self, past: State, tick: Int[Array, ""], key: Key[Array, ""]) -> State:
+        """Return the newest measurement."""
+        return _newest(past)
+
+    def clock_error(self, tick: int) -> float:
+        """Return the jump in every other interval."""
+        return self.jump if tick // self.every % 2 else 0.0
+
+
+def _newest(past: State) -> State:
+    return jax.tree.map(lambda leaf: leaf[-1], past)  # type: ignore[no-any-return]
+
+
+def _last_of(tick: Int[Array, ""], every: Int[Array, ""]) -> Bool[Array, ""]:
+    return tick % every == every - 1
