@@ -21,6 +21,7 @@ from retrim.config.vehicle_file import VehicleSpec
 from retrim.config.vehicles import make_vehicle
 from retrim.control.controller import PolicyController
 from retrim.control.gravity_frame import GravityFrame, SeenFrame
+from retrim.control.monitor import Monitor
 from retrim.learn import policy_loss
 from retrim.physics.actuators import Lagged
 from retrim.physics.dynamics import PointMass
@@ -201,6 +202,8 @@ def test_the_pilot_has_the_presets_schedule(built, latency, monkeypatch):
         assert isinstance(flown, SeenFrame)
         flown = flown.inner
     elif a.frame == "gravity":
+        assert isinstance(flown, Monitor)
+        flown = flown.frame
         assert isinstance(flown, GravityFrame)
         assert flown.observer.delay_ticks == preset.plant_delay_ticks
         assert flown.known.model is made.learner.residual_model

@@ -213,7 +213,7 @@ def test_what_is_known_needs_no_estimate(key):
         memory = replaced(memory, observer=observer.issued(first, u))  # no delay is declared: it acts at once
         after = Hybrid(PointMass(0.02), residual).step(x, u, jnp.zeros(3))
         _, memory = framed(memory, jnp.array(0.0), after)
-        apart = Unsteady(residual)(x, u) + d, residual(x, u)
+        apart = Unsteady(residual, jnp.array(1.0))(x, u) + d, residual(x, u)
         return apart, memory.observer.d_hat, (memory.frame.d, residual(after, u))
 
     apart, d_hat, both = seen()

@@ -16,7 +16,9 @@ from jaxtyping import Array, Float, Key
 from ..adapt.learner import LearnerState, OnlineLearner
 from ..adapt.workers import PolicyWorker, ResidualWorker
 from ..control.controller import AbstractController, PolicyController
+from ..control.gravity_frame import GravityFrame
 from ..control.lora import LoraPolicy
+from ..control.monitor import Monitor
 from ..control.policy import Policy
 from ..errors import ConfigError
 from ..learn.encoder import pretrain_encoder
@@ -195,12 +197,16 @@ class Setup:
         return pilot
 
     def controller(self, state: LearnerState) -> AbstractController[Any]:
-        """Return the controller of a policy that adapts: behind its observation, in the preset's frame."""
+        """Return the controller of a policy that adapts: behind its observation, in the preset's frame.
+
+        In the frame of effective gravity a monitor steps back from what was learned if that makes the flight worse.
+        """
         plain = PolicyController(self.flown.observation_in_flight, state.policy.policy.merged())
         if self.preset.adapt.frame == "world":
             return plain
         known = FittedResidual(self.learner.residual_model, state.residual)
-        return felt_frame(plain, self.preset, self.vehicle, known)
+        frame = felt_frame(plain, self.preset, self.vehicle, known)
+        return Monitor(frame, self.flown) if isinstance(frame, GravityFrame) else frame
 
     def low_rank(self, policy: Policy | LoraPolicy, key: Key[Array, ""]) -> LoraPolicy:
         """Return ``policy`` with a fresh low-rank delta (ranks 4, 10, 1 and scale 4, as in the paper).

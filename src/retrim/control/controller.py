@@ -11,6 +11,7 @@ from ..errors import FrameError
 from ..physics.felt_frame import FeltFrame
 from ..physics.state import Command, State
 from ..tasks.observation import AbstractObservation
+from .condition import Condition
 from .policy import Policy
 
 M = TypeVar("M")
@@ -55,6 +56,11 @@ class AbstractController(eqx.Module, Generic[M]):
         """
         del omega, a
         return self
+
+    def condition(self, memory: M) -> Condition | None:
+        """Return how far the controller has stepped back from its full function; None if it never does."""
+        del memory
+        return None
 
     def in_frame(self, frame: FeltFrame) -> "AbstractController[M]":
         """Return the same controller for states and commands of ``frame``.

@@ -43,6 +43,12 @@ class GravityFrame(AbstractController[GravityFrameState]):
     """How old measurements are [s]: the controller inside is shown what they say of now."""
     rate_bias: Float[Array, "3"] = eqx.field(default_factory=lambda: jnp.zeros(3))
     """The vehicle turns so much faster than it is told [rad/s], so it is told less."""
+    trust_estimate: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(1.0))
+    """Share of the disturbance that turns the frame: 0 flies the controller inside as it is."""
+    trust_known: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(1.0))
+    """Share of what has been learnt, residual and bias of the rates, that is used."""
+    steady: Float[Array, "3"] = eqx.field(default_factory=lambda: jnp.zeros(3))
+    """Disturbance that turns the frame beside the estimated one, world [m/s^2]."""
 
     def aged(self, age: float | Float[Array, ""]) -> "GravityFrame":
         """Return the same for measurements that are ``age`` old [s]."""
@@ -51,7 +57,7 @@ class GravityFrame(AbstractController[GravityFrameState]):
     def init(self, x: State) -> GravityFrameState:
         """Return the memory at the start of a flight."""
         observed = self.observer.init(x)
-        told = tuple(Command(u.c, u.omega - self.rate_bias.astype(x.p.dtype)) for u in observed.commands)
+        told = tuple(Command(u.c, u.omega - self._bias(x.p.dtype)) for u in observed.commands)
         observed = dataclasses.replace(observed, commands=told)
         return GravityFrameState(observed, self.inner.init(x), FeltFrame.of(observed.d_hat))
 
@@ -59,12 +65,13 @@ class GravityFrame(AbstractController[GravityFrameState]):
         """Return the inner controller's command in the frame of what is felt now."""
         observer, felt = self.observer, jnp.zeros_like(x.p)
         if self.known is not None:
-            unsteady = Unsteady(self.known)
+            unsteady = Unsteady(self.known, self.trust_known)
             felt = unsteady(x, memory.observer.commands[-1])
             observer = dataclasses.replace(observer, nominal=Hybrid(observer.nominal, unsteady))
         observed = observer(memory.observer, t, x)
-        frame = FeltFrame.of(capped(observed.d_hat + felt, observer.limit))
-        bias, last = self.rate_bias.astype(x.p.dtype), memory.observer.commands[0]
+        felt = self.trust_estimate.astype(x.p.dtype) * (observed.d_hat + felt) + self.steady.astype(x.p.dtype)
+        frame = FeltFrame.of(capped(felt, observer.limit))
+        bias, last = self._bias(x.p.dtype), memory.observer.commands[0]
         x = ahead(x, Command(last.c, last.omega + bias), frame.d, self.age.astype(x.p.dtype))
         u, inner = self.inner.in_frame(frame)(memory.inner, t, frame.state(x))
         u = frame.world_command(u)
@@ -74,8 +81,11 @@ class GravityFrame(AbstractController[GravityFrameState]):
     def accepted(self, memory: GravityFrameState, u: Command) -> GravityFrameState:
         """Remember the accepted command, in the observer and, as the frame has it, in the controller inside."""
         observer = self.observer.accepted(memory.observer, u)
-        meant = memory.frame.command(Command(u.c, u.omega + self.rate_bias.astype(u.omega.dtype)))
+        meant = memory.frame.command(Command(u.c, u.omega + self._bias(u.omega.dtype)))
         return GravityFrameState(observer, self.inner.accepted(memory.inner, meant), memory.frame)
+
+    def _bias(self, dtype: Any) -> Float[Array, "3"]:
+        return (self.trust_known * self.rate_bias).astype(dtype)
 
 
 class SeenFrame(AbstractController[tuple[OccludedMemory, Command]]):
@@ -108,10 +118,13 @@ class Unsteady(eqx.Module):
     """What a residual predicts beyond what it predicts at rest: that part depends on state and command."""
 
     residual: Residual
+    share: Float[Array, ""]
+    """Share of it that is used."""
 
     def __call__(self, x: State, u: Command) -> Float[Array, "3"]:
         """Return the rest of the residual acceleration, world frame [m/s^2]."""
-        return self.residual(x, u) - self.residual(State.at(x.p), Command.hover(x.p.dtype))
+        rest = self.residual(x, u) - self.residual(State.at(x.p), Command.hover(x.p.dtype))
+        return self.share.astype(x.p.dtype) * rest
 
 
 class Capped(eqx.Module):

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..adapt.learner import LearnerState
 from ..config.setup import Setup
+from ..control.condition import Condition
 from ..control.controller import AbstractController
 from ..control.policy import Policy
 from ..learn.bptt import PolicyState
@@ -83,8 +84,10 @@ def _source(setup: Setup, controller: Any, predicted: Any, parameters: dict[str,
 
     def decide(parameters: Any, inputs: Any) -> Any:
         memory, t, age, x = inputs
-        u, after = controller(parameters).aged(age)(memory, t, x)
-        return (u.c, u.omega), after
+        now = controller(parameters).aged(age)
+        u, after = now(memory, t, x)
+        condition = now.condition(after) or Condition(jnp.array(0), jnp.array(0))
+        return (u.c, u.omega, condition.stage, condition.cause), after
 
     def accepted(parameters: Any, inputs: Any) -> Any:
         return controller(parameters).accepted(*inputs)

@@ -2,9 +2,12 @@
 
 from collections.abc import Iterable
 
+from ..control.condition import describe_condition
+from ..learn.screening import describe_counts
 from ..runtime.events import Event
 from .status import Status
 
+EXCLUDED_EVERY = 5.0  # [s] between two events about excluded measurements: a window is as long
 WATCHDOG = "watchdog: the process that flew is gone or hangs, the watchdog flies the fallback"
 
 
@@ -22,6 +25,8 @@ class LiveEvents:
         self._given_up: set[int] = set()
         self._refused: dict[str, int] = {}
         self._knobs_refused = ""
+        self._next_excluded = 0.0  # [s]
+        self._last_stage = -1.0  # [s], time of the last change that was told
 
     def take(self, status: Status, others: Iterable[Event] = ()) -> list[Event]:
         """Return what is new, ``others`` included."""
@@ -36,6 +41,13 @@ class LiveEvents:
             if version not in self._given_up:
                 self._given_up.add(version)
                 new.append(Event(t, "guard", f"policy: version {version} is taken back, or comes from one that was"))
+        changes = [(at, stage, cause) for at, stage, cause in control.get("stages", []) if at > self._last_stage]
+        for at, stage, cause in changes:
+            self._last_stage = at
+            new.append(Event(at, "stage", describe_condition(stage, cause)))
+        if (excluded := describe_counts(status.excluded)) and t >= self._next_excluded:
+            self._next_excluded = t + EXCLUDED_EVERY
+            new.append(Event(t, "excluded", f"measurements that contradict each other, in the window: {excluded}"))
         new += [Event(t, "rejected", said) for said in status.rejections]
         for what, count in control.get("refused", {}).items():
             if count > self._refused.get(what, 0):

@@ -15,7 +15,7 @@ from jax import random
 
 from ..adapt.buffer import RollingBuffer
 from ..adapt.learner import LearnerState
-from ..adapt.updates import Layer, PolicyUpdate, ResidualUpdate, Update, pack_update
+from ..adapt.updates import NOTHING, Layer, PolicyUpdate, ResidualUpdate, Update, pack_update
 from ..adapt.workers import PolicyWorker, ResidualWorker
 from ..config.presets import Preset
 from ..config.setup import Setup
@@ -143,7 +143,10 @@ class LearnerLoop:
         """Publish what was learnt from the window of :meth:`due`, if it is still wanted."""
         self._learnt += 1
         took = self._clock() - self._began
-        note = pack_note(f"learner.{self.plan.layer}", learnt=self._learnt, took=took, until=update.computed_from)
+        note = pack_note(
+            f"learner.{self.plan.layer}", learnt=self._learnt, took=took, until=update.computed_from,
+            excluded=list(update.excluded if isinstance(update, ResidualUpdate) else NOTHING),
+        )  # fmt: skip
         self.bus.publish(f"learner.{self.plan.layer}", note)
         if self.plan.layer == "policy" and self._judge():
             return  # the policy that it was trained from was taken back meanwhile

@@ -12,7 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from ..control.condition import describe_condition
 from ..errors import ConfigError, MessageError
+from ..learn.screening import describe_counts
 from ..onboard.messages import Sample, last_note, last_sent, pack_note
 from ..onboard.realtime import Lifeline
 from ..transport.bus import Bus
@@ -22,6 +24,7 @@ from .knobs import Knobs
 from .panel import Panel
 from .scene import Scene
 from .spec import PageSpec
+from .status import excluded_counts
 
 RATE = 20.0  # [Hz]
 TEXT_EVERY = 5  # refreshes
@@ -179,6 +182,11 @@ def _text(
     lines.append(f"<span style='color:#3070d6'>estimate</span> {estimate} m/s²")
     for layer, note in learners.items():
         lines.append(f"{layer} learner: {note.get('learnt')} times, {1e3 * float(note.get('took', 0.0)):.0f} ms each")
+    if excluded := describe_counts(excluded_counts(learners.get("residual", {}))):
+        lines.append(f"measurements excluded from the fit: {excluded}")
+    for at, stage, cause in status.get("stages", [])[-1:]:
+        if stage:
+            lines.append(f"since {at:.1f} s {describe_condition(stage, cause)}")
     if not status.get("learning", True):
         lines.append("what was learnt does not fly")
     if world.get("knobs_refused"):

@@ -24,5 +24,14 @@ class Status:
     """How often the watchdog has commanded."""
     log_failed: str | None
     """Why the flight is no longer written down; None while it is."""
+    excluded: tuple[int, ...] = ()
+    """Numbers of measurements that the last fit excluded, by reason."""
     stalls: dict[str, Any] = field(default_factory=dict)
     """How often the machine stood still, and for how long."""
+
+
+def excluded_counts(note: dict[str, Any]) -> tuple[int, ...]:
+    """Return the numbers of excluded measurements of a learner's note; none if the note has no such numbers."""
+    counts = note.get("excluded", [])
+    plain = isinstance(counts, list) and all(type(n) is int and 0 <= n < 10**6 for n in counts)
+    return tuple(counts) if plain else ()

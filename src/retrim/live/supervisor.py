@@ -20,7 +20,7 @@ from ..transport.shared_memory import SharedMemoryBus
 from .plans import plan_of
 from .remote_learners import RemoteLearners
 from .spec import LiveSpec
-from .status import Status
+from .status import Status, excluded_counts
 from .topics import topics
 
 LANDING = 60.0  # [s], after which processes are ended wherever the vehicle is
@@ -183,7 +183,10 @@ class Supervisor:
         by_watchdog = last_sent(self.bus, "fallback") > last_sent(self.bus, "setpoint")
         ticks = 0 if fallback is None else fallback.version
         said, stalls = self._rejections(), last_note(self.bus, "stalls")
-        return Status(t, control, world, alive, dict(self.restarts), ended, said, by_watchdog, ticks, failed, stalls)
+        excluded = excluded_counts(last_note(self.bus, "learner.residual"))
+        return Status(
+            t, control, world, alive, dict(self.restarts), ended, said, by_watchdog, ticks, failed, excluded, stalls
+        )
 
     def finish(self, patience: float = 3.0) -> None:
         """Wait until the log is written."""

@@ -45,6 +45,8 @@ class ControlLoop:
         self.felt, self.estimate = np.zeros(3), np.zeros(3)
         """Acceleration that the simple model misses, over the last tenths of a second, and what the residual model says
         of it, world [m/s^2]."""
+        self.stages: deque[tuple[float, int, int]] = deque(maxlen=GAPS)
+        """Changes of the controller's stage: time since the start [s], stage, cause."""
         self._fallback = Fallback(GeometricHover(plan.limits, plan.dt))
         self._row: np.ndarray | None = None
         self._start, self._issued, self._target = 0.0, np.array([]), np.zeros(3)
@@ -145,6 +147,7 @@ class ControlLoop:
             newest=intake.newest, given_up=intake.given_up, refused=intake.refused, swaps=list(intake.swaps),
             missed=self.missed, gaps=list(self.gaps), late_samples=self.late_samples, felt=self.felt.tolist(),
             estimate=self.estimate.tolist(), target=self._target.tolist(), learning=self.intake.open,
+            stages=list(self.stages),
         ))  # fmt: skip
 
     def land(self, reason: str) -> None:
@@ -163,7 +166,10 @@ class ControlLoop:
         if not wrong and not new and len(self._issued):
             return self._issued
         if not wrong:
+            stage = self.pilot.condition[0]
             u, aimed = self.pilot.act(t, sample.age, sample.state), self._aim(t)
+            if self.pilot.condition[0] != stage:
+                self.stages.append((t, *self.pilot.condition))
             if aimed and np.isfinite(u).all():
                 self._issued = self.plan.limits.within(u)
                 if (self._issued != u).any():

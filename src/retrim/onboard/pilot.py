@@ -20,7 +20,7 @@ class ControllerSource:
     init: ProgramSource
     """(parameters, state) -> memory"""
     decide: ProgramSource
-    """(parameters, [memory, time, age, state]) -> command, memory"""
+    """(parameters, [memory, time, age, state]) -> command, stage of the controller and its cause, memory"""
     accepted: ProgramSource
     """(parameters, [memory, command]) -> memory, after the plant took another command than was issued"""
     target: ProgramSource
@@ -49,6 +49,8 @@ class LivePilot:
         self._policies: dict[int, Arrays] = {0: self._parameters["policy"]}  # the last proven one, and all after it
         self._parked: tuple[dict[str, Arrays], dict[str, int], dict[int, Arrays]] | None = None
         self._memory: Arrays = []
+        self.condition = 0, 0
+        """How far the controller has stepped back, and the cause; see :mod:`retrim.control.condition`."""
         self._prepared = self._prepare()
         self._old = self._prepared[1]
         self._jump, self._left, self._swapped = np.zeros(4), 0, False
@@ -57,6 +59,7 @@ class LivePilot:
         """Start a flight in the state ``x`` (p, R by rows, v)."""
         self._memory = self._init.step(self._prepared[0], self._state(x))
         self._left, self._swapped, self._jump = 0, False, np.zeros(4)
+        self.condition = 0, 0
 
     def target(self, t: float) -> np.ndarray:
         """Return where the vehicle should be at time ``t`` of the flight [s], world [m]."""
@@ -72,7 +75,8 @@ class LivePilot:
         """
         inputs = [self._scalar(t), self._scalar(age), *self._state(x)]
         decide, memory = self._prepared[1], self._memory
-        c, omega, *self._memory = self._decide.step(decide, [*memory, *inputs])
+        c, omega, stage, cause, *self._memory = self._decide.step(decide, [*memory, *inputs])
+        self.condition = int(stage), int(cause)
         u = np.concatenate([[c], omega]).astype(float)
         if self._swapped:
             before, rates, *_ = self._decide.step(self._old, [*memory, *inputs])

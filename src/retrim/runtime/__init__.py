@@ -6,6 +6,7 @@ from .batch import batch_flight as batch_flight
 from .events import Event as Event
 from .events import JsonlObserver as JsonlObserver
 from .events import Observer as Observer
+from .events import stage_events as stage_events
 from .flight import FlightStopped as FlightStopped
 from .flight import Log as Log
 from .flight import Recorder as Recorder

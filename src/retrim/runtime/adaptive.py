@@ -77,6 +77,7 @@ class AdaptivePilot(Pilot):
         tick = round(t / self.dt)
         self._apply(t, tick)
         u = self._pilot.act(measurement)
+        self._tell(self._pilot.take_events())
         self._buffer.push(t, measurement.x, u, measurement.age)
         due = [i for i, period in enumerate(self.periods) if tick // period > self._ticks_offered[i]]
         if due:
@@ -111,8 +112,11 @@ class AdaptivePilot(Pilot):
         for learner, _ in self.learners:
             for update in learner.poll(tick):
                 self._publish(update)
-                self.events.append(Event.of(t, update))
-                self._new_events.append(self.events[-1])
+                self._tell([Event.of(t, update)])
+
+    def _tell(self, events: Sequence[Event]) -> None:
+        self.events += events
+        self._new_events += events
 
     def _publish(self, update: Update) -> None:
         if isinstance(update, ResidualUpdate | PolicyUpdate):

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, ArrayLike, Int
 
+from ..control.condition import Condition
 from ..control.controller import AbstractController
 from ..physics.state import Command, State, where
 from ..plants.sim import SimState, Simulation
@@ -34,6 +35,8 @@ class Ticks(eqx.Module):
     """Command of the controller."""
     accepted: Command
     """Command that the plant accepted for the tick."""
+    condition: Condition | None
+    """Of the controller after its command; None for a controller that never steps back."""
 
 
 def take_off(simulation: Simulation, controller: AbstractController[Any], x0: State) -> InFlight:
@@ -87,8 +90,10 @@ def fly_ticks(
         accepted = simulation.within_limits(issued)
         limited = jnp.any(accepted.vector() != issued.vector())
         memory = where(limited, controller.accepted(memory, accepted), memory)
-        s = simulation.advance(s, accepted, k)
-        return InFlight(s, memory, k + 1), Ticks(simulation.true(s), simulation.measured(s), issued, accepted)
+        s, condition = simulation.advance(s, accepted, k), controller.condition(memory)
+        return InFlight(s, memory, k + 1), Ticks(
+            simulation.true(s), simulation.measured(s), issued, accepted, condition
+        )
 
     def step(i: Array, carry: tuple[InFlight, Ticks]) -> tuple[InFlight, Ticks]:
         flight, row = tick(carry[0])
@@ -96,7 +101,8 @@ def fly_ticks(
 
     x = simulation.true(flight.sim)
     u = Command.hover(x.p.dtype)
-    blank = jax.tree.map(lambda leaf: jnp.zeros((room, *leaf.shape), leaf.dtype), Ticks(x, x, u, u))
+    row = Ticks(x, x, u, u, controller.condition(flight.memory))
+    blank = jax.tree.map(lambda leaf: jnp.zeros((room, *leaf.shape), leaf.dtype), row)
     flown: tuple[InFlight, Ticks] = lax.fori_loop(0, ticks, step, (flight, blank))
     return flown
 

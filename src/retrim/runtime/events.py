@@ -4,7 +4,11 @@ import json
 from pathlib import Path
 from typing import NamedTuple, Protocol, runtime_checkable
 
+import numpy as np
+from jaxtyping import Float
+
 from ..adapt.updates import KINDS, Update
+from ..control.condition import Condition, describe_condition
 from ..physics.state import Command
 from ..plants.plant import Measurement
 
@@ -15,8 +19,8 @@ class Event(NamedTuple):
     t: float
     """Time since the start of the flight at which it became visible [s]."""
     kind: str
-    """``residual``, ``policy``, ``rejected`` (a result that must not be used), ``skipped`` (the learner was busy) or
-    ``terminated``."""
+    """``residual``, ``policy``, ``rejected`` (a result that must not be used), ``skipped`` (the learner was busy),
+    ``stage`` (the controller stepped back, or returned) or ``terminated``."""
     note: str
     """One line."""
 
@@ -24,6 +28,20 @@ class Event(NamedTuple):
     def of(cls, t: float, update: Update) -> "Event":
         """Return the event of an update that became visible at time ``t`` [s] of the flight."""
         return cls(t, KINDS[type(update)], update.note())
+
+
+def stage_events(conditions: Condition | None, t: Float[np.ndarray, " n"]) -> list[Event]:
+    """Return an event for each change of the stage of a controller.
+
+    Args:
+        conditions: Of each tick (leading axis n); None for a controller that never steps back.
+        t: Times of the ticks since the start of the flight [s].
+    """
+    if conditions is None:
+        return []
+    stages, causes = np.asarray(conditions.stage), np.asarray(conditions.cause)
+    changed = np.flatnonzero(np.diff(stages, prepend=0))
+    return [Event(float(t[k]), "stage", describe_condition(int(stages[k]), int(causes[k]))) for k in changed]
 
 
 @runtime_checkable

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..control.condition import Condition
 from ..control.controller import AbstractController
 from ..physics.state import Command, State
 from ..plants.plant import Measurement
@@ -65,16 +66,22 @@ class FunctionPilot(Pilot):
 
 
 class ControllerPilot(Pilot):
-    """Any controller as a pilot. ``controller`` may be replaced in flight; its memory goes on."""
+    """Any controller as a pilot. ``controller`` may be replaced in flight; its memory goes on.
+
+    Each change of the controller's stage is an event.
+    """
 
     def __init__(self, controller: AbstractController[Any]) -> None:
         self.controller = controller
         self._memory: Any = None
         self._start = 0.0
+        self._stage = 0
+        self._events: list[Event] = []
 
     def reset(self, measurement: Measurement) -> None:
         """Initialise the controller's memory."""
         self._memory, self._start = _begin(self.controller, measurement.x), measurement.t
+        self._stage, self._events = 0, []
 
     def act(self, measurement: Measurement) -> Command:
         """Call the controller once, with the time since the start of the flight."""
@@ -83,12 +90,23 @@ class ControllerPilot(Pilot):
         controller = self.controller.aged(measurement.age)
         if measurement.omega is not None and measurement.a is not None:
             controller = controller.sensing(measurement.omega, measurement.a)
-        u, self._memory = _decide(controller, self._memory, t, x)
+        u, self._memory, condition = _decide(controller, self._memory, t, x)
+        self._note(float(t), condition)
         return u
 
     def accepted(self, u: Command) -> None:
         """Correct the controller's memory of its last command."""
         self._memory = self.controller.accepted(self._memory, u)
+
+    def take_events(self) -> list[Event]:
+        """Return the changes of the controller's stage since the last call."""
+        found, self._events = self._events, []
+        return found
+
+    def _note(self, t: float, condition: Condition | None) -> None:
+        if condition is not None and int(condition.stage) != self._stage:
+            self._stage = int(condition.stage)
+            self._events.append(Event(t, "stage", condition.note()))
 
 
 @eqx.filter_jit
@@ -97,5 +115,8 @@ def _begin(controller: AbstractController[Any], x: State) -> Any:
 
 
 @eqx.filter_jit
-def _decide(controller: AbstractController[Any], memory: Any, t: Float[Array, ""], x: State) -> tuple[Command, Any]:
-    return controller(memory, t, x)
+def _decide(
+    controller: AbstractController[Any], memory: Any, t: Float[Array, ""], x: State
+) -> tuple[Command, Any, Condition | None]:
+    u, memory = controller(memory, t, x)
+    return u, memory, controller.condition(memory)

@@ -1,0 +1,54 @@
+"""Condition of a controller that can step back from a part of its function, and the words for it."""
+
+from enum import IntEnum
+
+import equinox as eqx
+from jaxtyping import Array, Int
+
+
+class Stage(IntEnum):
+    """Which parts of an adapted flight act."""
+
+    ADAPTED = 0
+    OBSERVED = 1
+    SLOW = 2
+    BASE = 3
+
+
+class Cause(IntEnum):
+    """Reason of the last change of the stage."""
+
+    NONE = 0
+    ERROR = 1
+    OSCILLATION = 2
+    RECOVERY = 3
+
+
+PARTS = {
+    Stage.ADAPTED: "the adapted policy flies",
+    Stage.OBSERVED: "the base policy flies with the disturbance observer",
+    Stage.SLOW: "the base policy flies with a slow mean of the estimated disturbance",
+    Stage.BASE: "the base policy flies alone",
+}
+GROUNDS = {
+    Cause.NONE: "start of the flight",
+    Cause.ERROR: "the error exceeds that predicted for the base policy",
+    Cause.OSCILLATION: "the estimated disturbance oscillates by itself, as with late or wrongly scaled measurements",
+    Cause.RECOVERY: "the error has been as small as predicted for the base policy",
+}
+
+
+class Condition(eqx.Module):
+    """How far a controller has stepped back, and why."""
+
+    stage: Int[Array, ""]
+    cause: Int[Array, ""]
+
+    def note(self) -> str:
+        """Return the condition in words, for the log."""
+        return describe_condition(int(self.stage), int(self.cause))
+
+
+def describe_condition(stage: int, cause: int) -> str:
+    """Return a stage and the cause of its beginning in words."""
+    return f"{PARTS[Stage(stage)]}: {GROUNDS[Cause(cause)]}"

@@ -1,0 +1,177 @@
+"""The monitor of an adapted policy: steps back when adapting makes a flight worse than not adapting.
+
+An adapted flight has parts that can fail on their own: the re-trained policy with what was learned of the residual, and
+the disturbance observer. The monitor flies them in stages:
+
+    ADAPTED   the re-trained policy, the learned residual and the observer,
+    OBSERVED  the base policy and the observer,
+    SLOW      the base policy and a mean of the estimate, which is slow enough for late or wrongly scaled measurements,
+    BASE      the base policy alone, in the world frame.
+
+Two tests step back. (1) A *twin*, a simulated vehicle, shows the flight of the base policy: in the nominal model with
+the mean of the estimated disturbance. If the error of the vehicle exceeds that of the twin in three intervals in a row,
+or by much in one, the flight goes back by one stage. It returns after a while, which doubles each time. (2) An estimate
+that swings back and forth by itself (:mod:`retrim.control.swings`) shows that the observer drives the vehicle:
+measurements are later than declared, or wrongly scaled. That does not heal in flight: the base policy flies at once,
+then with the slow mean, and after a second oscillation alone to the end.
+"""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from ..physics.state import Command, State, where
+from ..tasks.task import AbstractTask
+from .condition import Cause, Condition, Stage
+from .controller import AbstractController, PolicyController
+from .gravity_frame import GravityFrame, GravityFrameState
+from .policy import Policy
+from .swings import Swings
+
+INTERVAL = 1.0  # [s] over which errors are averaged
+MARGIN, FAR = 0.03, 0.7  # [m] beyond the error of the twin: too much in a row, and too much once
+STRIKES = 3  # intervals in a row; a vehicle recovers from the largest kick of the gauntlet within two
+LOST = 3.0  # [m]: a twin with a larger error begins again at the vehicle
+SWINGS = 8.0  # the largest kick of the gauntlet reaches 6.7, an observer with measurements 60 ms late exceeds 20
+CALM = 2.0  # swings up to which the estimate has its full weight
+RAMP = 0.2  # [s] at the start, within which the estimate gains its weight: a launch with late measurements drives it
+HOLD = 10.0  # [s] before the first return
+MEAN_TAU = 1.0  # [s], of the mean of the estimate
+
+
+class Twin(eqx.Module):
+    """A simulated vehicle that the base policy flies, beside the errors of both vehicles."""
+
+    x: State
+    memory: Any
+    """Of the base policy."""
+    excess: Float[Array, ""]
+    """Sum over the interval of the error of the vehicle minus that of the twin [m]."""
+    ticks: Int[Array, ""]
+    """Since the start of the interval."""
+
+
+class MonitorState(eqx.Module):
+    """Memory of the monitor."""
+
+    flight: GravityFrameState
+    base: Policy
+    """Policy at take-off."""
+    stage: Int[Array, ""]
+    cause: Int[Array, ""]
+    """Reason of the last change of the stage."""
+    best: Int[Array, ""]
+    """Stage beyond which the flight does not return."""
+    swings: Swings
+    d: Float[Array, "3"]
+    """Mean of the estimated disturbance, world [m/s^2]."""
+    twin: Twin
+    strikes: Int[Array, ""]
+    """Intervals in a row with an error beyond that of the twin."""
+    wait: Float[Array, ""]
+    """Time until the flight may return to the stage before [s]."""
+    hold: Float[Array, ""]
+    """Time that the next step back lasts [s]."""
+
+
+class Monitor(AbstractController[MonitorState]):
+    """Flies an adapted policy in the frame of effective gravity, and steps back from it."""
+
+    frame: GravityFrame
+    """The adapted flight; the controller inside is a :class:`~retrim.control.controller.PolicyController`."""
+    task: AbstractTask
+    """It measures the error."""
+
+    def aged(self, age: float | Float[Array, ""]) -> "Monitor":
+        """Return the same for measurements that are ``age`` old [s]."""
+        return Monitor(self.frame.aged(age), self.task)
+
+    def init(self, x: State) -> MonitorState:
+        """Return the memory at the start of a flight; the policy of now is the base policy from then on."""
+        policy, zero, never = self._inner.policy, jnp.zeros_like(x.p[0]), jnp.array(0)
+        twin = Twin(x, self._inner.init(x), zero, never)
+        flight, hold = self.frame.init(x), jnp.full_like(zero, HOLD)
+        still = jnp.zeros_like(x.p)
+        return MonitorState(flight, policy, never, never, never, Swings.none(still), still, twin, never, zero, hold)
+
+    def __call__(self, memory: MonitorState, t: Float[Array, ""], x: State) -> tuple[Command, MonitorState]:
+        """Decide the command of this stage, and judge the stage."""
+        adapted, observed = memory.stage == Stage.ADAPTED, memory.stage <= Stage.OBSERVED
+        slow = memory.stage == Stage.SLOW
+        flying = dataclasses.replace(
+            self.frame,
+            inner=PolicyController(self._inner.observation, where(adapted, self._inner.policy, memory.base)),
+            trust_estimate=observed.astype(x.p.dtype) * self._trust(memory, t),
+            trust_known=adapted.astype(x.p.dtype),
+            steady=slow.astype(x.p.dtype) * memory.d,
+        )
+        u, flight = flying(memory.flight, t, x)
+        return u, self._judged(dataclasses.replace(memory, flight=flight), t, x)
+
+    def accepted(self, memory: MonitorState, u: Command) -> MonitorState:
+        """Remember the accepted command."""
+        adapted = (memory.stage == Stage.ADAPTED).astype(u.c.dtype)
+        frame = dataclasses.replace(self.frame, trust_known=adapted)
+        return dataclasses.replace(memory, flight=frame.accepted(memory.flight, u))
+
+    def condition(self, memory: MonitorState) -> Condition:
+        """Return the stage of the next command, and its cause."""
+        return Condition(memory.stage, memory.cause)
+
+    def _trust(self, memory: MonitorState, t: Float[Array, ""]) -> Float[Array, ""]:
+        """Return the weight of the estimate: small at the launch, and the smaller the more the estimate swings."""
+        calm = jnp.clip((SWINGS - memory.swings.size) / (SWINGS - CALM), 0.0, 1.0)
+        return calm * jnp.minimum(1.0, t / RAMP).astype(calm.dtype)
+
+    @property
+    def _inner(self) -> PolicyController:
+        assert isinstance(self.frame.inner, PolicyController)
+        return self.frame.inner
+
+    def _judged(self, s: MonitorState, t: Float[Array, ""], x: State) -> MonitorState:
+        """Return the memory after the tests of this tick."""
+        dt, d_hat = self.frame.observer.nominal.dt, s.flight.observer.d_hat
+        d = s.d + (dt / MEAN_TAU) * (d_hat - s.d)
+        swings = s.swings.after(d_hat, dt)
+        twin = self._step(s, t, x)
+        over = twin.ticks >= round(INTERVAL / dt)
+        excess = twin.excess / twin.ticks
+        worse = over & (excess > MARGIN)
+        strikes = jnp.where(over, jnp.where(worse, s.strikes + 1, 0), s.strikes)
+        strikes = jnp.where(over & (excess > FAR), STRIKES, strikes)
+        failed = (strikes >= STRIKES) & (s.stage < Stage.BASE)
+        swung = swings.size > SWINGS
+        wait = jnp.maximum(s.wait - dt, 0.0)
+        returns = over & ~worse & ~failed & (wait <= 0.0) & (s.stage > s.best)
+        stage = s.stage + failed.astype(s.stage.dtype) - returns.astype(s.stage.dtype)
+        moved = failed | returns
+        cause = jnp.where(failed, Cause.ERROR, jnp.where(returns, Cause.RECOVERY, s.cause))
+        cause = jnp.where(swung & (s.stage < Stage.BASE), Cause.OSCILLATION, cause)
+        best = jnp.where(s.stage < Stage.SLOW, Stage.SLOW, Stage.BASE)
+        calm = Swings.none(d_hat)
+        return MonitorState(
+            flight=s.flight,
+            base=s.base,
+            stage=jnp.where(swung, Stage.BASE, stage),
+            cause=cause,
+            best=jnp.where(swung & (s.stage < Stage.BASE), best, s.best),
+            swings=where(swung, calm, swings),
+            d=d,
+            twin=Twin(twin.x, twin.memory, jnp.where(over, 0.0, twin.excess), jnp.where(over, 0, twin.ticks)),
+            strikes=jnp.where(moved | swung, 0, strikes),
+            wait=jnp.where(moved | swung, s.hold, wait),
+            hold=jnp.where(failed, 2.0 * s.hold, s.hold),
+        )
+
+    def _step(self, s: MonitorState, t: Float[Array, ""], x: State) -> Twin:
+        """Return the twin one tick later."""
+        nominal, base = self.frame.observer.nominal, PolicyController(self._inner.observation, s.base)
+        excess = self.task.error(t, x) - self.task.error(t, s.twin.x)
+        near = self.task.error(t, s.twin.x) < LOST  # false for an error that is not a number, too
+        at, memory = where(near, (s.twin.x, s.twin.memory), (x, base.init(x)))
+        u, memory = base(memory, t, at)
+        after = nominal.state(nominal.step(nominal.init(at), u, s.d))
+        return Twin(after, memory, s.twin.excess + jnp.where(near, excess, 0.0), s.twin.ticks + 1)

@@ -1,0 +1,177 @@
+"""The monitor: calm flights keep what was learned; errors and oscillations step back, in order, with a cause."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import random
+
+from helpers import CheapModel
+from retrim.config import Setup, changed, load
+from retrim.config.faults import measurement_fault
+from retrim.control.condition import Cause, Stage, describe_condition
+from retrim.control.monitor import HOLD, INTERVAL, MARGIN, STRIKES, Monitor, Twin
+from retrim.control.swings import Swings
+from retrim.learn import PolicyState
+from retrim.physics import Constant, LinearDragQuadrotor, State, small
+from retrim.plants.sim import Simulation
+from retrim.runtime import stage_events
+from retrim.runtime.batch import fly_ticks, take_off
+
+pytestmark = pytest.mark.usefixtures("as_a_user")
+
+DT = 0.02
+
+
+@pytest.fixture(scope="module")
+def flying(as_a_user):
+    """A policy that hovers, and a monitor of it that has learned nothing."""
+    brief = {"hidden_sizes": (32, 32), "num_envs": 8, "num_updates": 200, "horizon": 100, "learning_rate": 0.01}
+    setup = Setup.of(changed(load("hover/retrim"), pretrain=brief))
+    policy = setup.pretrained(0)
+    return setup, policy, setup.controller(setup.learner.init(policy, random.key(0)))
+
+
+def flight(setup, monitor, *, seconds=4.0, fault=None, later=None, model=CheapModel(DT)):  # noqa: B008
+    """Fly from a start; after 2 s ``later`` takes over, if there is one."""
+    push = Constant(jnp.full(3, 0.5, dtype=jnp.float32))
+    simulation = Simulation(model, push, None, random.key(0), 0.02, fault)
+    half, whole = round(2.0 / DT), round(seconds / DT)
+
+    @eqx.filter_jit
+    def fly(monitor, later, x0):
+        begun = take_off(simulation, monitor, x0)
+        begun, first = fly_ticks(simulation, monitor, begun, half, room=half)
+        _, second = fly_ticks(simulation, later, begun, whole - half, room=whole - half)
+        return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), first, second)
+
+    ticks = fly(monitor, monitor if later is None else later, setup.flight_starts(1, 4)[0])
+    return ticks, np.linalg.norm(np.asarray(ticks.true.p) - np.array(setup.preset.goal), axis=1)
+
+
+def stages(ticks):
+    return np.asarray(ticks.condition.stage)
+
+
+def test_a_calm_flight_stays_adapted(flying):
+    setup, _, monitor = flying
+    ticks, error = flight(setup, monitor)
+    assert (stages(ticks) == Stage.ADAPTED).all()
+    assert error[-25:].max() < 0.02
+    assert stage_events(ticks.condition, DT * np.arange(200.0)) == []
+
+
+def test_a_policy_that_flies_worse_is_given_up(flying):
+    """The policy that takes over at 2 s commands what another task would: the monitor flies the base policy again."""
+    setup, policy, monitor = flying
+    worse = eqx.tree_at(lambda p: p.layers[-1].bias, policy, replace_fn=lambda b: b + jnp.array(0.15, b.dtype))
+    later = setup.controller(setup.learner.init(worse, random.key(0)))
+    ticks, error = flight(setup, monitor, later=later, seconds=9.0)
+    changes = stage_events(ticks.condition, DT * np.arange(450.0))
+    assert changes[0].kind == "stage"
+    assert changes[0].note == describe_condition(Stage.OBSERVED, Cause.ERROR)
+    assert 2.0 + (STRIKES - 1) * INTERVAL < changes[0].t < 2.0 + (STRIKES + 1) * INTERVAL + DT
+    worst = error[(changes[0].t > DT * np.arange(450)) & (DT * np.arange(450) > 2.5)].max()
+    assert worst > MARGIN
+    assert error[-25:].max() < 0.02 < worst
+
+
+def test_late_measurements_do_not_fly_the_estimate(flying):
+    """Measurements that are 60 ms late make the observer drive the vehicle; the base policy flies on."""
+    setup, policy, monitor = flying
+    world = {"fault": measurement_fault("late=3"), "model": LinearDragQuadrotor.of(small(), DT), "seconds": 8.0}
+    ticks, error = flight(setup, monitor, **world)
+    _, observed = flight(setup, monitor.frame, **world)
+    assert not observed[-50:].max() < 1.0
+    assert stages(ticks).max() > Stage.OBSERVED
+    assert error[-50:].max() < 0.5
+
+
+def judged(monitor, memory, *, excess, ticks=1):
+    """The memory after some intervals whose errors exceed those of the twin by so much [m]."""
+    x = State.at(jnp.array([0.0, 0.0, 1.0], jnp.float32))
+    last = round(INTERVAL / DT)
+    for _ in range(ticks):
+        twin = Twin(memory.twin.x, memory.twin.memory, jnp.float32(excess * last), jnp.array(last - 1))
+        memory = judge(monitor, dataclasses.replace(memory, twin=twin), jnp.float32(0.0), x)
+    return memory
+
+
+@eqx.filter_jit
+def begin(monitor, x):
+    return monitor.init(x)
+
+
+@eqx.filter_jit
+def judge(monitor, memory, t, x):
+    return monitor(memory, t, x)[1]
+
+
+def test_steps_back_are_in_order_and_last_longer_each_time(flying):
+    _, _, monitor = flying
+    memory = begin(monitor, State.at(jnp.array([0.0, 0.0, 1.0], jnp.float32)))
+    waits = []
+    for stage in (Stage.OBSERVED, Stage.SLOW, Stage.BASE):
+        memory = judged(monitor, memory, excess=2.0 * MARGIN, ticks=STRIKES)
+        assert int(memory.stage) == stage
+        assert int(memory.cause) == Cause.ERROR
+        waits.append(float(memory.wait))
+    np.testing.assert_allclose(waits, [HOLD, 2 * HOLD, 4 * HOLD], atol=0.1)
+    memory = judged(monitor, memory, excess=2.0 * MARGIN, ticks=STRIKES)
+    assert int(memory.stage) == Stage.BASE
+    rested = dataclasses.replace(memory, wait=jnp.zeros_like(memory.wait))
+    back = judged(monitor, rested, excess=0.0)
+    assert (int(back.stage), int(back.cause)) == (Stage.SLOW, Cause.RECOVERY)
+
+
+def test_fewer_bad_intervals_than_needed_change_nothing(flying):
+    _, _, monitor = flying
+    memory = begin(monitor, State.at(jnp.array([0.0, 0.0, 1.0], jnp.float32)))
+    for _ in range(3):
+        memory = judged(monitor, memory, excess=2.0 * MARGIN, ticks=STRIKES - 1)
+        memory = judged(monitor, memory, excess=0.5 * MARGIN)
+    assert int(memory.stage) == Stage.ADAPTED
+    assert int(judged(monitor, memory, excess=1.0).stage) == Stage.OBSERVED  # far off: once is enough
+
+
+def test_a_second_oscillation_is_the_last_one(flying):
+    _, _, monitor = flying
+    memory = begin(monitor, State.at(jnp.array([0.0, 0.0, 1.0], jnp.float32)))
+    wild = lambda m: dataclasses.replace(m, swings=dataclasses.replace(m.swings, size=jnp.float32(100.0)))  # noqa: E731
+    x = State.at(jnp.array([0.0, 0.0, 1.0], jnp.float32))
+    once = judge(monitor, wild(memory), jnp.float32(0.0), x)
+    assert (int(once.stage), int(once.best), int(once.cause)) == (Stage.BASE, Stage.SLOW, Cause.OSCILLATION)
+    back = judged(monitor, dataclasses.replace(once, wait=jnp.float32(0.0)), excess=0.0)
+    assert int(back.stage) == Stage.SLOW
+    twice = judge(monitor, wild(back), jnp.float32(0.0), x)
+    assert (int(twice.stage), int(twice.best)) == (Stage.BASE, Stage.BASE)
+    rested = judged(monitor, dataclasses.replace(twice, wait=jnp.float32(0.0)), excess=0.0)
+    assert int(rested.stage) == Stage.BASE
+
+
+def test_swings_count_reversals_and_not_steps():
+    def size(ds):
+        def tick(s, d):
+            s = s.after(d, DT)
+            return s, s.size
+
+        return float(jnp.max(jax.lax.scan(tick, Swings.none(jnp.zeros(3)), ds)[1]))
+
+    t = DT * jnp.arange(250.0)
+    along_x = jnp.array([1.0, 0.0, 0.0])
+    assert size(jnp.where(t < 1.0, 0.0, 3.0)[:, None] * along_x) == pytest.approx((3.0 / 4.0) ** 2, rel=1e-6)
+    assert size(0.9 * jnp.sin(6.0 * t)[:, None] * along_x) == 0.0  # smaller than a swing
+    slow = size(4.0 * jnp.sin(1.0 * t)[:, None] * along_x)
+    fast = size(4.0 * jnp.sin(8.0 * t)[:, None] * along_x)
+    assert slow < 8.0 < fast
+
+
+def test_the_monitor_has_the_frame_of_the_set_up(flying):
+    setup, policy, monitor = flying
+    assert isinstance(monitor, Monitor)
+    again = setup.controller(setup.learner.init(policy, random.key(1)))
+    assert jax.tree.structure(again.frame.observer) == jax.tree.structure(monitor.frame.observer)
+    assert isinstance(setup.learner.init(policy, random.key(1)).policy, PolicyState)
