@@ -5,6 +5,7 @@ import shutil
 import time
 from pathlib import Path
 from unittest.mock import MagicMock
+from urllib.parse import urlsplit
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +15,7 @@ from live_processes import DT, HOME, level
 from retrim.errors import ConfigError
 from retrim.live.knobs import Knobs
 from retrim.live.page import PagePlan, _Page, free_port
+from retrim.live.page_access import page_url
 from retrim.live.scene import quaternion
 from retrim.live.spec import PageSpec
 from retrim.onboard.launch import launch
@@ -71,7 +73,7 @@ def flight(tmp_path):
     spec = PageSpec("127.0.0.1", port, "hover", HOME[None].repeat(2, 0), ("full", "lora"), 0.06, 0.19, paths)
     process = launch("retrim.live.page:show", PagePlan(bus.folder, spec, os.getpid()), tmp_path / "page.log")
     try:
-        yield bus, f"http://127.0.0.1:{port}"
+        yield bus, page_url("127.0.0.1", port, spec.token)
     finally:
         process.terminate()
         process.wait()
@@ -105,7 +107,7 @@ def test_it_says_who_flies_now_and_not_who_once_did(monkeypatch):
 def test_it_listens_on_the_loopback_address_only(flight):
     bus, url = flight
     hover(bus, 60.0, lambda: bus.latest("ready.page") is not None)
-    port = int(url.rpartition(":")[2])
+    port = urlsplit(url).port
     assert unpack_note(bus.latest("ready.page").data, "ready")["port"] == port
     rows = [line.split() for file in ("tcp", "tcp6") for line in Path(f"/proc/net/{file}").read_text().splitlines()[1:]]
     listening = {row[1].split(":")[0] for row in rows if row[3] == "0A" and int(row[1].split(":")[1], 16) == port}

@@ -3,7 +3,6 @@
 import os
 import sys
 import threading
-import webbrowser
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -27,6 +26,7 @@ from ..live.display import figures, live_line, live_rows
 from ..live.events import LiveEvents
 from ..live.flying import fly_live
 from ..live.page import page_address
+from ..live.page_opening import open_page
 from ..live.session import LONGEST, LiveRequest, check_limits, learners_at
 from ..live.status import Status
 from ..runtime.events import Event
@@ -74,7 +74,7 @@ def live(
             machine listens there), or ros:HOST:PORT of a rosmaster. By default they run here.
         page: Show the flight in a browser, with knobs, also with `--seconds`; without it, that is the default.
         no_page: Show it in the terminal only.
-        page_host: Address that the page listens on. Anybody who reaches another than 127.0.0.1 may turn the knobs.
+        page_host: Address that the page listens on; its printed address has a token, without which nothing is answered.
         page_port: Port of the page, or the next one that is free.
         record: FILE.mcap for Foxglove and PlotJuggler, by default flight.mcap in the folder; or FILE.rrd for rerun.
         out: Folder of what the flight leaves; a new one under runs/ by default.
@@ -114,7 +114,7 @@ def live(
 
 def _fly(request: LiveRequest, run: Run) -> int:
     """Fly one flight, and show what it leaves."""
-    done = fly_live(request, run, RichReporter(), _display, _open_page)
+    done = fly_live(request, run, RichReporter(), _display, lambda url: _open_page(url, run.folder))
     if done is None:
         return INTERRUPTED
     show_table(TableSection(("figure", "unit", "value"), figures(done.rows), f"live, {done.flight.log.t[-1]:.1f} s"))
@@ -123,11 +123,11 @@ def _fly(request: LiveRequest, run: Run) -> int:
     return run.exit_code or int(not done.landed)
 
 
-def _open_page(url: str) -> None:
+def _open_page(url: str, folder: Path) -> None:
     """Say where the page is, and open it where there is a screen."""
     console.print(f"page: {url}", markup=False, soft_wrap=True)
     if console.is_terminal and (sys.platform == "darwin" or {"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ)):
-        webbrowser.open(url)
+        open_page(url, folder)
 
 
 @contextmanager

@@ -21,6 +21,7 @@ from ..onboard.messages import ACCOUNTS, COMMAND, MEASURED, TRUE
 from ..runtime.events import Event
 from ..tasks.transition import spliced
 from .events import LiveEvents
+from .page_access import page_url
 from .report import complaints, flight_of, histograms, learnt_in, results
 from .session import LEARNING, LiveRequest, live_spec
 from .status import Status
@@ -74,8 +75,9 @@ def fly_live(
         with Supervisor(live_spec(request)) as supervisor:
             if not _warmed_up(supervisor, run, reporter):
                 return None
-            if request.page is not None and supervisor.page_port is not None:
-                opened(f"http://{request.page[0]}:{supervisor.page_port}")
+            page = supervisor.spec.page
+            if request.page is not None and page is not None and supervisor.page_port is not None:
+                opened(page_url(request.page[0], supervisor.page_port, page.token))
             show = screen.enter_context(display(events))
             with closing(Wishes(request, supervisor)) as wishes:
                 status = watched(supervisor, request.seconds, events, show, run.stop, wishes)

@@ -21,6 +21,7 @@ from ..transport.bus import Bus
 from ..transport.remote import LOOPBACK
 from ..transport.shared_memory import SharedMemoryBus
 from .knobs import Knobs
+from .page_access import only_for
 from .panel import Panel
 from .scene import Scene
 from .spec import PageSpec
@@ -28,6 +29,7 @@ from .status import excluded_counts
 
 RATE = 20.0  # [Hz]
 TEXT_EVERY = 5  # refreshes
+LONGEST_NAME = 253  # letters, of a host
 
 
 @dataclass(frozen=True)
@@ -46,14 +48,16 @@ def free_port(host: str, wanted: int) -> int:
     Raises:
         ConfigError: There is none, or no such address on this machine.
     """
-    error: OSError | None = None
+    if not host.isprintable() or len(host) > LONGEST_NAME:
+        raise ConfigError(f"page: {host[:80]!r} is no address of this machine")
+    reason = ""
     for port in range(wanted, min(wanted + 10, 65536)):
         try:
             with socket.create_server((host, port)):
                 return port
-        except OSError as found:
-            error = found
-    raise ConfigError(f"page: no free port from {wanted} on at {host!r} ({error})")
+        except (OSError, ValueError) as error:  # not every text can be a name
+            reason = str(getattr(error, "strerror", None) or error)[:160]
+    raise ConfigError(f"page: no free port from {wanted} on at {host[:80]!r} ({reason})")
 
 
 def page_address(host: str, port: int, *, demanded: bool, say: Callable[[str], None]) -> tuple[str, int] | None:
@@ -77,7 +81,10 @@ def page_address(host: str, port: int, *, demanded: bool, say: Callable[[str], N
         return None
     free_port(host, port)
     if host not in LOOPBACK:
-        say(f"warning: the page listens on {host}; anybody who reaches it may turn the knobs and land the vehicle")
+        say(
+            f"warning: the page listens on {host}; anybody who has its printed address may turn the knobs and land "
+            "the vehicle, and it travels unencrypted"
+        )
     return host, port
 
 
@@ -86,7 +93,8 @@ def show(plan: PagePlan) -> None:
     import viser
 
     bus, parent, spec = SharedMemoryBus(plan.folder), Lifeline(plan.parent), plan.page
-    with contextlib.redirect_stdout(io.StringIO()):  # it prints where it is; so do we
+    # It prints where it is; so do we.
+    with contextlib.redirect_stdout(io.StringIO()), only_for(spec.token, spec.host):
         server = viser.ViserServer(host=spec.host, port=spec.port, label=f"retrim: {spec.name}", verbose=False)
     page = _Page(spec, bus, server)
     bus.publish("ready.page", pack_note("ready", port=server.get_port()))

@@ -1,0 +1,126 @@
+"""Who may reach the page of a flight: whoever has the address that was printed, from that address only.
+
+Every website that is open in a browser can send requests to this machine. A request is therefore answered only if its
+path begins with a random token, its ``Host`` is the address that it has reached, and its ``Origin`` is the page itself.
+A name that a stranger points at this machine (DNS rebinding) is another ``Host``.
+"""
+
+import contextlib
+import hmac
+import socket
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from http import HTTPStatus
+from ipaddress import IPv6Address, ip_address
+from typing import Any
+
+from ..errors import PlantError
+
+EVERYWHERE = ("", "0.0.0.0", "::")
+"""Addresses that stand for all of this machine's."""
+SEALED = {
+    "Referrer-Policy": "no-referrer",  # a link to elsewhere would carry the token
+    "Cache-Control": "no-store",
+    "X-Frame-Options": "DENY",
+    "Content-Security-Policy": "frame-ancestors 'none'",
+    "Cross-Origin-Resource-Policy": "same-origin",
+}
+"""Headers of every answer."""
+
+
+def page_url(host: str, port: int, token: str) -> str:
+    """Return the address of a page that listens on ``host``, with its token."""
+    return f"http://{_bracketed(_outward() if host in EVERYWHERE else host)}:{port}/{token}"
+
+
+def refusal(
+    path: str, headers: Mapping[str, tuple[str, ...]], *, token: str, host: str, local: tuple[Any, ...]
+) -> HTTPStatus | None:
+    """Return the status with which a request is refused; None if it may pass.
+
+    Args:
+        path: Of the request, with its query, as it came.
+        headers: All values of each header that the request has, by name in lower case.
+        token: First part of every path of the page.
+        host: Address that the page listens on.
+        local: Address and port that the request has reached, as of a socket.
+    """
+    named, origins = headers.get("host", ()), headers.get("origin", ())
+    if len(named) != 1 or named[0].lower() not in _authorities(host, local):
+        return HTTPStatus.FORBIDDEN
+    given = path.partition("?")[0].split("/")[1:2] if path.startswith("/") else []
+    if not hmac.compare_digest("".join(given).encode("utf-8", "replace"), token.encode()):
+        return HTTPStatus.NOT_FOUND
+    upgrade = bool(headers.get("upgrade", ()))  # browsers say where a WebSocket comes from, always
+    if (upgrade or origins) and origins != (f"http://{named[0].lower()}",):
+        return HTTPStatus.FORBIDDEN
+    return None
+
+
+@contextlib.contextmanager
+def only_for(token: str, host: str) -> Iterator[None]:
+    """Have every server of websockets that starts in this context answer only requests with the token.
+
+    viser serves files and WebSockets by one of them, and has no hook for who may reach it.
+
+    Args:
+        token: First part of every path of the page.
+        host: Address that the page listens on.
+
+    Raises:
+        PlantError: No server has started by the end, so that nothing is known to be protected.
+    """
+    import websockets.asyncio.server as servers
+
+    serve, started = servers.serve, list[bool]()
+
+    def guarded(*args: Any, process_request: Any = None, **named: Any) -> Any:
+        started.append(True)
+
+        def answer(connection: Any, request: Any) -> Any:
+            headers = {name.lower(): tuple(request.headers.get_all(name)) for name in request.headers}
+            refused = refusal(request.path, headers, token=token, host=host, local=connection.local_address)
+            if refused is not None:
+                response = connection.respond(refused, f"{refused.phrase}\n")
+            elif process_request is None:
+                response = None
+            else:
+                inner = request.path.partition(token)[2]
+                response = process_request(connection, replace(request, path=inner or "/"))
+            if response is not None:
+                for name, value in SEALED.items():
+                    response.headers[name] = value
+            return response
+
+        return serve(*args, process_request=answer, **named)
+
+    servers.serve = guarded  # type: ignore[assignment, misc]
+    try:
+        yield
+    finally:
+        servers.serve = serve  # type: ignore[misc]
+    if not started:
+        raise PlantError("page: this version of viser cannot be protected by a token; pip install 'retrim[page]'")
+
+
+def _authorities(host: str, local: tuple[Any, ...]) -> set[str]:
+    """Return how a browser may name the address that it has reached, with the port."""
+    address, port = ip_address(str(local[0]).partition("%")[0]), int(local[1])
+    if isinstance(address, IPv6Address) and address.ipv4_mapped is not None:
+        address = address.ipv4_mapped
+    names = {_bracketed(str(address))} | ({"localhost"} if address.is_loopback else set())
+    if host not in EVERYWHERE:
+        names.add(_bracketed(host.lower()))
+    return {f"{name}:{port}" for name in names} | (names if port == 80 else set())
+
+
+def _bracketed(host: str) -> str:
+    return f"[{host}]" if ":" in host else host
+
+
+def _outward() -> str:
+    """Return the address by which other machines reach this one; nothing is sent."""
+    with contextlib.suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.connect(("192.0.2.1", 9))
+        return str(probe.getsockname()[0])
+    return "127.0.0.1"
