@@ -18,7 +18,7 @@ from retrim.onboard.launch import launch
 from retrim.transport.shared_memory import SharedMemoryBus
 
 TOPICS = ("sample", "status", "setpoint", "fallback", "knobs", "wish", "followed", "ended", "world",
-          "learner.residual", "learner.policy", "ready.page")  # fmt: skip
+          "learner.residual", "learner.policy", "ready.page", "refusals")  # fmt: skip
 WITHIN = 60.0  # [s]
 
 

@@ -78,7 +78,10 @@ def test_pausing_keeps_what_flies_and_none_does_not(asked):
     assert wish(asked, method="none", paused=False) == ["asked: method none"]
     assert wish(asked, method="full", paused=False) == ["asked: method full"]
     assert asked._supervisor.told == [(True, True), (True, False), (False, True)]
-    assert wish(asked, method="magic") == []
+    assert wish(asked, method="magic") == ["refused: method 'magic': there are full, lora, none"]
+    assert wish(asked, method=1, land=True) == []
+    assert wish(asked, method="full", paused="yes") == []
+    assert "land" not in asked._supervisor.told
 
 
 def test_another_way_of_learning_goes_on_from_what_is_flown(asked):

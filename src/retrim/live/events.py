@@ -53,6 +53,7 @@ class LiveEvents:
             if count > self._refused.get(what, 0):
                 self._refused[what] = count
                 new.append(Event(t, "refused", f"message: {what}, {count} so far"))
+        new += [Event(t, "refused", said) for said in status.refusals]
         for role, count in status.restarts.items():
             if count > self._restarts.get(role, 0):
                 self._restarts[role] = count

@@ -1,6 +1,5 @@
 """What a person may do to a simulated vehicle in flight: push it, blow at it, load it, weaken a rotor."""
 
-import math
 from dataclasses import dataclass
 
 import jax.numpy as jnp
@@ -10,6 +9,7 @@ from ..config.disturbances import disturbance
 from ..config.scenario import Scenario
 from ..errors import MessageError, PlantError
 from ..onboard.messages import pack_note, unpack_note
+from ..onboard.note_fields import read_fields
 from ..physics.disturbance import Held, Together
 from ..physics.effects import ExternalEffects
 from ..physics.state import Command
@@ -40,8 +40,9 @@ class Knobs:
 
     def __post_init__(self) -> None:
         """Raise :class:`MessageError` for a knob that is turned too far, or nowhere."""
+        read_fields("knobs", vars(self))
         for name, values, bound in (("push", self.push, PUSH), ("wind", self.wind, WIND), ("kick", self.kick, KICK)):
-            if len(values) != 3 or not all(math.isfinite(v) and abs(v) <= bound for v in values):
+            if not all(abs(v) <= bound for v in values):
                 raise MessageError(f"knobs: {name} = {values} must be three numbers within +-{bound:g}")
         if not 0.0 <= self.load <= LOAD or not WEAKEST <= self.rotor <= 1.0 or self.kicks < 0:
             raise MessageError(
@@ -61,11 +62,10 @@ class Knobs:
         """
         fields = unpack_note(data, "knobs")
         try:
-            (px, py, pz), (wx, wy, wz), (kx, ky, kz) = (map(float, fields[name]) for name in ("push", "wind", "kick"))
-            load, rotor, kicks = float(fields["load"]), float(fields["rotor"]), int(fields["kicks"])
-            return cls((px, py, pz), (wx, wy, wz), load, rotor, (kx, ky, kz), kicks)
-        except (KeyError, TypeError, ValueError, OverflowError) as error:
-            raise MessageError(f"knobs: {error}") from error
+            push, wind, kick = (tuple(fields[name]) for name in ("push", "wind", "kick"))
+            return cls(push, wind, fields["load"], fields["rotor"], kick, fields["kicks"])
+        except KeyError as error:
+            raise MessageError(f"knobs: {error} is missing") from error
 
     def effects(self, *, kicking: bool = False) -> ExternalEffects:
         """Return what acts on the vehicle, with or without the kick."""

@@ -16,19 +16,23 @@ from ..control.condition import describe_condition
 from ..errors import ConfigError, MessageError
 from ..learn.screening import describe_counts
 from ..onboard.messages import Sample, last_note, last_sent, pack_note
+from ..onboard.note_fields import FIELDS, plain, read_fields, shown
 from ..onboard.realtime import Lifeline
 from ..transport.bus import Bus
 from ..transport.remote import LOOPBACK
 from ..transport.shared_memory import SharedMemoryBus
 from .knobs import Knobs
 from .page_access import only_for
+from .page_input import take_values_only
 from .panel import Panel
+from .refused_notes import PAGE
 from .scene import Scene
 from .spec import PageSpec
-from .status import excluded_counts
 
 RATE = 20.0  # [Hz]
 TEXT_EVERY = 5  # refreshes
+NO_ROTATION = 0.1  # error of R R^T, above which an attitude is not shown
+FAR = 1e6  # [m], further than anything is drawn
 LONGEST_NAME = 253  # letters, of a host
 
 
@@ -97,10 +101,14 @@ def show(plan: PagePlan) -> None:
     with contextlib.redirect_stdout(io.StringIO()), only_for(spec.token, spec.host):
         server = viser.ViserServer(host=spec.host, port=spec.port, label=f"retrim: {spec.name}", verbose=False)
     page = _Page(spec, bus, server)
+    take_values_only(server, page.refuse)
     bus.publish("ready.page", pack_note("ready", port=server.get_port()))
     refreshed = 0
     while not parent.gone(1.0 / RATE):
-        page.refresh(text=refreshed % TEXT_EVERY == 0)
+        try:
+            page.refresh(text=refreshed % TEXT_EVERY == 0)
+        except Exception as error:  # the button that lands outlives whatever cannot be shown
+            page.refuse(f"{type(error).__name__}: {error}")
         refreshed += 1
     server.stop()
 
@@ -110,7 +118,12 @@ class _Page:
 
     def __init__(self, spec: PageSpec, bus: Bus, server: Any) -> None:
         self._bus, self._lock = bus, threading.Lock()
-        self._wishes = last_note(self._bus, "wish")  # of a page before this one
+        self._spec = spec
+        self._refused = last_note(self._bus, PAGE).get("count", 0)
+        self._wishes = dict[str, Any]()
+        for name, value in last_note(self._bus, "wish").items():  # of a page before this one
+            with contextlib.suppress(MessageError):
+                self._wishes |= self._possible({name: value})
         self._scene = Scene(server, spec.path, spec.arm, RATE)
         self._paths, self._followed = spec.paths, ""
         self._panel = Panel(
@@ -132,14 +145,16 @@ class _Page:
         status, sample = last_note(self._bus, "status"), self._sample()
         if sample is not None and sample.tick != self._tick:
             self._tick = sample.tick
-            felt, estimate = (np.asarray(status.get(name, (0.0, 0.0, 0.0))) for name in ("felt", "estimate"))
-            target = np.asarray(status.get("target", sample.state[:3]))
-            self._scene.move(sample.truth[:3], sample.truth[3:12].reshape(3, 3), target, felt, estimate)
+            felt, estimate = (_drawn(status.get(name, (0.0, 0.0, 0.0))) for name in ("felt", "estimate"))
+            target, R = _drawn(status.get("target", sample.state[:3])), sample.truth[3:12].reshape(3, 3)
+            if np.abs(R).max() < FAR and np.allclose(R @ R.T, np.eye(3), atol=NO_ROTATION):
+                self._scene.move(_drawn(sample.truth[:3]), R, target, felt, estimate)
             policies = int(status.get("newest", {}).get("policy", 0))
-            self._panel.note(sample.t, float(np.linalg.norm(sample.truth[:3] - target)), policies)
+            self._panel.note(sample.t, float(np.linalg.norm(_drawn(sample.truth[:3]) - target)), policies)
         if text and (followed := last_note(self._bus, "followed").get("name", "")) != self._followed:
             self._followed = followed
-            self._scene.follow(self._paths[followed])
+            if followed in self._paths:
+                self._scene.follow(self._paths[followed])
         if text and status:
             if last_sent(self._bus, "fallback") > last_sent(self._bus, "setpoint"):
                 status["mode"], status["reason"] = "watchdog", "the process that flew is gone or hangs"
@@ -164,33 +179,64 @@ class _Page:
             return Knobs() if message is None else Knobs.unpack(message.data)
         return Knobs()
 
-    def _turn(self, turned: Callable[[Knobs], Knobs]) -> None:
-        """Turn knobs from how they stand; people turn them in many threads."""
-        with self._lock:
-            self._bus.publish("knobs", turned(self._knobs()).pack())
+    def refuse(self, why: str) -> None:
+        """Count what cannot be used, and tell it."""
+        self._refused += 1
+        with contextlib.suppress(MessageError):
+            self._bus.publish(PAGE, pack_note(PAGE, count=self._refused, last=plain(why)))
 
-    def _wish(self, **wish: Any) -> None:
+    def _turn(self, turned: Callable[[Knobs], Knobs]) -> Knobs | None:
+        """Turn knobs from how they stand, in many threads; return how they stand if they cannot be turned so."""
         with self._lock:
-            self._wishes |= wish
-            self._bus.publish("wish", pack_note("wish", **self._wishes))
+            before = self._knobs()
+            try:
+                self._bus.publish("knobs", turned(before).pack())
+            except (MessageError, KeyError, TypeError, ValueError, OverflowError) as error:
+                self.refuse(f"{error}" if isinstance(error, MessageError) else f"knobs: {type(error).__name__}")
+                return before
+        return None
+
+    def _wish(self, **wish: Any) -> dict[str, Any]:
+        """Ask for something; return what is asked for now, in full."""
+        first = {"method": next(iter(self._spec.methods), "none"), "paused": False}
+        with self._lock:
+            try:
+                self._wishes |= self._possible(wish)
+                self._bus.publish("wish", pack_note("wish", **self._wishes))
+            except MessageError as error:
+                self.refuse(str(error))
+            return first | {"reference": next(iter(self._paths), "")} | self._wishes
+
+    def _possible(self, wish: dict[str, Any]) -> dict[str, Any]:
+        """Return a wish that can be had.
+
+        Raises:
+            MessageError: It is of another type, or there is no such choice.
+        """
+        found = read_fields("wish", {name: value for name, value in wish.items() if name in FIELDS["wish"]})
+        for name, there in (("method", (*self._spec.methods, "none")), ("reference", tuple(self._spec.paths))):
+            if name in found and found[name] not in there:
+                raise MessageError(f"wish: {name} = {shown(found[name])} is not among {', '.join(there)}")
+        return found
 
 
 def _text(
     status: dict[str, Any], ended: dict[str, Any], learners: dict[str, dict[str, Any]], world: dict[str, Any]
 ) -> str:
-    lines = [f"**{status['mode']}**" + (f": {status['reason']}" if status.get("reason") else "")]
+    reason = f": {_escaped(status['reason'])}" if status.get("reason") else ""
+    lines = [f"**{_escaped(status.get('mode', 'not known'))}**{reason}"]
     if ended:
-        lines = [f"**flight over**: {ended.get('reason', '')}"]
+        lines = [f"**flight over**: {_escaped(ended.get('reason', ''))}"]
     versions = status.get("versions", {})
     if "policy" in versions:
         lines.append(f"policy {versions['policy']}, taken back: {len(status.get('given_up', []))}")
-    lines.append(f"error {100.0 * status['error']:.1f} cm, missed ticks {status['missed']}")
+    lines.append(f"error {100.0 * status.get('error', 0.0):.1f} cm, missed ticks {status.get('missed', 0)}")
     felt, estimate = (_arrow(status.get(name, [])) for name in ("felt", "estimate"))
     lines.append(f"<span style='color:#d64541'>disturbance</span> {felt} m/s²")
     lines.append(f"<span style='color:#3070d6'>estimate</span> {estimate} m/s²")
     for layer, note in learners.items():
-        lines.append(f"{layer} learner: {note.get('learnt')} times, {1e3 * float(note.get('took', 0.0)):.0f} ms each")
-    if excluded := describe_counts(excluded_counts(learners.get("residual", {}))):
+        lines.append(f"{layer} learner: {note.get('learnt', 0)} times, {1e3 * note.get('took', 0.0):.0f} ms each")
+    if excluded := describe_counts(learners.get("residual", {}).get("excluded", [])):
         lines.append(f"measurements excluded from the fit: {excluded}")
     for at, stage, cause in status.get("stages", [])[-1:]:
         if stage:
@@ -198,8 +244,19 @@ def _text(
     if not status.get("learning", True):
         lines.append("what was learnt does not fly")
     if world.get("knobs_refused"):
-        lines.append(f"knobs refused: {world['knobs_refused']}")
+        lines.append(f"knobs refused: {_escaped(world['knobs_refused'])}")
     return "<br>".join(lines)
+
+
+def _drawn(vector: Any) -> np.ndarray:
+    """Return a vector that can be drawn, whatever was reported."""
+    drawn: np.ndarray = np.clip(np.nan_to_num(np.asarray(vector, dtype=float)), -FAR, FAR)
+    return drawn
+
+
+def _escaped(text: str) -> str:
+    """Return a text as Markdown shows it letter by letter, whatever markup it holds."""
+    return "".join(c if c.isalnum() or c in " ,.:;()'+-/%=" else f"&#{ord(c)};" for c in plain(text))
 
 
 def _arrow(a: list[float]) -> str:

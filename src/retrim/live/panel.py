@@ -1,7 +1,7 @@
 """The panel of the page: how the flight stands, and what a person may change of it."""
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -19,8 +19,8 @@ class Panel:
     def __init__(
         self,
         server: Any,
-        turn: Callable[[Callable[[Knobs], Knobs]], None],
-        wish: Callable[..., None],
+        turn: Callable[[Callable[[Knobs], Knobs]], Knobs | None],
+        wish: Callable[..., Mapping[str, Any]],
         knobs: Knobs,
         wishes: dict[str, Any],
         methods: tuple[str, ...],
@@ -32,8 +32,10 @@ class Panel:
 
         Args:
             server: The viser server.
-            turn: Called with a function from how the knobs stand to how they shall stand.
-            wish: Called with ``method`` and ``paused``, with ``reference``, or with ``land``.
+            turn: Called with a function from how the knobs stand to how they shall stand; it returns how they stand if
+                they cannot be turned so.
+            wish: Called with ``method`` and ``paused``, with ``reference``, or with ``land``; it returns what is wished
+                now, which is not always what was asked for.
             knobs: How the knobs stand.
             wishes: What was wished before.
             methods: Ways of learning to choose from, the present one first; none if nothing learns.
@@ -41,7 +43,8 @@ class Panel:
             mass: Of the vehicle [kg].
             rate: How often the panel is refreshed [Hz].
         """
-        self._tell, self._gui, self._pull = turn, server.gui, np.zeros(3)
+        self._tell, self._wish, self._gui, self._pull = turn, wish, server.gui, np.zeros(3)
+        self._setting, self._choices = False, dict[str, Any]()
         self._history: deque[tuple[float, float, float]] = deque(maxlen=round(HISTORY_S * rate))
         self._text = self._gui.add_markdown(WAITING)
         self._plot = _history_plot(self._gui)
@@ -65,22 +68,24 @@ class Panel:
             calm = self._gui.add_button("Calm", hint="all knobs back to nothing")
         for knob in (self._push, self._wind, self._load, self._rotor):
             knob.on_update(lambda _: self._turned())
-        kick.on_click(lambda event: self._turned(KICKS[event.target.value]))
+        kick.on_click(lambda event: self._turned(event.target.value))
         calm.on_click(lambda _: self._calm())
         with self._gui.add_folder("Learning"):
             if methods:
-                method = self._gui.add_dropdown(
-                    "method", (*methods, "none"), initial_value=wishes.get("method", methods[0])
-                )
-                paused = self._gui.add_checkbox("pause", initial_value=bool(wishes.get("paused")))
-                for choice in (method, paused):
-                    choice.on_update(lambda _: wish(method=method.value, paused=paused.value))
+                self._choices = {
+                    "method": self._gui.add_dropdown(
+                        "method", (*methods, "none"), initial_value=wishes.get("method", methods[0])
+                    ),
+                    "paused": self._gui.add_checkbox("pause", initial_value=bool(wishes.get("paused"))),
+                }
+                for choice in self._choices.values():
+                    choice.on_update(lambda _: self._choose("method", "paused"))
             else:
                 self._gui.add_markdown("This flight does not learn.")
         if len(references) > 1:
-            asked = str(wishes.get("reference", references[0]))
-            chosen = self._gui.add_dropdown("reference", references, initial_value=asked)
-            chosen.on_update(lambda _: wish(reference=chosen.value))
+            asked = wishes.get("reference", references[0])
+            chosen = self._choices["reference"] = self._gui.add_dropdown("reference", references, initial_value=asked)
+            chosen.on_update(lambda _: self._choose("reference"))
         self._gui.add_button("Land", color="red").on_click(lambda _: wish(land=True))
 
     def pull(self, a: np.ndarray) -> None:
@@ -102,25 +107,47 @@ class Panel:
             self._plot.scales = _scales((t[0], t[-1]), top)
             self._plot.data = (t, error, marks)
 
-    def _turned(self, kick: tuple[float, float, float] | None = None) -> None:
-        push = np.clip(np.asarray(self._push.value) + self._pull, -PUSH, PUSH)
+    def _choose(self, *names: str) -> None:
+        """Wish for what the controls of some names say, and let them say what is wished."""
+        if self._setting:
+            return
+        before = {name: self._choices[name].value for name in names}
+        wished = self._wish(**before)
+        self._set(*((self._choices[name], wished[name]) for name in names))
+
+    def _set(self, *values: tuple[Any, Any]) -> None:
+        """Let controls say what stands; nothing is told of that."""
+        self._setting = True
+        try:
+            for control, value in values:
+                control.value = value
+        finally:
+            self._setting = False
+
+    def _turned(self, kick: str | None = None) -> None:
+        if self._setting:
+            return
 
         def turned(before: Knobs) -> Knobs:
+            push = np.clip(np.asarray(self._push.value, dtype=float) + self._pull, -PUSH, PUSH)
             return Knobs(
                 (float(push[0]), float(push[1]), float(push[2])),
                 self._wind.value,
                 self._load.value,
                 self._rotor.value,
-                kick or before.kick,
+                before.kick if kick is None else KICKS[kick],
                 before.kicks + (kick is not None),
             )
 
-        self._tell(turned)
+        if (stand := self._tell(turned)) is not None:
+            load = min(stand.load, self._load.max)
+            self._set(
+                (self._push, stand.push), (self._wind, stand.wind), (self._load, load), (self._rotor, stand.rotor)
+            )
 
     def _calm(self) -> None:
         still = (0.0, 0.0, 0.0)
-        for knob, value in ((self._push, still), (self._wind, still), (self._load, 0.0), (self._rotor, 1.0)):
-            knob.value = value
+        self._set((self._push, still), (self._wind, still), (self._load, 0.0), (self._rotor, 1.0))
         self._tell(lambda before: Knobs(kick=before.kick, kicks=before.kicks))
 
 

@@ -101,7 +101,7 @@ def results(
         "commands_held": status.world.get("held"),
         "simulation_lost_s": status.world.get("lost"),
         "restarts": sum(status.restarts.values()),
-        "refused_messages": sum(status.control.get("refused", {}).values()),
+        "refused_messages": sum(status.control.get("refused", {}).values()) + status.refused_notes,
         "taken_back": len(given_up),
         "fallback_ticks": int(np.sum(flown[:, -1] != Mode.POLICY)),
     }

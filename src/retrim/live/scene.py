@@ -57,10 +57,14 @@ class Scene:
         """Call ``pull`` with an acceleration, world [m/s^2], as somebody pulls the vehicle; zero at the end."""
 
         async def dragged(event: Any) -> None:  # the server calls only coroutines in order
-            grip, hand = np.array(event.start_position), np.array(event.end_position)
-            over = event.phase == "end"
-            self._rope.visible, self._rope.points = not over, np.stack([grip, hand])[None]
-            pull(np.zeros(3) if over else ROPE * (hand - grip))
+            grip, hand = (np.asarray(place, dtype=float) for place in (event.start_position, event.end_position))
+            over = event.phase == "end" or grip.shape != (3,) or hand.shape != (3,)
+            if over or not np.isfinite([grip, hand]).all():  # whatever a browser sends, a pull ends
+                self._rope.visible = False
+                pull(np.zeros(3))
+                return
+            self._rope.visible, self._rope.points = True, np.stack([grip, hand])[None]
+            pull(ROPE * (hand - grip))
 
         self._grip.on_drag("left")(dragged)
 

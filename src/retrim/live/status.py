@@ -24,14 +24,11 @@ class Status:
     """How often the watchdog has commanded."""
     log_failed: str | None
     """Why the flight is no longer written down; None while it is."""
-    excluded: tuple[int, ...] = ()
-    """Numbers of measurements that the last fit excluded, by reason."""
     stalls: dict[str, Any] = field(default_factory=dict)
     """How often the machine stood still, and for how long."""
-
-
-def excluded_counts(note: dict[str, Any]) -> tuple[int, ...]:
-    """Return the numbers of excluded measurements of a learner's note; none if the note has no such numbers."""
-    counts = note.get("excluded", [])
-    plain = isinstance(counts, list) and all(type(n) is int and 0 <= n < 10**6 for n in counts)
-    return tuple(counts) if plain else ()
+    refusals: list[str] = field(default_factory=list)
+    """What was refused of notes between processes since the last look."""
+    refused_notes: int = 0
+    """How many notes and inputs of a browser were refused so far."""
+    excluded: list[int] = field(default_factory=list)
+    """Numbers of measurements that the last fit excluded, by reason."""

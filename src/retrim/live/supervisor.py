@@ -13,14 +13,16 @@ from typing import Any
 from ..errors import MessageError, PlantError
 from ..onboard.launch import last_words, launch
 from ..onboard.messages import last_note, last_sent, pack_note
+from ..onboard.note_fields import plain
 from ..onboard.realtime import cores_of
 from ..transport.message import describe
 from ..transport.network import FAREWELL
 from ..transport.shared_memory import SharedMemoryBus
 from .plans import plan_of
+from .refused_notes import RefusedNotes
 from .remote_learners import RemoteLearners
 from .spec import LiveSpec
-from .status import Status, excluded_counts
+from .status import Status
 from .topics import topics
 
 LANDING = 60.0  # [s], after which processes are ended wherever the vehicle is
@@ -51,6 +53,7 @@ class Supervisor:
     def __enter__(self) -> "Supervisor":
         """Make the bus."""
         self.bus, self.start, self.floor = SharedMemoryBus.create(topics(self.spec)), self.spec.start, 0
+        self._notes = RefusedNotes(self.bus, topics(self.spec))
         self._remote = None if self.spec.learners is None else RemoteLearners(self.spec, self.bus)
         self._cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else None
         if self._cores:
@@ -183,10 +186,10 @@ class Supervisor:
         by_watchdog = last_sent(self.bus, "fallback") > last_sent(self.bus, "setpoint")
         ticks = 0 if fallback is None else fallback.version
         said, stalls = self._rejections(), last_note(self.bus, "stalls")
-        excluded = excluded_counts(last_note(self.bus, "learner.residual"))
         return Status(
-            t, control, world, alive, dict(self.restarts), ended, said, by_watchdog, ticks, failed, excluded, stalls
-        )
+            t, control, world, alive, dict(self.restarts), ended, said, by_watchdog, ticks, failed, stalls,
+            self._notes.look(), self._notes.count, last_note(self.bus, "learner.residual").get("excluded", []),
+        )  # fmt: skip
 
     def finish(self, patience: float = 3.0) -> None:
         """Wait until the log is written."""
@@ -236,7 +239,7 @@ class Supervisor:
             self._said[layer] = message.version
             with contextlib.suppress(MessageError, KeyError, ValueError, TypeError):
                 said = json.loads(describe(message.data, kind="rejected", source=layer)["update"])
-                found.append(f"{layer}: {said['reason']}")
+                found.append(f"{layer}: {plain(str(said['reason']))}")
         return found
 
     def _start(self, role: str) -> None:

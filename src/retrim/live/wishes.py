@@ -9,6 +9,7 @@ from typing import Any
 from ..errors import MessageError, RetrimError
 from ..io.trained import load_learnt, save_learnt
 from ..onboard.messages import unpack_note
+from ..onboard.note_fields import shown
 from ..runtime.events import Event
 from .following import Following
 from .knobs import Knobs
@@ -38,13 +39,11 @@ class Wishes:
         """Do what has been asked for since the last call; return it as events."""
         new = self._knobs(status.t)
         if (wish := self._new("wish")) is not None:
-            try:
+            with contextlib.suppress(MessageError):  # the supervisor counts and tells it
                 asked = unpack_note(wish, "wish")
-            except MessageError:
-                return new
-            if "reference" in asked:
-                new += self.following.ask(str(asked["reference"]), status.t)
-            new += self._ask(asked, status)
+                if "reference" in asked:
+                    new += self.following.ask(asked["reference"], status.t)
+                new += self._ask(asked, status)
         return new + self._arrived(status.t) + self.following.obey(status)
 
     def close(self) -> None:
@@ -55,10 +54,12 @@ class Wishes:
         if asked.get("land"):
             self._supervisor.land()
             return [Event(status.t, "asked", "land")]
-        method, paused = asked.get("method", self._wish["method"]), bool(asked.get("paused", self._wish["paused"]))
+        method, paused = asked.get("method", self._wish["method"]), asked.get("paused", self._wish["paused"])
         now = {"method": method, "paused": paused}
-        if now == self._wish or not self._supervisor.spec.layers or method not in (*LEARNING, "none"):
+        if now == self._wish or not self._supervisor.spec.layers:
             return []
+        if method not in (*LEARNING, "none"):
+            return [Event(status.t, "refused", f"method {shown(method)}: there are {', '.join(LEARNING)}, none")]
         self._wish = now
         self._supervisor.learn(paused=paused or method == "none", flown=method != "none")
         if method in LEARNING and method != self._method:

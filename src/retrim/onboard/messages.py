@@ -10,6 +10,7 @@ import numpy as np
 from ..errors import MessageError
 from ..transport.bus import Bus
 from ..transport.message import ArrayLike, describe, pack_arrays, unpack_arrays
+from .note_fields import plain, read_fields
 
 STATE = 15  # p, R by rows, v
 
@@ -217,17 +218,15 @@ def unpack_note(data: bytes, kind: str) -> dict[str, Any]:
     """Read a small message.
 
     Raises:
-        MessageError: It is none, or of another kind.
+        MessageError: It is none, of another kind, or a field is not of its type or range.
     """
     header = describe(data, kind=kind, source=kind)
     unpack_arrays(data, {}, kind=kind, source=kind)
     try:
         fields = json.loads(header["fields"])
     except (KeyError, ValueError, RecursionError) as error:
-        raise MessageError(f"{kind}: no fields ({error})") from error
-    if not isinstance(fields, dict):
-        raise MessageError(f"{kind}: no fields")
-    return fields
+        raise MessageError(f"{kind}: no fields ({plain(str(error))})") from error
+    return read_fields(kind, fields)
 
 
 def last_note(bus: Bus, topic: str, kind: str | None = None) -> dict[str, Any]:

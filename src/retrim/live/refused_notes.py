@@ -1,0 +1,56 @@
+"""Notes between processes that are none: counted, and told now and then instead of each time."""
+
+from collections.abc import Iterable
+
+from ..errors import MessageError
+from ..onboard.messages import last_note, unpack_note
+from ..transport.bus import Bus
+
+NOTES = ("airborne", "ended", "followed", "ground", "knobs", "learner.", "learning", "order", "ready.", "refusals",
+         "stalls", "status", "wish", "world")  # fmt: skip
+"""Topics of notes, or how their names begin."""
+PAGE = "refusals"
+"""Topic in which the page says what it has refused of a browser."""
+
+
+class RefusedNotes:
+    """Looks at each new note of a bus once. Who reads a note ignores one that is refused here, too."""
+
+    def __init__(self, bus: Bus, topics: Iterable[str]) -> None:
+        """Begin to look.
+
+        Args:
+            bus: Of the flight.
+            topics: Of the bus; those that are no notes are left out.
+        """
+        self.count = 0
+        """Notes and inputs that were refused so far."""
+        self._bus, self._known = bus, {topic: 0 for topic in topics if topic.startswith(NOTES)}
+        self._refused = dict.fromkeys(self._known, 0)
+
+    def look(self) -> list[str]:
+        """Return what has been refused since the last look, in words; a topic is told 1, 10, 100 times and so on."""
+        said = []
+        for topic, known in self._known.items():
+            message = self._bus.latest(topic, known)
+            if message is None:
+                continue
+            self._known[topic] = message.version
+            try:
+                unpack_note(message.data, "ready" if topic.startswith("ready.") else topic)
+            except MessageError as error:
+                said += self._count(topic, 1, str(error))
+            else:
+                said += self._page() if topic == PAGE else []
+        return said
+
+    def _page(self) -> list[str]:
+        note = last_note(self._bus, PAGE)
+        more = note.get("count", 0) - self._refused[PAGE]
+        return self._count(PAGE, more, str(note.get("last", ""))) if more > 0 else []
+
+    def _count(self, topic: str, more: int, why: str) -> list[str]:
+        before, now = self._refused[topic], self._refused[topic] + more
+        self._refused[topic], self.count = now, self.count + more
+        source = "page" if topic == PAGE else f"note {topic}"
+        return [f"{source}: {why}; {now} so far"] if len(str(now)) > len(str(before)) or not before else []

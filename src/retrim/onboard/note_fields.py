@@ -1,0 +1,152 @@
+"""What the fields of notes between processes may be: type and range, checked before anything is done with them."""
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from ..errors import MessageError
+
+Read = Callable[[Any], Any]
+"""From a value of JSON to the same value, or ``ValueError`` with what it must be."""
+MANY, MOST, LONG = 2**53, 1e300, 1000
+"""The largest whole number and the largest number that every reader takes, and the longest text."""
+
+
+def shown(value: Any) -> str:
+    """Return a value as a message of an error may quote it: short, and without control characters."""
+    text = ascii(value) if isinstance(value, str | int | float | bool | type(None)) else type(value).__name__
+    return text if len(text) <= 80 else f"{text[:77]}..."
+
+
+def plain(text: str) -> str:
+    """Return a text of limited length, with control characters written out."""
+    written = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text[: LONG + 1])
+    return written if len(written) <= LONG else f"{written[: LONG - 3]}..."
+
+
+def number(low: float = -math.inf, high: float = math.inf, *, finite: bool = True) -> Read:
+    """Return what reads a number of a range; ``finite=False`` takes what is none, which a flight may report."""
+
+    def read(value: Any) -> float:
+        if not isinstance(value, int | float) or isinstance(value, bool):
+            raise ValueError("a number")
+        if isinstance(value, float) and not math.isfinite(value) and not finite:
+            return value
+        if not max(low, -MOST) <= value <= min(high, MOST):
+            raise ValueError(f"a number from {low:g} to {high:g}")
+        return float(value)
+
+    return read
+
+
+def whole(low: int = 0, high: int = MANY) -> Read:
+    """Return what reads a whole number of a range."""
+
+    def read(value: Any) -> int:
+        if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
+            raise ValueError(f"a whole number from {low} to {high}")
+        return value
+
+    return read
+
+
+def flag(value: Any) -> bool:
+    """Read true or false."""
+    if not isinstance(value, bool):
+        raise ValueError("true or false")
+    return value
+
+
+def text(value: Any) -> str:
+    """Read a text; control characters are written out, and what is too long is cut."""
+    if not isinstance(value, str):
+        raise ValueError("a text")
+    return plain(value)
+
+
+def maybe(read: Read) -> Read:
+    """Return what reads nothing, too."""
+    return lambda value: None if value is None else read(value)
+
+
+def list_of(*reads: Read, length: int | None = None) -> Read:
+    """Return what reads a list: of one kind and any length or a given one, or of several kinds in their order."""
+    exact = length if len(reads) == 1 else len(reads)
+
+    def read(value: Any) -> list[Any]:
+        if not isinstance(value, list | tuple) or exact not in (None, len(value)):
+            raise ValueError("a list" if exact is None else f"a list of {exact}")
+        kinds = reads * len(value) if len(reads) == 1 else reads
+        return [kind(item) for kind, item in zip(kinds, value, strict=True)]
+
+    return read
+
+
+def map_of(read: Read) -> Read:
+    """Return what reads a table of names and values of one kind."""
+
+    def read_all(value: Any) -> dict[str, Any]:
+        if not isinstance(value, dict):
+            raise ValueError("a table")
+        return {text(name): read(item) for name, item in value.items()}
+
+    return read_all
+
+
+_time, _any = number(), number(finite=False)
+_vector = list_of(_any, length=3)
+FIELDS: Mapping[str, Mapping[str, Read]] = {
+    "airborne": {},
+    "ended": {"reason": text},
+    "followed": {"name": text},
+    "ground": {"base": text, "alive": map_of(flag), "failed": text, "over": flag},
+    "knobs": {
+        **dict.fromkeys(("push", "wind", "kick"), list_of(number(), length=3)),
+        **{"load": number(), "rotor": number(), "kicks": whole()},
+    },
+    "learner": {"learnt": whole(), "took": number(0.0), "until": _time, "excluded": list_of(whole(), length=5)},
+    "learning": {"paused": flag, "flown": flag},
+    "order": {"epoch": maybe(number(0.0)), "order": text},
+    "ready": {
+        **dict.fromkeys(("base", "device"), text),
+        **{"failed": maybe(text), "refused": list_of(text), "stands": flag, "port": whole(1, 65535)},
+    },
+    "refusals": {"count": whole(), "last": text},
+    "stalls": {"count": whole(), "longest": number(0.0), "newest": list_of(list_of(_time, _time))},
+    "status": {
+        **dict.fromkeys(("mode", "reason"), text),
+        **dict.fromkeys(("missed", "late_samples"), whole()),
+        "stages": list_of(list_of(_time, whole(0, 3), whole(0, 3))),
+        **dict.fromkeys(("versions", "newest", "refused"), map_of(whole())),
+        **dict.fromkeys(("felt", "estimate", "target"), _vector),
+        "error": _any,
+        "given_up": list_of(whole()),
+        "swaps": list_of(list_of(_any, text, whole(), _any)),
+        "gaps": list_of(list_of(_any, _any, whole())),
+        "learning": flag,
+    },
+    "wish": {**dict.fromkeys(("method", "reference"), text), **dict.fromkeys(("paused", "land"), flag)},
+    "world": {**dict.fromkeys(("late", "held"), whole()), "lost": number(0.0), "knobs_refused": text},
+}
+"""Fields of each kind of note, by the first part of its name; every field may be absent."""
+
+
+def read_fields(kind: str, fields: Any) -> dict[str, Any]:
+    """Return the fields of a note, each of its type and in its range.
+
+    Args:
+        kind: Of the note, as ``wish`` or ``learner.policy``.
+        fields: What was said; a field that is not known is left as it is.
+
+    Raises:
+        MessageError: They are no table, or a field is not what it must be.
+    """
+    if not isinstance(fields, dict):
+        raise MessageError(f"{kind}: no fields")
+    known, found = FIELDS.get(kind.partition(".")[0], {}), dict(fields)
+    for name in known.keys() & found.keys():
+        try:
+            found[name] = known[name](found[name])
+        except ValueError as error:
+            raise MessageError(f"{kind}: {name} = {shown(fields[name])} must be {error}") from None
+    return found

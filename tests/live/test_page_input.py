@@ -1,0 +1,182 @@
+"""Whatever a browser or another process sends, the page goes on, says what it refused, and its *Land* button lands."""
+
+import asyncio
+import contextlib
+import io
+import json
+import time
+from unittest.mock import MagicMock
+
+import numpy as np
+import pytest
+
+from live_processes import HOME, level
+from retrim.live.knobs import Knobs
+from retrim.live.page import _Page, free_port
+from retrim.live.page_input import take_values_only
+from retrim.live.refused_notes import RefusedNotes
+from retrim.live.spec import PageSpec
+from retrim.onboard.messages import Sample, last_note, pack_note
+from retrim.onboard.note_fields import FIELDS
+from retrim.transport.in_process import InProcessBus
+from retrim.transport.message import pack_arrays
+
+TOPICS = ("sample", "status", "setpoint", "fallback", "knobs", "wish", "followed", "ended", "world",
+          "learner.residual", "learner.policy", "ready.page", "refusals")  # fmt: skip
+PATHS = {"circle": HOME[None] + np.eye(3), "figure8": HOME[None] - np.eye(3)}
+SPEC = PageSpec("127.0.0.1", 18380, "hover", HOME[None].repeat(2, 0), ("full", "lora"), 0.06, 0.19, PATHS)
+ODD = (None, True, -1, 2**70, 1e308, float("nan"), "x", "<b>{x}</b>\x1b[2J", [], [1], [[None]], [float("inf")] * 3, {},
+       {"policy": "x"}, {"a": {"b": []}})  # fmt: skip
+NOISE = (
+    b"", b"noise", pack_arrays({}, kind="wish", about={}), pack_arrays({}, kind="wish", about={"fields": "[" * 5000}),
+    pack_arrays({}, kind="wish", about={"fields": "9" * 5000}), pack_arrays({}, kind="wish", about={"fields": "[]"}),
+    pack_arrays({"a": np.zeros(3)}, kind="wish", about={"fields": "{}"}),
+)  # fmt: skip
+VALUES = (None, True, -1, 2**70, 1e300, float("nan"), float("inf"), "", "x", "land", b"x", [], [1], ["x", "y", "z"],
+          [float("nan")] * 3, [1e9, 0.0, 0.0], [0.0] * 50, {}, {"a": 1}, [[], [], []])  # fmt: skip
+
+
+@pytest.fixture
+def server():
+    """A real viser server on a port of its own, with somebody connected."""
+    viser = pytest.importorskip("viser")
+    with contextlib.redirect_stdout(io.StringIO()):
+        server = viser.ViserServer("127.0.0.1", free_port("127.0.0.1", 18380), verbose=False)
+    server._connected_clients[0] = MagicMock()
+    try:
+        yield server
+    finally:
+        server._connected_clients.clear()
+        server.stop()
+
+
+@pytest.fixture
+def bus():
+    return InProcessBus(dict.fromkeys(TOPICS, 65536))
+
+
+def sent(server, handle, **updates):
+    """Send what a browser sends if somebody changes a control, and wait until it is dealt with."""
+    from viser._messages import GuiUpdateMessage
+
+    connection = server._websock_server
+    message = GuiUpdateMessage(handle._impl.uuid, updates)
+    coroutine = connection._handle_incoming_message(0, message)
+    asyncio.run_coroutine_threadsafe(coroutine, connection._background_event_loop).result(20.0)
+    server._thread_executor.submit(time.sleep, 0.0).result(20.0)
+
+
+def controls(server):
+    return {handle._impl.props.label: handle for handle in server.gui._gui_input_handle_from_uuid.values()}
+
+
+def settled(true):
+    end = time.monotonic() + 10.0
+    while not true() and time.monotonic() < end:
+        time.sleep(0.01)
+    return true()
+
+
+def test_no_value_of_any_control_stops_the_page_and_land_lands(server, bus):
+    page = _Page(SPEC, bus, server)
+    take_values_only(server, page.refuse)
+    found = controls(server)
+    assert {"method", "pause", "reference", "Land", "rotor", "load [kg]", "kick"} <= found.keys()
+    for label, handle in found.items():
+        for value in VALUES:
+            if label not in ("Land", "Calm"):
+                sent(server, handle, value=value)
+    assert settled(lambda: last_note(bus, "refusals").get("count", 0) > 50)
+    for label, handle in found.items():  # afterwards every control says what stands, and works
+        if label in ("method", "reference", "rotor", "load [kg]", "push [m/s²]"):
+            good = {"method": "lora", "reference": "figure8", "push [m/s²]": [1.0, 0.5, 0.0]}.get(label, 0.75)
+            good = 0.1 if label == "load [kg]" else good
+            sent(server, handle, value=good)
+    assert settled(lambda: last_note(bus, "wish").get("reference") == "figure8")
+    assert settled(lambda: last_note(bus, "wish").get("method") == "lora")
+    assert settled(lambda: Knobs.unpack(bus.latest("knobs").data).load == 0.1)
+    assert settled(lambda: Knobs.unpack(bus.latest("knobs").data).push == (1.0, 0.5, 0.0))
+    sent(server, found["Land"], value=True)
+    assert settled(lambda: last_note(bus, "wish").get("land") is True)
+    _Page(SPEC, bus, MagicMock())  # a page that is started again begins from that
+
+
+@pytest.mark.parametrize("updates", [{"visible": False}, {"removed": True}, {"disabled": True, "value": True}, {}])
+def test_a_browser_cannot_take_the_button_away(server, bus, updates):
+    page = _Page(SPEC, bus, server)
+    take_values_only(server, page.refuse)
+    land = controls(server)["Land"]
+    sent(server, land, **updates)
+    assert land.visible
+    assert not land.disabled
+    assert not land._impl.removed
+    assert last_note(bus, "refusals")["count"] == 1
+    assert "land" not in last_note(bus, "wish")
+
+
+@pytest.mark.parametrize("topic", [topic for topic in TOPICS if topic not in ("sample", "setpoint", "fallback")])
+def test_no_note_of_any_kind_stops_the_page_or_a_page_that_is_started_again(bus, topic):
+    pytest.importorskip("viser")
+    kind = topic.partition(".")[0]
+    name = "ready" if kind == "ready" else topic
+    hostile = [*NOISE, pack_note("other", x=1)]
+    for field in FIELDS[kind]:
+        hostile += [pack_note(name, **{field: value}) for value in ODD]
+        hostile += [pack_note(name, **dict.fromkeys(FIELDS[kind], 1) | {field: ODD[-1]})]
+    sample = Sample(1, 0.0, 0.0, 0.0, level(), level(), np.array([9.81, 0.0, 0.0, 0.0]))
+    good = {name: [0.0, 0.0, 1.0] for name in ("felt", "estimate", "target")}
+    before, watch = _Page(SPEC, bus, MagicMock()), RefusedNotes(bus, TOPICS)
+    bus.publish("status", pack_note("status", mode="policy", error=0.0, missed=0, **good))
+    for tick, data in enumerate(hostile):
+        bus.publish(topic, data)
+        bus.publish("sample", Sample(tick, *list(vars(sample).values())[1:]).pack())
+        again = kind in ("wish", "knobs", "refusals") or tick % 10 == 0  # what a new page reads as it begins
+        for page in (before, *([_Page(SPEC, bus, MagicMock())] if again else [])):
+            page.refresh(text=True)
+            page._panel.show("x")
+        watch.look()
+        assert page._wish(land=True)["land"]
+        assert last_note(bus, "wish") == page._wishes | {"land": True}
+    assert watch.count >= len(NOISE)
+
+
+def test_an_attitude_that_is_none_is_not_shown_and_stops_nothing(bus):
+    pytest.importorskip("viser")
+    page, shown = _Page(SPEC, bus, MagicMock()), []
+    page._scene.move = lambda *given: shown.append(given)
+    for tick, R in enumerate((np.zeros(9), np.eye(3).ravel() * 1e200, -np.ones(9), np.eye(3).ravel())):
+        x = level()
+        x[:3], x[3:12] = 1e308, R
+        bus.publish("sample", Sample(tick, 0.0, 0.0, 0.0, x, x, np.array([9.81, 0.0, 0.0, 0.0])).pack())
+        page.refresh(text=True)
+    assert len(shown) == 1
+
+
+def test_text_of_a_process_is_no_markup_of_the_page(bus, monkeypatch):
+    pytest.importorskip("viser")
+    page, texts = _Page(SPEC, bus, MagicMock()), []
+    monkeypatch.setattr(page._panel, "show", texts.append)
+    bus.publish("status", pack_note("status", mode="<script>", reason="{alert(1)} [a](http://b) `c`\x1b", error=0.0))
+    page.refresh(text=True)
+    (text,) = texts
+    assert not set("{}[]`\x1b") & set(text.partition("<br>")[0])
+    assert "<script" not in text
+
+
+def test_a_refused_note_is_counted_each_time_and_told_now_and_then():
+    bus = InProcessBus({"learner.policy": 4096, "sample": 4096, "refusals": 4096})
+    watch, said = RefusedNotes(bus, ("learner.policy", "sample", "refusals")), []
+    for i in range(12):
+        bus.publish("learner.policy", pack_note("learner.policy", took="x" * (i + 1)))
+        bus.publish("sample", b"no note")
+        said += watch.look()
+        assert watch.look() == []
+    assert said == [
+        "note learner.policy: learner.policy: took = 'x' must be a number; 1 so far",
+        "note learner.policy: learner.policy: took = 'xxxxxxxxxx' must be a number; 10 so far",
+    ]
+    bus.publish("learner.policy", pack_note("learner.policy", took=1.0))
+    bus.publish("refusals", pack_note("refusals", count=3, last="knobs: turned too far"))
+    assert watch.look() == ["page: knobs: turned too far; 3 so far"]
+    assert watch.count == 15
+    assert json.dumps(watch.count)
