@@ -12,9 +12,10 @@ from retrim.experiments.latency import free_port, rosmaster
 from retrim.transport.bus import Bus
 from retrim.transport.in_process import InProcessBus
 from retrim.transport.remote import Address
+from retrim.transport.shared_key import SharedKey
 from retrim.transport.shared_memory import SharedMemoryBus
 
-LOCAL, NETWORK = ("in process", "shared memory"), ("zenoh", "ros")
+LOCAL, NETWORK = ("in process", "shared memory"), ("zenoh", "zenoh, signed", "ros")
 
 
 class Ends(NamedTuple):
@@ -57,7 +58,8 @@ def network(backend):
     if backend == "ros":
         return master()
     pytest.importorskip("zenoh")
-    return Address("zenoh", "127.0.0.1", free_port())
+    shared = SharedKey(bytes(32)) if backend.endswith("signed") else None
+    return Address("zenoh", "127.0.0.1", free_port(), shared=shared)
 
 
 def arrived(bus, topic, after=0, data=None, patience=10.0):

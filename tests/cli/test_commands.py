@@ -121,11 +121,14 @@ def test_what_live_refuses(folder):
         (("--page", "--page-port", "0"), "--page-port 0 must be between 1 and 65535"),
         (("--page", "--page-host", "192.0.2.1"), "no free port from 8080 on at '192.0.2.1'"),
         (("--learners", "somewhere"), "'somewhere' is no address of a bus; one is zenoh:HOST:PORT or ros:HOST:PORT"),
+        (("--learners", "zenoh:192.0.2.1:7447"), "learners beyond this machine need a shared key: --key FILE"),
+        (("--learners", "zenoh:127.0.0.1:7447", "--key", "none"), "--key 'none': the key cannot be read"),
         (("--record", "flight.bag"), "--record flight.bag: the name must end with .mcap"),
         (("--record", "nowhere/flight.mcap"), "nothing can be written in nowhere"),
     ):
         assert said in retrim("live", "--policy", "p", *words, "--out", "lx", cwd=folder, code=1)
     assert "'somewhere' is no address of a bus" in retrim("learn", "somewhere", cwd=folder, code=1)
+    assert "zenoh:192.0.2.1:7447: learners beyond" in retrim("learn", "zenoh:192.0.2.1:7447", cwd=folder, code=1)
     assert "no rosmaster at 'http://127.0.0.1:1'" in retrim("learn", "ros:127.0.0.1:1", cwd=folder, code=1)
 
 

@@ -10,9 +10,9 @@ import pytest
 
 from live.test_faults import Drill, controller, spec_in, whole_log  # noqa: F401
 from live_processes import HOME, DrillPlan, level
-from retrim.errors import ConfigError, MessageError
+from retrim.errors import ConfigError, MessageError, PlantError
 from retrim.experiments.latency import free_port as unused_port
-from retrim.live import ground
+from retrim.live import ground, remote_learners
 from retrim.live.events import LiveEvents
 from retrim.live.ground import Ground, learn_for
 from retrim.live.mission import Mission
@@ -25,8 +25,11 @@ from retrim.onboard.topics import INTO, OUT
 from retrim.transport.bridge import EVERY, Bridge
 from retrim.transport.in_process import InProcessBus
 from retrim.transport.remote import Address
+from retrim.transport.session import FOREIGN, MISSING, UNSIGNED
+from retrim.transport.shared_key import SharedKey
 
 SECONDS = 3.0
+KEY, OTHER = SharedKey(b"k" * 32), SharedKey(b"o" * 32)
 
 
 class DrillGround(Ground):
@@ -54,7 +57,7 @@ def station(address, over):
 def flown_while(lost, folder, controller):  # noqa: F811
     """Fly with learners at a ground station, and lose ``lost`` after a second; return the last status, the events, and
     who flew at each tick before the landing."""
-    address, over = Address("zenoh", "127.0.0.1", unused_port()), threading.Event()
+    address, over = Address("zenoh", "127.0.0.1", unused_port(), shared=KEY), threading.Event()
     page = PageSpec("127.0.0.1", free_port("127.0.0.1", 18180), "drill", HOME[None].repeat(2, 0), (), 0.06, 0.19)
     changes = {"learners": address, "seconds": SECONDS, "page": page if lost == "bridge and page" else None}
     thread = threading.Thread(target=station, args=(address, over))
@@ -107,10 +110,41 @@ def test_a_flight_with_learners_elsewhere(tmp_path, controller, lost):  # noqa: 
 
 
 @pytest.mark.parametrize(
+    ("here", "there", "said_here", "said_there"),
+    [(KEY, OTHER, FOREIGN, FOREIGN), (None, KEY, MISSING, UNSIGNED), (KEY, None, UNSIGNED, MISSING)],
+    ids=("another", "none here", "none there"),
+)
+def test_with_another_key_or_none_nothing_takes_off_and_both_ends_say_why(
+    tmp_path, monkeypatch, request, here, there, said_here, said_there
+):
+    pytest.importorskip("zenoh")
+    for module in (ground, remote_learners):
+        monkeypatch.setattr(module, "DISTRUST", 0.5)
+    port, heard, flown = unused_port(), [], request.getfixturevalue("controller")
+
+    def listen():
+        try:
+            station(Address("zenoh", "127.0.0.1", port, shared=there), threading.Event())
+        except ConfigError as error:
+            heard.append(str(error))
+
+    thread = threading.Thread(target=listen)
+    thread.start()
+    address = Address("zenoh", "127.0.0.1", port, shared=here)
+    with Drill(spec_in(tmp_path, flown, learners=address)) as drill, pytest.raises(PlantError) as error:
+        for _ in drill.warm_up():
+            pass
+    thread.join(20.0)
+    assert str(error.value) == f"zenoh:127.0.0.1:{port}: {said_here}"
+    assert heard == [f"zenoh:127.0.0.1:{port}: {said_there}"]
+
+
+@pytest.mark.parametrize(
     ("addresses", "why"),
     [
         (["zenoh:h:1", "zenoh:h:1"], "address zenoh:h:1 is there twice"),
         (["ros:h:1/a", "ros:g:1/b"], "vehicles at several rosmasters"),
+        (["zenoh:127.0.0.1:1", "zenoh:10.0.0.5:1"], "zenoh:10.0.0.5:1: learners beyond this machine need a shared key"),
     ],
 )
 def test_addresses_that_cannot_be_learnt_for_together_are_named(addresses, why):
@@ -218,12 +252,12 @@ def test_a_failure_is_told_while_the_other_flights_go_on_and_raised_at_the_end(m
                 yield "learnt: policy 7"
 
     def tell(text):
-        if text == "zenoh:h:1/a: failed: OSError('no room'); zenoh:h:1/b: learnt: policy 7":
+        if text == "zenoh:127.0.0.1:1/a: failed: OSError('no room'); zenoh:127.0.0.1:1/b: learnt: policy 7":
             told.set()
 
     monkeypatch.setattr(ground, "Ground", Other)
     with pytest.raises(OSError, match="no room"):
-        learn_for([Address.of("zenoh:h:1/a"), Address.of("zenoh:h:1/b")], threading.Event(), tell)
+        learn_for([Address.of("zenoh:127.0.0.1:1/a"), Address.of("zenoh:127.0.0.1:1/b")], threading.Event(), tell)
     assert told.is_set()
 
 

@@ -37,7 +37,7 @@ SMALL = (
     "learner.residual",
     "learner.policy",
     "ready.page",
-    "refusals",
+    "refusals.page",
 )
 BROWSER = shutil.which("chromium")
 DRAWING = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist",

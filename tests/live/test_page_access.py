@@ -18,7 +18,7 @@ from retrim.onboard.launch import launch
 from retrim.transport.shared_memory import SharedMemoryBus
 
 TOPICS = ("sample", "status", "setpoint", "fallback", "knobs", "wish", "followed", "ended", "world",
-          "learner.residual", "learner.policy", "ready.page", "refusals")  # fmt: skip
+          "learner.residual", "learner.policy", "ready.page", "refusals.page")  # fmt: skip
 WITHIN = 60.0  # [s]
 
 
@@ -174,6 +174,7 @@ def test_without_protection_there_is_no_page():
 def test_a_browser_is_told_the_address_in_a_file_of_this_user(tmp_path, monkeypatch):
     told = []
     monkeypatch.setattr(webbrowser, "open", told.append)
+    monkeypatch.setenv("DISPLAY", ":0")
     open_page("http://127.0.0.1:8080/SECRET", tmp_path)
     (file,) = tmp_path.iterdir()
     assert told == [file.as_uri()]

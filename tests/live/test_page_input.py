@@ -22,7 +22,7 @@ from retrim.transport.in_process import InProcessBus
 from retrim.transport.message import pack_arrays
 
 TOPICS = ("sample", "status", "setpoint", "fallback", "knobs", "wish", "followed", "ended", "world",
-          "learner.residual", "learner.policy", "ready.page", "refusals")  # fmt: skip
+          "learner.residual", "learner.policy", "ready.page", "refusals.page")  # fmt: skip
 PATHS = {"circle": HOME[None] + np.eye(3), "figure8": HOME[None] - np.eye(3)}
 SPEC = PageSpec("127.0.0.1", 18380, "hover", HOME[None].repeat(2, 0), ("full", "lora"), 0.06, 0.19, PATHS)
 ODD = (None, True, -1, 2**70, 1e308, float("nan"), "x", "<b>{x}</b>\x1b[2J", [], [1], [[None]], [float("inf")] * 3, {},
@@ -86,7 +86,7 @@ def test_no_value_of_any_control_stops_the_page_and_land_lands(server, bus):
         for value in VALUES:
             if label not in ("Land", "Calm"):
                 sent(server, handle, value=value)
-    assert settled(lambda: last_note(bus, "refusals").get("count", 0) > 50)
+    assert settled(lambda: last_note(bus, "refusals.page").get("count", 0) > 50)
     for label, handle in found.items():  # afterwards every control says what stands, and works
         if label in ("method", "reference", "rotor", "load [kg]", "push [m/s²]"):
             good = {"method": "lora", "reference": "figure8", "push [m/s²]": [1.0, 0.5, 0.0]}.get(label, 0.75)
@@ -110,7 +110,7 @@ def test_a_browser_cannot_take_the_button_away(server, bus, updates):
     assert land.visible
     assert not land.disabled
     assert not land._impl.removed
-    assert last_note(bus, "refusals")["count"] == 1
+    assert last_note(bus, "refusals.page")["count"] == 1
     assert "land" not in last_note(bus, "wish")
 
 
@@ -130,7 +130,7 @@ def test_no_note_of_any_kind_stops_the_page_or_a_page_that_is_started_again(bus,
     for tick, data in enumerate(hostile):
         bus.publish(topic, data)
         bus.publish("sample", Sample(tick, *list(vars(sample).values())[1:]).pack())
-        again = kind in ("wish", "knobs", "refusals") or tick % 10 == 0  # what a new page reads as it begins
+        again = kind in ("wish", "knobs", "refusals.page") or tick % 10 == 0  # what a new page reads as it begins
         for page in (before, *([_Page(SPEC, bus, MagicMock())] if again else [])):
             page.refresh(text=True)
             page._panel.show("x")
@@ -164,8 +164,8 @@ def test_text_of_a_process_is_no_markup_of_the_page(bus, monkeypatch):
 
 
 def test_a_refused_note_is_counted_each_time_and_told_now_and_then():
-    bus = InProcessBus({"learner.policy": 4096, "sample": 4096, "refusals": 4096})
-    watch, said = RefusedNotes(bus, ("learner.policy", "sample", "refusals")), []
+    bus = InProcessBus({"learner.policy": 4096, "sample": 4096, "refusals.page": 4096})
+    watch, said = RefusedNotes(bus, ("learner.policy", "sample", "refusals.page")), []
     for i in range(12):
         bus.publish("learner.policy", pack_note("learner.policy", took="x" * (i + 1)))
         bus.publish("sample", b"no note")
@@ -176,7 +176,7 @@ def test_a_refused_note_is_counted_each_time_and_told_now_and_then():
         "note learner.policy: learner.policy: took = 'xxxxxxxxxx' must be a number; 10 so far",
     ]
     bus.publish("learner.policy", pack_note("learner.policy", took=1.0))
-    bus.publish("refusals", pack_note("refusals", count=3, last="knobs: turned too far"))
+    bus.publish("refusals.page", pack_note("refusals.page", count=3, last="knobs: turned too far"))
     assert watch.look() == ["page: knobs: turned too far; 3 so far"]
     assert watch.count == 15
     assert json.dumps(watch.count)

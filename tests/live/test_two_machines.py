@@ -34,9 +34,15 @@ def test_a_flight_learns_on_another_machine(policy, tmp_path, network):
             if machines is None:
                 pytest.skip("needs the right to make network namespaces")
             address, inside = f"zenoh:{machines[0]}:7447", machines[1]
+        key = tmp_path / "key"
+        key.write_text("a key that both ends have\n")
         words = [*RETRIM, "live", "--policy", str(policy), "--disturbance", "large", "--seconds", "20", "--learners"]
-        flight = subprocess.Popen([*words, address, "--out", str(tmp_path)], stdout=subprocess.PIPE, text=True)
-        ground = subprocess.Popen([*inside, *RETRIM, "learn", address], stdout=subprocess.PIPE, text=True)
+        flight = subprocess.Popen(
+            [*words, address, "--key", str(key), "--out", str(tmp_path)], stdout=subprocess.PIPE, text=True
+        )
+        ground = subprocess.Popen(
+            [*inside, *RETRIM, "learn", address, "--key", str(key)], stdout=subprocess.PIPE, text=True
+        )
         said, heard = flight.communicate(timeout=300)[0], ground.communicate(timeout=60)[0]
     assert flight.returncode == 0, said
     assert ground.returncode == 0, heard

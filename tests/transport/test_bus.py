@@ -159,12 +159,12 @@ def test_what_an_end_of_ros_writes_has_readers_before_the_first_message(monkeypa
     monkeypatch.setattr(ros, "join", lambda master: Rospy())
     monkeypatch.setattr(ros, "system_module", lambda name: SimpleNamespace(UInt8MultiArray=None))
     bus = Address("ros", "h", 1, "quad1").join(TOPICS, listen=True, writes=("a", "b.c"))
-    assert declared == ["/retrim/quad1/a", "/retrim/quad1/b/c"]
+    assert declared == ["/retrim/quad1/a", "/retrim/quad1/b/c", "/retrim/quad1/greeting/flight"]
     bus.publish("a", b"last")
-    assert declared == ["/retrim/quad1/a", "/retrim/quad1/b/c"]
+    assert len(declared) == 3
     bus.publish("there", b"also")
-    assert declared[2:] == ["/retrim/quad1/there"]
-    assert sent == [("/retrim/quad1/a", b"last"), ("/retrim/quad1/there", b"also")]
+    assert declared[3:] == ["/retrim/quad1/there"]
+    assert sent[1:] == [("/retrim/quad1/a", b"last"), ("/retrim/quad1/there", b"also")]
 
 
 def test_a_master_that_there_is_not_is_named():

@@ -1,7 +1,5 @@
 """``retrim live``."""
 
-import os
-import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -48,6 +46,7 @@ def live(
     policy_age: float | None = None,
     seed: int = 0,
     learners: str | None = None,
+    key: Path | None = None,
     page: tyro.conf.FlagCreatePairsOff[bool] = False,
     no_page: tyro.conf.FlagCreatePairsOff[bool] = False,
     page_host: str = LOOPBACK[0],
@@ -72,6 +71,7 @@ def live(
         seed: Seed of the start, of the learners and of what is random in the scenario.
         learners: Where learners on another machine, started by `retrim learn`, reach this one: zenoh:HOST:PORT (this
             machine listens there), or ros:HOST:PORT of a rosmaster. By default they run here.
+        key: File with a key that `retrim learn` has, too, or RETRIM_KEY; needed for learners on another machine.
         page: Show the flight in a browser, with knobs, also with `--seconds`; without it, that is the default.
         no_page: Show it in the terminal only.
         page_host: Address that the page listens on; its printed address has a token, without which nothing is answered.
@@ -94,7 +94,7 @@ def live(
         scenario = where.scenario(chosen)
         wanted = page or (seconds is None and not no_page)
         address = page_address(page_host, page_port, demanded=page, say=RichReporter().say) if wanted else None
-        ground = learners_at(learners, RichReporter().say) if learners is not None else None
+        ground = learners_at(learners, RichReporter().say, key) if learners is not None else None
         setup, run = Setup.of(chosen, scenario.reference), started(Run("live", out, stop=stop))
         if weights is None:
             weights, losses = train(Setup.of(chosen), seed, reporter=RichReporter(), stop=stop)
@@ -126,7 +126,7 @@ def _fly(request: LiveRequest, run: Run) -> int:
 def _open_page(url: str, folder: Path) -> None:
     """Say where the page is, and open it where there is a screen."""
     console.print(f"page: {url}", markup=False, soft_wrap=True)
-    if console.is_terminal and (sys.platform == "darwin" or {"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ)):
+    if console.is_terminal:
         open_page(url, folder)
 
 

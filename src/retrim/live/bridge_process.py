@@ -14,6 +14,7 @@ from ..transport.bridge import Bridge
 from ..transport.bus import Bus
 from ..transport.remote import Address
 from ..transport.shared_memory import SharedMemoryBus
+from .refused_notes import NETWORK
 
 IDLE = 0.002  # [s]
 SILENCE = 10.0  # [s] without a measurement, after which a flight without a supervisor is over; an autopilot may land it
@@ -38,15 +39,25 @@ def carry(plan: BridgePlan) -> None:
     try:
         bridge = Bridge(bus, network, out=OUT, into=INTO, slowly=SLOWLY)
         bus.publish("ready.bridge", pack_note("ready"))
-        said, since = (0, 0), time.monotonic()
+        said, since, told = (0, 0), time.monotonic(), (0, "")
         # A vehicle that has lost its supervisor still lands, and the learners wait until they are told.
         while not (parent.gone() and time.monotonic() > since + (LINGER if said[1] else SILENCE)):
             if not bridge.step():
                 time.sleep(IDLE)
+            told = _told(bus, network, told)
             if (now := _said(bus)) != said:
                 said, since = now, time.monotonic()
     finally:
         network.close()  # its threads would keep the process alive
+
+
+def _told(bus: Bus, network: Bus, before: tuple[int, str]) -> tuple[int, str]:
+    """Tell the flight what was refused of the network, and why nobody is heard there."""
+    now = network.refused, network.fault
+    if now != before:
+        bus.publish(NETWORK, pack_note(NETWORK, count=now[0], last=now[1] or "a message that was none, forged or old",
+                                       fault=now[1]))  # fmt: skip
+    return now
 
 
 def _said(bus: Bus) -> tuple[int, int]:

@@ -16,8 +16,9 @@ from ..onboard.launch import last_words, launch
 from ..onboard.messages import last_note, pack_note
 from ..onboard.topics import INTO, MOST, OUT
 from ..transport.bridge import Bridge
-from ..transport.network import FAREWELL
+from ..transport.network import DISTRUST, FAREWELL
 from ..transport.remote import Address
+from ..transport.shared_key import read_key
 from ..transport.shared_memory import SharedMemoryBus
 from .fleet_process import FleetProcess, Seat
 from .learner_process import LearnerPlan
@@ -50,6 +51,7 @@ class Ground:
         self.processes: dict[str, Popen[bytes] | Seat] = {}
         self.restarts: dict[str, int] = {}
         self._mission: Mission | None = None
+        self._distrust: float | None = None
         self._bus: SharedMemoryBus | None = None
         self._bridge: Bridge | None = None
         self.carried = False
@@ -70,8 +72,16 @@ class Ground:
             self._place.cleanup()
 
     def wait(self) -> Iterator[None]:
-        """Yield until there is a flight to learn for."""
+        """Yield until there is a flight to learn for.
+
+        Raises:
+            ConfigError: Somebody is there, and has another key or none.
+        """
         while not self._look():
+            if (fault := self._network.fault) and self._distrust is None:
+                self._distrust = time.monotonic()
+            if fault and self._distrust is not None and time.monotonic() > self._distrust + DISTRUST:
+                raise ConfigError(f"{self.address}: {fault}")
             yield
 
     def learn(self) -> Iterator[str]:
@@ -182,7 +192,8 @@ class Ground:
         if not all(last_note(self._bus, f"ready.{layer}", "ready") for layer in self.processes):
             return "compiling; the flight waits"
         done = {layer: last_note(self._bus, f"learner.{layer}").get("learnt", 0) for layer in self.processes}
-        return "learnt: " + ", ".join(f"{layer} {n}" for layer, n in done.items())
+        refused = f"; messages refused: {n}" if (n := self._network.refused) else ""
+        return "learnt: " + ", ".join(f"{layer} {n}" for layer, n in done.items()) + refused
 
     def _silence(self) -> float:
         message = None if self._bus is None else self._bus.latest("status")
@@ -190,6 +201,22 @@ class Ground:
         if version != self._heard[0] or not version:
             self._heard = version, time.monotonic()
         return time.monotonic() - self._heard[1]
+
+
+def flights_at(texts: Sequence[str], key: Path | None) -> list[Address]:
+    """Return where flights are to learn for.
+
+    Args:
+        texts: As ``zenoh:192.168.1.5:7447``.
+        key: File with the key that the flights have, too; None: that of ``RETRIM_KEY``, if there is one.
+
+    Raises:
+        ConfigError: There is none, one of them is no address, or the key cannot be read.
+    """
+    if not texts:
+        raise ConfigError("no address; one is zenoh:HOST:PORT or ros:HOST:PORT")
+    shared = read_key(key)
+    return [Address.of(text, shared) for text in texts]
 
 
 def learn_for(
@@ -208,13 +235,16 @@ def learn_for(
         How they ended.
 
     Raises:
-        ConfigError: One of the buses cannot be joined, an address is there twice, or there are two rosmasters.
+        ConfigError: One of the buses cannot be joined, an address is there twice, there are two rosmasters, or an
+            address is beyond this machine and there is no shared key.
         Exception: The first of what failed, once the other flights are over.
     """
     if twice := [str(each) for i, each in enumerate(addresses) if each in addresses[:i]]:
         raise ConfigError(f"address {twice[0]} is there twice; each vehicle has its own, or a key of its own")
     if len({(each.host, each.port) for each in addresses if each.kind == "ros"}) > 1:
-        raise ConfigError("vehicles at several rosmasters: a process of ROS 1 knows one; give them keys at one master")
+        raise ConfigError("vehicles at several rosmasters: a process of ROS 1 knows one; give them names at one master")
+    for each in addresses:
+        each.check_shared()
     with ExitStack() as stack:
         fleet = None
         if len(addresses) > 1:

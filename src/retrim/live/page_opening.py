@@ -3,6 +3,7 @@
 import atexit
 import contextlib
 import os
+import sys
 import tempfile
 import webbrowser
 from html import escape
@@ -16,6 +17,8 @@ def open_page(url: str, folder: Path) -> None:
         url: Of the page, with its token.
         folder: For the file, which goes when this process ends.
     """
+    if sys.platform != "darwin" and not {"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ):
+        return  # there is no screen
     with contextlib.suppress(OSError):  # the address was printed, too
         descriptor, name = tempfile.mkstemp(prefix="page-", suffix=".html", dir=folder.resolve())
         atexit.register(_remove, Path(name))

@@ -6,11 +6,11 @@ from ..errors import MessageError
 from ..onboard.messages import last_note, unpack_note
 from ..transport.bus import Bus
 
-NOTES = ("airborne", "ended", "followed", "ground", "knobs", "learner.", "learning", "order", "ready.", "refusals",
+NOTES = ("airborne", "ended", "followed", "ground", "knobs", "learner.", "learning", "order", "ready.", "refusals.",
          "stalls", "status", "wish", "world")  # fmt: skip
 """Topics of notes, or how their names begin."""
-PAGE = "refusals"
-"""Topic in which the page says what it has refused of a browser."""
+PAGE, NETWORK = "refusals.page", "refusals.network"
+"""Topics of what the page has refused of a browser, and the bridge of the network."""
 
 
 class RefusedNotes:
@@ -41,16 +41,17 @@ class RefusedNotes:
             except MessageError as error:
                 said += self._count(topic, 1, str(error))
             else:
-                said += self._page() if topic == PAGE else []
+                said += self._told(topic) if topic in (PAGE, NETWORK) else []
         return said
 
-    def _page(self) -> list[str]:
-        note = last_note(self._bus, PAGE)
-        more = note.get("count", 0) - self._refused[PAGE]
-        return self._count(PAGE, more, str(note.get("last", ""))) if more > 0 else []
+    def _told(self, topic: str) -> list[str]:
+        """Count what a process has refused by itself."""
+        note = last_note(self._bus, topic)
+        more = note.get("count", 0) - self._refused[topic]
+        return self._count(topic, more, note.get("last", "")) if more > 0 else []
 
     def _count(self, topic: str, more: int, why: str) -> list[str]:
         before, now = self._refused[topic], self._refused[topic] + more
         self._refused[topic], self.count = now, self.count + more
-        source = "page" if topic == PAGE else f"note {topic}"
+        source = topic.partition(".")[2] if topic in (PAGE, NETWORK) else f"note {topic}"
         return [f"{source}: {why}; {now} so far"] if len(str(now)) > len(str(before)) or not before else []

@@ -5,7 +5,9 @@ from pathlib import Path
 
 from ..onboard.messages import last_note
 from ..transport.bus import Bus
+from ..transport.network import DISTRUST
 from .mission import Mission
+from .refused_notes import NETWORK
 from .spec import LiveSpec
 from .topics import topics
 
@@ -19,6 +21,7 @@ class RemoteLearners:
         """Build it for a flight and its bus."""
         self._spec, self._bus = spec, bus
         self._missions, self._beat = 0, (0, 0.0)
+        self._distrust: float | None = None
 
     def announce(self, start: Path) -> None:
         """Publish what they have to know; the policy's learner starts again from ``start``."""
@@ -43,7 +46,11 @@ class RemoteLearners:
         return last_note(self._bus, f"ready.{layer}", "ready").get("base") == self._spec.controller.base
 
     def failed(self) -> str | None:
-        """Return the last words of a learner that died for good; None if none did."""
+        """Return why learners cannot learn: another key, or the last words of one that died for good; else None."""
+        fault = last_note(self._bus, NETWORK).get("fault", "")
+        self._distrust = (self._distrust or time.monotonic()) if fault else None
+        if self._distrust is not None and time.monotonic() > self._distrust + DISTRUST:
+            return f"{self._spec.learners}: {fault}"
         said = last_note(self._bus, "ground")
         words = said.get("failed")
         if said.get("base") != self._spec.controller.base or not isinstance(words, str) or not words:

@@ -27,6 +27,7 @@ from ..physics.state import State
 from ..plants.plant import as_numpy
 from ..runtime.pilot import ControllerPilot
 from ..transport.remote import Address
+from ..transport.shared_key import read_key
 from .choices import choices, paths
 from .controllers import adaptive_source, plain_source
 from .page import free_port
@@ -153,22 +154,25 @@ def live_spec(request: LiveRequest) -> LiveSpec:
     )
 
 
-def learners_at(text: str, say: Callable[[str], None]) -> Address:
+def learners_at(text: str, say: Callable[[str], None], key: Path | None = None) -> Address:
     """Return where learners on another machine are reached.
 
     Args:
         text: As ``zenoh:192.168.1.5:7447``.
         say: Told what a person should know.
+        key: File with the key that those who learn have, too; None: that of ``RETRIM_KEY``, if there is one.
 
     Raises:
-        ConfigError: It is no address, or what it takes is not installed.
+        ConfigError: It is no address, what it takes is not installed, or there is no key although it is beyond this
+            machine.
     """
-    address = Address.of(text)
+    address = Address.of(text, read_key(key))
+    address.check_shared()
     if address.kind == "zenoh" and find_spec("zenoh") is None:
         raise ConfigError("a bus by zenoh needs zenoh: pip install 'retrim[zenoh]'")
     if not address.loopback:
         where = address.host if address.kind == "zenoh" else "the network of its rosmaster"
-        say(f"warning: this machine listens on {where}; anybody who reaches it may send policies to the vehicle")
+        say(f"warning: this machine listens on {where}; messages are signed, but anybody on the way can read them")
     return address
 
 

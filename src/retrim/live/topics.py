@@ -5,7 +5,7 @@ from ..onboard.topics import LAYERS, REFERENCE, SLOTS, slot
 from .spec import LiveSpec
 
 SMALL = ("sample", "setpoint", "fallback", "order", "ended", "world", "knobs", "wish", "learning", "ground",
-         "airborne", "followed", "refusals")  # fmt: skip
+         "airborne", "followed", "refusals.page", "refusals.network")  # fmt: skip
 ROLES = ("control", "plant", "watchdog", "recorder", "page", "bridge", *LAYERS)
 
 

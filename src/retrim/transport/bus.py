@@ -15,6 +15,16 @@ class Message(NamedTuple):
 class Bus(abc.ABC):
     """Topics with one writer each and any number of readers, none of which ever waits for another."""
 
+    @property
+    def refused(self) -> int:
+        """Messages from outside that were not taken."""
+        return 0
+
+    @property
+    def fault(self) -> str:
+        """Why another end is not heard; empty if nothing is known against it."""
+        return ""
+
     @abc.abstractmethod
     def publish(self, topic: str, data: bytes) -> None:
         """Replace the last message of ``topic``.

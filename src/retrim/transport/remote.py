@@ -2,10 +2,12 @@
 
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from ..errors import ConfigError
 from .network import NetworkBus
+from .session import GREETINGS, Session
+from .shared_key import MAKING, VARIABLE, SharedKey
 
 KINDS = ("zenoh", "ros")
 LOOPBACK = ("127.0.0.1", "localhost")
@@ -21,14 +23,20 @@ class Address:
     port: int
     key: str = ""
     """Of one vehicle among several that share the place."""
+    shared: SharedKey | None = field(default=None, repr=False, compare=False)
+    """Shared by those who may speak there; None: anybody may."""
 
     def __str__(self) -> str:
         """Return the text that :meth:`of` reads."""
         return f"{self.kind}:{self.host}:{self.port}{'/' if self.key else ''}{self.key}"
 
     @classmethod
-    def of(cls, text: str) -> "Address":
+    def of(cls, text: str, shared: SharedKey | None = None) -> "Address":
         """Read an address.
+
+        Args:
+            text: As ``zenoh:192.168.1.5:7447``.
+            shared: Key of those who may speak there.
 
         Raises:
             ConfigError: It is none.
@@ -39,12 +47,20 @@ class Address:
                 f"{text!r} is no address of a bus; one is zenoh:HOST:PORT or ros:HOST:PORT, with /KEY for one of "
                 "several vehicles there"
             )
-        return cls(found["kind"], found["host"], int(found["port"]), found["key"] or "")
+        return cls(found["kind"], found["host"], int(found["port"]), found["key"] or "", shared)
 
     @property
     def loopback(self) -> bool:
         """Whether it is on this machine only."""
         return self.host in LOOPBACK
+
+    def check_shared(self) -> None:
+        """Raise :class:`ConfigError` if the address is beyond this machine, and there is no shared key."""
+        if self.shared is None and not self.loopback:
+            raise ConfigError(
+                f"{self}: learners beyond this machine need a shared key: --key FILE or the variable {VARIABLE}, the "
+                f"same at both ends; {MAKING}"
+            )
 
     def join(self, capacities: Mapping[str, int], *, listen: bool, writes: Iterable[str] = ()) -> NetworkBus:
         """Join the bus.
@@ -58,10 +74,18 @@ class Address:
         Raises:
             ConfigError: It cannot be joined.
         """
+        greeting, where = GREETINGS[0 if listen else 1], f"{self.host}:{self.port}"
+        session = None if self.shared is None else Session(self.shared, self.key, greeting)
+        capacities, writes = dict(capacities) | dict.fromkeys(GREETINGS, 0), (*writes, greeting)
+        bus: NetworkBus
         if self.kind == "zenoh":
             from .zenoh import ZenohBus
 
-            return ZenohBus(capacities, f"tcp/{self.host}:{self.port}", listen=listen, key=self.key, writes=writes)
-        from .ros import RosBus
+            bus = ZenohBus(capacities, f"tcp/{where}", listen=listen, key=self.key, writes=writes, session=session)
+        else:
+            from .ros import RosBus
 
-        return RosBus(capacities, f"http://{self.host}:{self.port}", key=self.key, writes=writes)
+            bus = RosBus(capacities, f"http://{where}", key=self.key, writes=writes, session=session)
+        if session is None:
+            bus.publish(greeting, b"")  # so that an end with a key knows that this one has none
+        return bus

@@ -5,6 +5,7 @@ from typing import Any
 
 from ..rospy_node import join, system_module
 from .network import NetworkBus
+from .session import Session
 
 PREFIX = "/retrim"
 
@@ -13,7 +14,13 @@ class RosBus(NetworkBus):
     """One end of the bus. Ends in one process share its node, which lives as long as the process."""
 
     def __init__(
-        self, capacities: Mapping[str, int], master: str, *, key: str = "", writes: Iterable[str] = ()
+        self,
+        capacities: Mapping[str, int],
+        master: str,
+        *,
+        key: str = "",
+        writes: Iterable[str] = (),
+        session: Session | None = None,
     ) -> None:
         """Join a bus.
 
@@ -22,12 +29,13 @@ class RosBus(NetworkBus):
             master: Where the rosmaster is, as ``http://127.0.0.1:11311``.
             key: Of one vehicle among several.
             writes: Topics that are written here; others are declared with their first message.
+            session: Signs messages; None: nobody does.
 
         Raises:
             ConfigError: rospy is not installed, or there is no master.
         """
         rospy, message = join(master), system_module("std_msgs.msg").UInt8MultiArray
-        super().__init__(capacities)
+        super().__init__(capacities, session)
         self._rospy, self._message = rospy, message
         self._prefix = f"{PREFIX}/{key}" if key else PREFIX
         self._publishers: dict[str, Any] = {}
@@ -38,9 +46,11 @@ class RosBus(NetworkBus):
         ]  # fmt: skip
         for topic in writes:
             self._declare(topic)
+        self._begin()
 
     def close(self) -> None:
         """Leave the bus."""
+        self._end()
         for each in (*self._subscribers, *self._publishers.values()):
             each.unregister()
 

@@ -9,6 +9,7 @@ from typing import Any
 
 from ..errors import ConfigError
 from .network import NetworkBus
+from .session import Session
 
 PREFIX = "retrim"
 BUFFER = 1  # messages of a topic that its writer keeps for those who join late
@@ -25,6 +26,7 @@ class ZenohBus(NetworkBus):
         listen: bool,
         key: str = "",
         writes: Iterable[str] = (),
+        session: Session | None = None,
     ) -> None:
         """Join a bus.
 
@@ -34,6 +36,7 @@ class ZenohBus(NetworkBus):
             listen: Wait there for others; if not, look for who does, for as long as it takes.
             key: Of one vehicle among several.
             writes: Topics that are written here; others are declared with their first message.
+            session: Signs messages; None: nobody does.
 
         Raises:
             ConfigError: zenoh is not installed, or nobody can listen there.
@@ -44,7 +47,7 @@ class ZenohBus(NetworkBus):
         except ImportError as error:
             raise ConfigError("a bus by zenoh needs zenoh: pip install 'retrim[zenoh]'") from error
         ext: Any = _ext
-        super().__init__(capacities)
+        super().__init__(capacities, session)
         config = zenoh.Config()
         for name, value in {
             "mode": "peer",
@@ -79,9 +82,11 @@ class ZenohBus(NetworkBus):
                 self._session, where, listener, history=history, allowed_origin=remote
             )
             self._subscribers.append(found)
+        self._begin()
 
     def close(self) -> None:
         """Leave the bus."""
+        self._end()
         self._session.close()
 
     def _send(self, topic: str, frame: bytes) -> None:

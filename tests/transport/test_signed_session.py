@@ -1,0 +1,253 @@
+"""Of two ends with a key each takes what the other says to it, once, and nothing that anybody else says."""
+
+import os
+import pickle
+import secrets
+
+import pytest
+
+from retrim.errors import ConfigError
+from retrim.transport import session as sessions
+from retrim.transport.network import NetworkBus
+from retrim.transport.remote import Address
+from retrim.transport.session import FOREIGN, GREETINGS, HEAD, MISSING, UNSIGNED, Session
+from retrim.transport.shared_key import SharedKey, read_key
+
+KEY, OTHER = SharedKey(b"k" * 32), SharedKey(b"o" * 32)
+TOPICS = {"out": 1000, "mission": 1000, "into": 1000} | dict.fromkeys(GREETINGS, 0)
+
+
+class End(NetworkBus):
+    """One end on a wire, which somebody else can read and write."""
+
+    def __init__(self, wire, side, key=KEY, vehicle=""):
+        super().__init__(TOPICS, None if key is None else Session(key, vehicle, GREETINGS[side]))
+        self.wire = wire
+        wire.ends.append(self)
+
+    def _send(self, topic, frame):
+        self.wire.carried.append((self, topic, frame))
+
+    def close(self):
+        self.wire.ends.remove(self)
+
+
+class Wire:
+    def __init__(self):
+        self.ends, self.carried, self.record = [], [], []
+
+    def settle(self):
+        """Carry until nobody has anything to say."""
+        for _ in range(20):
+            for end in self.ends:
+                end._attend()
+            carried, self.carried = self.carried, []
+            for sender, topic, frame in carried:
+                self.record.append((topic, frame))
+                for end in self.ends:
+                    if end is not sender:
+                        end._received(topic, frame)
+            if not carried:
+                return
+        raise AssertionError("they never stop to talk")
+
+
+@pytest.fixture
+def wire():
+    return Wire()
+
+
+def said(end, topic):
+    message = end.latest(topic)
+    return None if message is None else message.data
+
+
+def test_messages_arrive_in_both_directions_whoever_was_first(wire):
+    flight = End(wire, 0)
+    flight.publish("mission", b"before anybody is there")
+    wire.settle()
+    ground = End(wire, 1)
+    wire.settle()
+    assert said(ground, "mission") == b"before anybody is there"
+    for i in range(3):
+        flight.publish("out", b"out %d" % i)
+        ground.publish("into", b"into %d" % i)
+        wire.settle()
+        assert (said(ground, "out"), said(flight, "into")) == (b"out %d" % i, b"into %d" % i)
+    assert flight.refused == ground.refused == 0
+    assert flight.fault == ground.fault == ""
+
+
+@pytest.mark.parametrize("again", [0, 1])
+def test_an_end_that_is_started_again_goes_on_and_the_one_before_is_not_heard_any_more(wire, again):
+    ends = [End(wire, 0), End(wire, 1)]
+    topics = "out", "into"
+    for end, topic in zip(ends, topics, strict=True):
+        end.publish(topic, b"first")
+    wire.settle()
+    version = ends[1 - again].latest(topics[again]).version
+    old = ends[again]
+    old.close()
+    ends[again] = End(wire, again)
+    wire.settle()
+    assert said(ends[again], topics[1 - again]) == b"first"
+    ends[again].publish(topics[again], b"second")
+    wire.settle()
+    found = ends[1 - again].latest(topics[again])
+    assert found.data == b"second"
+    assert found.version > version
+    old.publish(topics[again], b"of a process that hung")
+    wire.settle()
+    assert said(ends[1 - again], topics[again]) == b"second"
+
+
+def test_nothing_that_was_said_before_is_taken_again_by_anybody(wire):
+    """Neither by the ends that heard it, nor by ends that have just been started, alone or with each other."""
+    flight, ground = End(wire, 0), End(wire, 1)
+    flight.publish("out", b"old")
+    ground.publish("into", b"old")
+    wire.settle()
+    flight.publish("out", b"new")
+    ground.publish("into", b"new")
+    wire.settle()
+    record = list(wire.record)
+
+    def replayed(*ends):
+        for topic, frame in record:
+            for end in ends:
+                end._received(topic, frame)
+        wire.settle()
+
+    replayed(flight, ground)
+    assert (said(ground, "out"), said(flight, "into")) == (b"new", b"new")
+    assert flight.refused > 0
+    assert ground.refused > 0
+    ground.close()
+    later = End(wire, 1)
+    replayed(flight, later)
+    assert said(later, "out") == b"new"  # from the flight that lives
+    later.publish("into", b"newer")
+    wire.settle()
+    replayed(flight, later)
+    assert said(flight, "into") == b"newer"
+    alone = End(Wire(), 1)
+    for topic, frame in record:
+        alone._received(topic, frame)
+    assert said(alone, "out") is None
+    assert said(alone, "into") is None
+
+
+def test_no_change_of_a_message_is_taken(wire):
+    flight, ground = End(wire, 0), End(wire, 1)
+    wire.settle()
+    flight.publish("out", b"payload")
+    ((_, topic, frame),) = wire.carried
+    assert topic == "out"
+    wire.carried.clear()
+    for i in range(len(frame)):
+        for bit in (1, 128):
+            ground._received("out", frame[:i] + bytes([frame[i] ^ bit]) + frame[i + 1 :])
+    for cut in (b"", frame[:-1], frame[: HEAD.size], frame[: HEAD.size - 1], frame + b"x", frame[1:]):
+        ground._received("out", cut)
+    for other in ("mission", "into", GREETINGS[0]):  # said of something else
+        ground._received(other, frame)
+    flight._received("out", frame)  # sent back
+    ground._received("out", bytes(2000))
+    assert said(ground, "out") is said(ground, "mission") is said(ground, "into") is None
+    assert flight.latest("out").version == 1
+    assert ground.refused == 2 * len(frame) + 6 + 3 + 1
+    ground._received("out", frame)
+    assert said(ground, "out") == b"payload"
+
+
+def test_vehicles_with_one_key_do_not_take_what_is_said_to_another(wire):
+    flight, ground = End(wire, 0, vehicle="quad1"), End(wire, 1, vehicle="quad2")
+    flight.publish("out", b"for quad1")
+    wire.settle()
+    assert said(ground, "out") is None
+    assert ground.refused > 0
+
+
+@pytest.mark.parametrize(
+    ("here", "there", "fault"), [(KEY, OTHER, FOREIGN), (KEY, None, UNSIGNED), (None, KEY, MISSING)]
+)
+def test_another_key_or_none_is_one_clear_line_at_both_ends(wire, here, there, fault):
+    flight, ground = End(wire, 0, here), End(wire, 1, there)
+    flight.publish("out", b"out")
+    ground.publish("into", b"into")
+    wire.settle()
+    assert flight.fault == fault
+    assert said(flight, "into") is said(ground, "out") is None
+    assert flight.refused > 0
+    assert fault.isprintable()
+    assert len(fault) < 120
+
+
+def test_a_stranger_does_not_come_between_two_ends_that_have_met(wire):
+    flight, ground = End(wire, 0), End(wire, 1)
+    flight.publish("mission", b"mine")
+    wire.settle()
+    for end in (flight, ground):
+        for topic in TOPICS:
+            end._received(topic, b"noise")
+            end._received(topic, secrets.token_bytes(200)[: HEAD.size])
+    assert flight.fault == ground.fault == ""
+    assert said(ground, "mission") == b"mine"
+    flight.publish("mission", b"mine still")
+    wire.settle()
+    assert said(ground, "mission") == b"mine still"
+
+
+def test_the_code_is_hmac_sha256_over_parts_that_cannot_be_shifted():
+    assert len(KEY.sign(b"a")) == 32
+    assert KEY.sign(b"ab", b"c") != KEY.sign(b"a", b"bc")
+    assert KEY.sign(b"a", b"b") != KEY.sign(b"a", b"b", b"")
+    assert KEY.sign(b"a") != OTHER.sign(b"a")
+
+
+def test_a_key_is_read_and_shown_nowhere(tmp_path, monkeypatch):
+    file = tmp_path / "key"
+    file.write_text("0123456789abcdef-secret\n")
+    key = read_key(file)
+    assert key == SharedKey(b"0123456789abcdef-secret")
+    address = Address.of("zenoh:10.0.0.5:7447", key)
+    for shown in (repr(key), str(key), repr(address), str(address), repr([address]), f"{address!r}"):
+        assert "secret" not in shown.replace("secret=", "")
+    assert pickle.loads(pickle.dumps(address)).shared == key
+    monkeypatch.setenv("RETRIM_KEY", " 0123456789abcdef-secret ")
+    assert read_key(None) == key
+    assert "RETRIM_KEY" not in os.environ  # no process that is started now has it
+    assert read_key(None) is None
+
+
+@pytest.mark.parametrize("text", ["", "short", "x" * 5000, " " * 50])
+def test_a_key_that_is_none_is_one_line_without_it(tmp_path, monkeypatch, text):
+    file = tmp_path / "key"
+    file.write_text(text)
+    with pytest.raises(ConfigError, match="a key has 16 to 4096 bytes") as error:
+        read_key(file)
+    assert text.strip() == "" or text not in str(error.value)
+    monkeypatch.setenv("RETRIM_KEY", text)
+    if text:
+        with pytest.raises(ConfigError, match=r"RETRIM_KEY: a key has 16 to 4096 bytes"):
+            read_key(None)
+
+
+def test_a_file_that_cannot_be_read_is_named(tmp_path):
+    for file in (tmp_path / "none", tmp_path, tmp_path / "a\0b"):
+        with pytest.raises(ConfigError, match="the key cannot be read") as error:
+            read_key(file)
+        assert str(error.value).isprintable()
+
+
+def test_beyond_loopback_a_key_is_needed():
+    for text in ("zenoh:192.168.1.5:7447", "ros:robot:11311/quad1", "zenoh:0.0.0.0:7447", "zenoh:127.0.0.1.evil:1"):
+        with pytest.raises(ConfigError, match="need a shared key: --key FILE or the variable RETRIM_KEY"):
+            Address.of(text).check_shared()
+        Address.of(text, KEY).check_shared()
+    for text in ("zenoh:127.0.0.1:7447", "ros:localhost:11311"):
+        Address.of(text).check_shared()
+
+
+def test_a_mark_tells_signed_messages_from_others():
+    assert sessions.MARK[-1] > 0x80  # the numbers of writers of unsigned messages have 63 bits
