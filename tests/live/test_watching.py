@@ -75,6 +75,15 @@ def test_a_report_of_swaps_costs_no_look_at_those_before():
     assert len(events.swaps) == 180
 
 
+def test_what_is_ignored_of_a_vehicle_is_told_once():
+    events = LiveEvents()
+    for notes in ([], ["ODOMETRY in frame 7"], ["ODOMETRY in frame 7"], ["ODOMETRY in frame 7", "another"]):
+        events.take(Status(1.0, {}, {"notes": notes}, {}, {}, None, [], False, 0, None))
+    assert [event.note for event in events.all] == [
+        f"vehicle: {what}; such messages are ignored" for what in ("ODOMETRY in frame 7", "another")
+    ]
+
+
 def test_a_terminal_that_stands_still_stops_nobody():
     blocked, stop = threading.Event(), threading.Event()
     threading.Timer(0.3, stop.set).start()

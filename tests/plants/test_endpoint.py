@@ -3,11 +3,14 @@
 import os
 import pty
 import select
+import socket
 
+import numpy as np
 import pytest
 
 from retrim import ConfigError, PlantError
-from retrim.plants.bridges.endpoint import Endpoint, address_of, open_endpoint
+from retrim.plants.bridges.crazyflie import CrazyfliePlant
+from retrim.plants.bridges.endpoint import Endpoint, address_of, address_towards, open_endpoint
 
 
 @pytest.mark.parametrize(
@@ -49,6 +52,26 @@ def test_a_port_is_listened_on_and_given_back():
 def test_an_address_of_another_machine_is_refused(address):
     with pytest.raises(PlantError, match="cannot be listened on"):
         open_endpoint(address)
+
+
+def test_only_the_address_towards_a_vehicle_is_listened_on():
+    assert address_towards("127.0.0.1", 19850) == "127.0.0.1"
+    beyond = address_towards_or_none("192.0.2.1")
+    assert beyond != "0.0.0.0"
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        plant = CrazyfliePlant(f"udp:127.0.0.1:{server.getsockname()[1]}", 0.02, np.zeros(4), np.ones(4))
+        with pytest.raises(PlantError, match="flight was given up"):
+            plant.connect(lambda: False)
+        assert plant.link._endpoint._socket.getsockname()[0] == "127.0.0.1"
+        plant.land()
+
+
+def address_towards_or_none(host):
+    """Return the address, or None where a machine has no network."""
+    try:
+        return address_towards(host, 19850)
+    except PlantError:
+        return None
 
 
 def test_a_serial_line_carries_both_ways():

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from made_up_wire import Wire
-from retrim import PlantError
 from retrim.plants.bridges import frames
 from retrim.plants.bridges.mavlink_link import MavlinkLink
 
@@ -103,9 +102,42 @@ def test_position_and_attitude_of_one_instant_do_for_a_state(px4, link):
     np.testing.assert_allclose(link.reading.omega, [0.4, -0.5, -0.6], atol=1e-6)
 
 
-def test_a_frame_that_is_not_known_is_named(px4):
-    with pytest.raises(PlantError, match="ODOMETRY in frame 7"):
-        px4.odometry(frame=7)
+def test_messages_in_frames_that_are_not_known_are_counted_and_named_once(px4, link):
+    px4.odometry()
+    before = link.reading
+    for frame in range(256):
+        if frame not in (1, 20):
+            px4.odometry(p=(7.0, 7.0, 7.0), frame=frame)
+    for child in (0, 2, 9, 255):
+        px4.odometry(p=(7.0, 7.0, 7.0), child=child)
+    for _ in range(3):
+        px4.odometry(p=(7.0, 7.0, 7.0), frame=7)
+    assert link.reading is before
+    assert link.ignored == 254 + 4 + 3
+    assert link.notes[0] == "ODOMETRY in frame 0; only LOCAL_NED (1) and LOCAL_FRD (20) are known"
+    assert len(set(link.notes)) == len(link.notes) == 5
+    px4.odometry(p=(4.0, 5.0, -6.0), frame=20)
+    np.testing.assert_allclose(link.reading.p, [5.0, 4.0, 6.0], atol=1e-6)
+
+
+def framed(kind, payload):
+    """A whole packet of any kind of message, with any content."""
+    head = bytes([len(payload), 0, 0, 0, 1, 1]) + kind.id.to_bytes(3, "little")
+    crc = mavlink.x25crc(head + payload + bytes([kind.crc_extra])).crc
+    return b"\xfd" + head + payload + crc.to_bytes(2, "little")
+
+
+def test_no_message_of_the_dialect_ends_a_flight(px4, wire, link):
+    rng = np.random.default_rng(0)
+    for kind in mavlink.mavlink_map.values():
+        length = kind.unpacker.size
+        for payload in (bytes(length), b"\xff" * length, *(rng.bytes(length) for _ in range(8))):
+            wire.inbox.append((framed(kind, payload), px4.peer))
+        link.pump(0.0)
+    assert link.system == (1, 1)
+    assert link.reading is None or np.isfinite(link.reading.p).all()
+    px4.odometry(p=(4.0, 5.0, -6.0))
+    assert link.reading is not None
 
 
 @pytest.mark.parametrize(

@@ -27,6 +27,7 @@ class LiveEvents:
         self._knobs_refused = ""
         self._next_excluded = 0.0  # [s]
         self._last_stage = -1.0  # [s], time of the last change that was told
+        self._vehicle_notes: set[str] = set()
 
     def take(self, status: Status, others: Iterable[Event] = ()) -> list[Event]:
         """Return what is new, ``others`` included."""
@@ -54,6 +55,10 @@ class LiveEvents:
                 self._refused[what] = count
                 new.append(Event(t, "refused", f"message: {what}, {count} so far"))
         new += [Event(t, "refused", said) for said in status.refusals]
+        for note in status.world.get("notes", []):
+            if note not in self._vehicle_notes:
+                self._vehicle_notes.add(note)
+                new.append(Event(t, "refused", f"vehicle: {note}; such messages are ignored"))
         for role, count in status.restarts.items():
             if count > self._restarts.get(role, 0):
                 self._restarts[role] = count

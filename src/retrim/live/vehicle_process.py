@@ -80,7 +80,9 @@ def _carried(plan: PlantPlan, plant: VehiclePlant, bus: Bus, parent: Lifeline, e
         tick = max(tick + 1, due)
         if tick % 25 == 0:
             refused = "a vehicle has no knobs" if bus.latest("knobs") is not None else ""
-            bus.publish("world", pack_note("world", late=late, held=held, lost=plant.lost, knobs_refused=refused))
+            bus.publish("world", pack_note(
+                "world", late=late, held=held, lost=plant.lost, knobs_refused=refused, notes=list(plant.notes)
+            ))  # fmt: skip
 
 
 def _sample(tick: int, dt: float, now: VehicleState, accepted: np.ndarray) -> Sample:

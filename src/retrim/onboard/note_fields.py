@@ -126,7 +126,12 @@ FIELDS: Mapping[str, Mapping[str, Read]] = {
         "learning": flag,
     },
     "wish": {**dict.fromkeys(("method", "reference"), text), **dict.fromkeys(("paused", "land"), flag)},
-    "world": {**dict.fromkeys(("late", "held"), whole()), "lost": number(0.0), "knobs_refused": text},
+    "world": {
+        **dict.fromkeys(("late", "held"), whole()),
+        "lost": maybe(number(0.0)),
+        "knobs_refused": text,
+        "notes": list_of(text),
+    },
 }
 """Fields of each kind of note, by the first part of its name; every field may be absent."""
 

@@ -8,7 +8,7 @@ import numpy as np
 from ...errors import ConfigError, PlantError
 from . import crtp
 from .crazyflie_link import CrazyflieLink
-from .endpoint import UdpEndpoint, address_of
+from .endpoint import UdpEndpoint, address_of, address_towards
 from .frames import heading_of
 from .linked_plant import LinkedPlant, ThrustScale
 from .patience import KeepOn, insisting
@@ -58,7 +58,7 @@ class CrazyfliePlant(LinkedPlant[CrazyflieLink]):
                 to = (socket.gethostbyname(host), port)
             except OSError as error:
                 raise PlantError(f"{self.address}: no such host ({error})") from error
-            self._link = CrazyflieLink(UdpEndpoint("0.0.0.0", 0), to)
+            self._link = CrazyflieLink(UdpEndpoint(address_towards(*to), 0), to)
         elif self._link.reading is not None:
             return
         link = self._link

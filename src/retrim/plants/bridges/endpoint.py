@@ -137,6 +137,23 @@ def address_of(text: str) -> tuple[str, str, int]:
     return kind, place, int(number)
 
 
+def address_towards(host: str, port: int) -> str:
+    """Return the address of this machine from which another one is reached; nothing is sent.
+
+    Whoever listens on that address only is not reached by other networks: the loopback address for a vehicle on this
+    machine, that of the radio for one on a radio.
+
+    Raises:
+        PlantError: There is no way there.
+    """
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect((host, port))
+        except OSError as error:
+            raise PlantError(f"udp:{host}:{port} cannot be reached: {error}") from error
+        return str(probe.getsockname()[0])
+
+
 def open_endpoint(address: str) -> Endpoint:
     """Open what an address names.
 

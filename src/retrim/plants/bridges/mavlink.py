@@ -2,6 +2,7 @@
 
 import math
 import time
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -171,4 +172,10 @@ class MavlinkPlant(LinkedPlant[MavlinkLink]):
             raise PlantError(f"{self.address}: the autopilot refuses {what}{self._said()}")
 
     def _said(self) -> str:
-        return f"; it said: {'; '.join(self.link.texts)}" if self.link.texts else ""
+        ignored = f"; ignored: {'; '.join(self.link.notes)}" if self.link.notes else ""
+        return ignored + (f"; it said: {'; '.join(self.link.texts)}" if self.link.texts else "")
+
+    @property
+    def notes(self) -> Sequence[str]:
+        """Kinds of messages of the vehicle that were ignored."""
+        return () if self._link is None else tuple(self._link.notes)

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import PlantError
 from ..extras import import_extra
 from . import frames
 from .clock import RemoteClock
@@ -24,10 +23,12 @@ PREARM = 0x10000000  # bit of SYS_STATUS: it could be armed
 ARMED = 0x80  # bit of HEARTBEAT.base_mode
 ONBOARD_COMPUTER, INVALID = 18, 8  # MAV_TYPE, MAV_AUTOPILOT
 LOCAL_NED, LOCAL_FRD, BODY_FRD, BODY_NED = 1, 20, 12, 8
+WORLDS, BODIES = (LOCAL_NED, LOCAL_FRD), (BODY_FRD, BODY_NED)
 VISION, INT32, REAL32 = 2, 6, 9  # MAV_ESTIMATOR_TYPE, MAV_PARAM_TYPE
 RATES_ONLY = 128  # SET_ATTITUDE_TARGET: thrust and body rates count, the attitude does not
 PLACE_AND_YAW = 0x9F8  # SET_POSITION_TARGET_LOCAL_NED: velocity, acceleration and yaw rate do not count
 PAIRED_S = 0.025  # [s] between a position and an attitude that are one state
+MOST_NOTES = 5
 SETTLED_S = 1.0  # [s] without ODOMETRY, after which other messages are made do with
 
 
@@ -68,6 +69,8 @@ class MavlinkLink:
         """When it said anything last, monotonic clock [s]."""
         self.ignored = 0
         """Messages of strangers, and those that are damaged or make no sense."""
+        self.notes: list[str] = []
+        """What kinds of messages of the autopilot were ignored, each once."""
         self._origin: tuple[float, float, float] | None = None
         self._takes: dict[str, Callable[[Any, float], None]] = {
             "HEARTBEAT": self._heartbeat, "SYS_STATUS": self._sys_status, "TIMESYNC": self._timesync,
@@ -174,7 +177,10 @@ class MavlinkLink:
                 self.heard = now
                 take = self._takes.get(message.get_type())
                 if take is not None:
-                    take(message, now)
+                    try:
+                        take(message, now)
+                    except (ArithmeticError, LookupError, TypeError, ValueError) as error:  # one message ends nothing
+                        self._ignore(f"{message.get_type()} that makes no sense ({type(error).__name__})")
             else:
                 self.ignored += 1
 
@@ -203,14 +209,24 @@ class MavlinkLink:
             self._clock.exchanged(now - trip, 1e-9 * message.tc1, now)
 
     def _odometry(self, message: Any, now: float) -> None:
-        if message.frame_id not in (LOCAL_NED, LOCAL_FRD):
-            raise PlantError(f"ODOMETRY in frame {message.frame_id}; only LOCAL_NED (1) and LOCAL_FRD (20) are known")
+        frame, child = message.frame_id, message.child_frame_id
+        if frame not in WORLDS:
+            self._ignore(f"ODOMETRY in frame {frame}; only LOCAL_NED (1) and LOCAL_FRD (20) are known")
+            return
+        if child not in (*WORLDS, *BODIES):
+            self._ignore(f"ODOMETRY with velocities in frame {child}; only 1, 8, 12 and 20 are known")
+            return
         q, v = np.array(message.q), np.array([message.vx, message.vy, message.vz])
         rates = np.array([message.rollspeed, message.pitchspeed, message.yawspeed])
         p = np.array([message.x, message.y, message.z])
-        in_body = message.child_frame_id in (BODY_FRD, BODY_NED)
         self._odometry_at = now
-        self._read(1e-6 * message.time_usec, now, p, q, v, rates, in_body=in_body)
+        self._read(1e-6 * message.time_usec, now, p, q, v, rates, in_body=child in BODIES)
+
+    def _ignore(self, what: str) -> None:
+        """Count a message that cannot be used, and note its kind once."""
+        self.ignored += 1
+        if what not in self.notes and len(self.notes) < MOST_NOTES:
+            self.notes.append(what)
 
     def _attitude_quaternion(self, message: Any, now: float) -> None:
         self._attitude = message

@@ -3,7 +3,7 @@
 import abc
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import jax.numpy as jnp
 import numpy as np
@@ -39,6 +39,11 @@ class VehiclePlant(Plant, abc.ABC):
         self._tick: int | None = None
         self._began = 0.0
         self._thrust = STANDARD_GRAVITY
+
+    @property
+    def notes(self) -> Sequence[str]:
+        """Kinds of messages of the vehicle that were ignored, in words, each once."""
+        return ()
 
     @abc.abstractmethod
     def connect(self, keep_on: KeepOn = lambda: True) -> None:
