@@ -51,6 +51,18 @@ def test_a_picture_calls_methods_what_they_are(tmp_path):
     assert _colours(["indi"]) == {"indi": 1}
 
 
+def test_what_a_person_did_is_marked_where_it_was_done(tmp_path):
+    acts = [
+        Event(2.0, "asked", "method lora $x_$"),
+        Event(4.0, "knobs", "push 1 0 0"),
+        Event(5.0, "guard", "hold: gone"),
+    ]
+    shown = flight(0.1, spec=FlightSpec(Scenario("large"), "full", 0), events=acts)
+    text = picture([shown], Setup.of(tiny_preset()), shown.spec.scenario, tmp_path)[1].read_text()
+    assert all(words in text for words in ("method lora $x_$", "push 1 0 0", "somebody acts"))
+    assert "hold: gone" not in text
+
+
 def test_spans_of_disturbances():
     def found(name, seconds=30.0):
         return [(s.start, s.end, s.label) for s in spans(name, jnp.array([0.0, 0.0, 1.0]), seconds)]

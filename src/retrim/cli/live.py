@@ -56,7 +56,7 @@ def live(
 ) -> Callable[[threading.Event], int]:
     """Fly against the clock, and learn at the same time: a process for control, for each learner, and for the plant.
 
-    Ctrl-C lands the vehicle.
+    Ctrl-C lands the vehicle: the end of a flight without `--seconds`, whose exit code is 0.
 
     Args:
         policy: A policy.safetensors, or the folder that holds one; without one, a policy is trained first.
@@ -104,7 +104,7 @@ def live(
         method = "base" if adapt == "none" else adapt
         request = LiveRequest(
             setup, weights, scenario, method, seconds or LONGEST, seed, fence, run.folder, state, address, ground,
-            policy_age=policy_age or float("inf"), record=record,
+            policy_age=policy_age or float("inf"), record=record, until_stopped=seconds is None,
         )  # fmt: skip
         with interrupts_only_set(run.stop):  # a Ctrl-C lands the vehicle; whoever is in the air is not dropped
             return _fly(request, run)

@@ -22,6 +22,9 @@ from ..viz import plots
 from .flights import Flight
 from .recovery import FEW, timeline
 
+BY_HAND = ("asked", "knobs", "reference")
+"""Kinds of events that a person causes in a live flight."""
+
 
 def picture(
     flights: Sequence[Flight], setup: Setup, scenario: Scenario, folder: Path, *, stem: str | None = None
@@ -112,8 +115,9 @@ def _colours(methods: Sequence[str]) -> dict[str, int]:
 
 def _track(flight: Flight) -> plots.Track:
     return plots.Track(
-        flight.log.t, flight.log.p, flight.error, flight.swaps, flight.log.terminated, flight.steady_seconds
-    )
+        flight.log.t, flight.log.p, flight.error, flight.swaps, flight.log.terminated, flight.steady_seconds,
+        tuple((event.t, event.note) for event in flight.log.events if event.kind in BY_HAND),
+    )  # fmt: skip
 
 
 def _image_track(observation: Keypoints, x: State) -> plots.ImageTrack:

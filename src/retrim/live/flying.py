@@ -81,6 +81,8 @@ def fly_live(
             show = screen.enter_context(display(events))
             with closing(Wishes(request, supervisor)) as wishes:
                 status = watched(supervisor, request.seconds, events, show, run.stop, wishes)
+            if request.until_stopped and status.ended == "landed":
+                run.stop.clear()  # it ended as it was meant to
             learnt = learnt_in(supervisor.bus, status, supervisor.start) if request.method in LEARNING else None
         if len(pieces := wishes.following.pieces) > 1:  # errors and pictures are of all that was followed
             request = replace(request, setup=request.setup.on(spliced(pieces)))

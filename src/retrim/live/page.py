@@ -31,6 +31,13 @@ from .spec import PageSpec
 
 RATE = 20.0  # [Hz]
 TEXT_EVERY = 5  # refreshes
+FLOWN_BY = {
+    "policy": " (the neural policy, with what it has learnt so far)",
+    "hold": " (the guard, which holds the vehicle, and lands it then)",
+    "descend": " (the guard, which lands)",
+    "blind": " (the guard, without a measurement)",
+}
+"""What the names of who flies mean."""
 NO_ROTATION = 0.1  # error of R R^T, above which an attitude is not shown
 FAR = 1e6  # [m], further than anything is drawn
 LONGEST_NAME = 253  # letters, of a host
@@ -136,6 +143,7 @@ class _Page:
             tuple(spec.paths),
             spec.mass,
             RATE,
+            _escaped(f"Scenario: {spec.world}."),
         )
         self._scene.on_pull(self._panel.pull)
         self._tick = -1
@@ -224,7 +232,8 @@ def _text(
     status: dict[str, Any], ended: dict[str, Any], learners: dict[str, dict[str, Any]], world: dict[str, Any]
 ) -> str:
     reason = f": {_escaped(status['reason'])}" if status.get("reason") else ""
-    lines = [f"**{_escaped(status.get('mode', 'not known'))}**{reason}"]
+    mode = status.get("mode", "not known")
+    lines = [f"flown by: **{_escaped(mode)}**{reason or _escaped(FLOWN_BY.get(mode, ''))}"]
     if ended:
         lines = [f"**flight over**: {_escaped(ended.get('reason', ''))}"]
     versions = status.get("versions", {})

@@ -27,6 +27,7 @@ class Panel:
         references: tuple[str, ...],
         mass: float,
         rate: float,
+        world: str,
     ) -> None:
         """Build the panel.
 
@@ -42,6 +43,7 @@ class Panel:
             references: What may be followed, the first one at the beginning; none if there is no choice.
             mass: Of the vehicle [kg].
             rate: How often the panel is refreshed [Hz].
+            world: What flies where, in Markdown.
         """
         self._tell, self._wish, self._gui, self._pull = turn, wish, server.gui, np.zeros(3)
         self._setting, self._choices = False, dict[str, Any]()
@@ -49,7 +51,8 @@ class Panel:
         self._text = self._gui.add_markdown(WAITING)
         self._plot = _history_plot(self._gui)
         with self._gui.add_folder("World"):
-            self._gui.add_markdown("Grab the vehicle with the mouse and pull. Or:")
+            self._gui.add_markdown(world)
+            self._gui.add_markdown("On top of that, grab the vehicle with the mouse and pull, or:")
             self._push = _vector(self._gui, "push [m/s²]", knobs.push, PUSH, 0.1)
             self._wind = _vector(self._gui, "wind [m/s]", knobs.wind, WIND, 0.5)
             most = float(f"{min(LOAD, 0.8 * mass):.2g}")

@@ -87,6 +87,8 @@ class LiveRequest:
     """How old the flight may be that the policy was learnt from [s]."""
     record: Path | None = None
     """File of a recording for other viewers."""
+    until_stopped: bool = False
+    """Whether an interruption is how the flight is meant to end."""
 
     @property
     def followed(self) -> str:
@@ -213,7 +215,9 @@ def _page(request: LiveRequest) -> PageSpec:
     name, mass = request.setup.preset.name, float(vehicle.mass)
     offered = choices(request.setup, request.followed) if methods else ()
     places = _places(request, PATH_S)
-    return PageSpec(host, free_port(host, port), name, places, methods, arm, mass, paths(offered, PATH_S))
+    scenario = request.scenario
+    world = f"plant {scenario.plant}, disturbance {scenario.disturbance}"
+    return PageSpec(host, free_port(host, port), name, places, methods, arm, mass, paths(offered, PATH_S), world)
 
 
 def _limits(request: LiveRequest) -> Limits:

@@ -48,6 +48,8 @@ class PageSpec:
     paths: Mapping[str, np.ndarray] = field(default_factory=dict)
     """References to choose from by name, the present one first, and places that each passes, world [m], (n, 3); none
     if nothing is to be chosen."""
+    world: str = ""
+    """What flies where, in words."""
     token: str = field(default_factory=lambda: secrets.token_urlsafe(24), repr=False)
     """First part of every path of the page, which only its printed address has."""
 

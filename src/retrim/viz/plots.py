@@ -19,6 +19,7 @@ T = TypeVar("T")
 BASE, ADAPTED, UPDATE, PUSH, INK = "#D55E00", "#0072B2", "#009E73", "#E69F00", "#333333"
 GROUPS = (BASE, ADAPTED, "#CC79A7", "#56B4E9")
 LAPS_S = 10.0  # [s] at the end of a flight that its path from above shows
+MOST_WORDS = 8  # marks that have their words beside them
 ASPECT = 720 / 1280  # of a camera's image, whose axes both run from -1 to 1
 
 
@@ -37,6 +38,8 @@ class Track:
     crashed: bool = False
     last_s: float = 2.0
     """The flight is scored over this long at its end [s]."""
+    marks: tuple[tuple[float, str], ...] = ()
+    """What a person did, and when [s]."""
 
 
 @dataclass(frozen=True)
@@ -121,6 +124,7 @@ def _errors(axes: "matplotlib.axes.Axes", groups: Sequence[Group[Track]], spans:
             t, ymax=1.0 if few else 0.03, color=UPDATE, linestyle="--" if few else "-", linewidth=1.2,
             label=None if i else "new policy takes over",
         )  # fmt: skip
+    _marks(axes, sorted({mark for track in every for mark in track.marks}), top)
     for tracks, color, name in _coloured(groups):
         for i, track in enumerate(tracks):
             label = f"{name}: single flights" if len(tracks) > 1 and i == 0 else None
@@ -140,6 +144,15 @@ def _errors(axes: "matplotlib.axes.Axes", groups: Sequence[Group[Track]], spans:
             axes.plot(first.t, mean, color=color, linewidth=2.4, label=f"{name}: {final}")
     axes.set(xlabel="time [s]", ylabel="distance from where it should be [m]", ylim=(0, top))
     axes.margins(x=0)
+
+
+def _marks(axes: "matplotlib.axes.Axes", marks: Sequence[tuple[float, str]], top: float) -> None:
+    """Draw what a person did: a line each, with its words where there are few."""
+    for i, (t, words) in enumerate(marks):
+        axes.axvline(t, color=INK, linestyle=":", linewidth=1.2, label=None if i else "somebody acts")
+        if len(marks) <= MOST_WORDS:
+            axes.text(t, 0.9 * top, f" {words[:40]}", rotation=90, ha="right", va="top", color=INK, fontsize=8,
+                      parse_math=False)  # fmt: skip
 
 
 def paths(axes: "matplotlib.axes.Axes", groups: Sequence[Group[Track]], goal: tuple[float, float, float]) -> None:
