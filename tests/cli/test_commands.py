@@ -123,6 +123,7 @@ def test_what_live_refuses(folder):
         (("--learners", "somewhere"), "'somewhere' is no address of a bus; one is zenoh:HOST:PORT or ros:HOST:PORT"),
         (("--learners", "zenoh:192.0.2.1:7447"), "learners beyond this machine need a shared key: --key FILE"),
         (("--learners", "zenoh:127.0.0.1:7447", "--key", "none"), "--key 'none': the key cannot be read"),
+        (("--key", "p/policy.safetensors"), "--key 'p/policy.safetensors': a key has"),
         (("--record", "flight.bag"), "--record flight.bag: the name must end with .mcap"),
         (("--record", "nowhere/flight.mcap"), "nothing can be written in nowhere"),
     ):

@@ -178,5 +178,7 @@ def test_a_refused_note_is_counted_each_time_and_told_now_and_then():
     bus.publish("learner.policy", pack_note("learner.policy", took=1.0))
     bus.publish("refusals.page", pack_note("refusals.page", count=3, last="knobs: turned too far"))
     assert watch.look() == ["page: knobs: turned too far; 3 so far"]
-    assert watch.count == 15
+    bus.publish("refusals.page", pack_note("refusals.page", count=2, last="of a page that was started again"))
+    assert watch.look() == []
+    assert watch.count == 17
     assert json.dumps(watch.count)

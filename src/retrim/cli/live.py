@@ -94,7 +94,7 @@ def live(
         scenario = where.scenario(chosen)
         wanted = page or (seconds is None and not no_page)
         address = page_address(page_host, page_port, demanded=page, say=RichReporter().say) if wanted else None
-        ground = learners_at(learners, RichReporter().say, key) if learners is not None else None
+        ground = learners_at(learners, RichReporter().say, key)
         setup, run = Setup.of(chosen, scenario.reference), started(Run("live", out, stop=stop))
         if weights is None:
             weights, losses = train(Setup.of(chosen), seed, reporter=RichReporter(), stop=stop)

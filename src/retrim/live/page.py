@@ -126,7 +126,7 @@ class _Page:
     def __init__(self, spec: PageSpec, bus: Bus, server: Any) -> None:
         self._bus, self._lock = bus, threading.Lock()
         self._spec = spec
-        self._refused = last_note(self._bus, PAGE).get("count", 0)
+        self._refused = 0
         self._wishes = dict[str, Any]()
         for name, value in last_note(self._bus, "wish").items():  # of a page before this one
             with contextlib.suppress(MessageError):

@@ -26,7 +26,7 @@ class RefusedNotes:
         self.count = 0
         """Notes and inputs that were refused so far."""
         self._bus, self._known = bus, {topic: 0 for topic in topics if topic.startswith(NOTES)}
-        self._refused = dict.fromkeys(self._known, 0)
+        self._refused, self._told_so_far = dict.fromkeys(self._known, 0), dict[str, int]()
 
     def look(self) -> list[str]:
         """Return what has been refused since the last look, in words; a topic is told 1, 10, 100 times and so on."""
@@ -47,8 +47,10 @@ class RefusedNotes:
     def _told(self, topic: str) -> list[str]:
         """Count what a process has refused by itself."""
         note = last_note(self._bus, topic)
-        more = note.get("count", 0) - self._refused[topic]
-        return self._count(topic, more, note.get("last", "")) if more > 0 else []
+        before, now = self._told_so_far.get(topic, 0), note.get("count", 0)
+        self._told_so_far[topic] = now
+        more = now - before if now >= before else now  # the process was started again
+        return self._count(topic, more, note.get("last", "")) if more else []
 
     def _count(self, topic: str, more: int, why: str) -> list[str]:
         before, now = self._refused[topic], self._refused[topic] + more

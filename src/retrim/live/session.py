@@ -156,19 +156,24 @@ def live_spec(request: LiveRequest) -> LiveSpec:
     )
 
 
-def learners_at(text: str, say: Callable[[str], None], key: Path | None = None) -> Address:
-    """Return where learners on another machine are reached.
+def learners_at(text: str | None, say: Callable[[str], None], key: Path | None = None) -> Address | None:
+    """Return where learners on another machine are reached; None if they are on this one.
 
     Args:
-        text: As ``zenoh:192.168.1.5:7447``.
+        text: As ``zenoh:192.168.1.5:7447``; None for this machine.
         say: Told what a person should know.
         key: File with the key that those who learn have, too; None: that of ``RETRIM_KEY``, if there is one.
 
     Raises:
         ConfigError: It is no address, what it takes is not installed, or there is no key although it is beyond this
-            machine.
+            machine, or one although it is needed for nothing.
     """
-    address = Address.of(text, read_key(key))
+    shared = read_key(key)
+    if text is None:
+        if key is not None:
+            raise ConfigError("--key without --learners: learners on this machine need no key")
+        return None
+    address = Address.of(text, shared)
     address.check_shared()
     if address.kind == "zenoh" and find_spec("zenoh") is None:
         raise ConfigError("a bus by zenoh needs zenoh: pip install 'retrim[zenoh]'")
