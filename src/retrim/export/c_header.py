@@ -1,15 +1,21 @@
-"""C: one header of C99, single precision, without allocation, with test vectors inside."""
+"""C: one header of C99, single precision, without allocation, with test vectors inside.
 
+Numbers are tested by their bits: under -ffast-math a compiler removes comparisons that only NaN can fail.
+"""
+
+import math
 import re
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
+from ..control.finite_controller import LARGEST
 from ..io.files import write_whole
 from .portable import Portable
 
 WIDTH = 8  # numbers in a line
+BAD = (math.nan, math.inf, -math.inf, LARGEST)  # that the test vectors put in each place
 
 
 def write_c(path: Path, policy: Portable) -> list[Path]:
@@ -34,6 +40,8 @@ def _header(name: str, policy: Portable) -> str:
         f"#ifndef {guard}",
         f"#define {guard}",
         "#include <math.h>",
+        "#include <stdint.h>",
+        "#include <string.h>",
         "",
         f"#define {name.upper()}_OBSERVATION {sizes[0]}",
         f"#define {name.upper()}_DT {_number(policy.about['dt'])}",
@@ -43,8 +51,25 @@ def _header(name: str, policy: Portable) -> str:
         lines += _array(f"{name}_w{i}", w) + _array(f"{name}_b{i}", b)
     for what in ("low", "high", "y0", "test_observations", "test_commands"):
         lines += _array(f"{name}_{what}", getattr(policy, what))
-    return "\n".join([*lines, *_layer(name), *_command(name, sizes), *_check(name, policy), *_step(name, policy),
-                      f"#endif /* {guard} */", ""])  # fmt: skip
+    lines += [f"static const uint32_t {name}_test_bits[{len(BAD)}] = {{{', '.join(map(_bits, BAD))}}};", ""]
+    parts = (_finite(name), _layer(name), _command(name, sizes), _step(name, policy), _check(name, policy))
+    return "\n".join([*lines, *(line for part in parts for line in part), f"#endif /* {guard} */", ""])
+
+
+def _finite(name: str) -> list[str]:
+    return [
+        f"/* Whether all numbers are finite and smaller than {LARGEST:g}; by their bits, which -ffast-math leaves. */",
+        f"static inline int {name}_finite(const float *x, int n)",
+        "{",
+        "    for (int i = 0; i < n; ++i) {",
+        "        uint32_t bits;",
+        "        memcpy(&bits, x + i, sizeof bits);",
+        f"        if ((bits & 0x7fffffffu) >= {_bits(LARGEST)}) return 0;",
+        "    }",
+        "    return 1;",
+        "}",
+        "",
+    ]
 
 
 def _layer(name: str) -> list[str]:
@@ -67,9 +92,11 @@ def _layer(name: str) -> list[str]:
 def _command(name: str, sizes: tuple[int, ...]) -> list[str]:
     widest = max(sizes[1:])
     lines = [
-        f"static inline void {name}_command(const float observation[{sizes[0]}], float command[4])",
+        "/* Returns 1; or 0, and leaves the command as it is, if observation or command are not finite. */",
+        f"static inline int {name}_command(const float observation[{sizes[0]}], float command[4])",
         "{",
-        f"    float a[{widest}], b[{widest}];",
+        f"    float a[{widest}], b[{widest}], u[4];",
+        f"    if (!{name}_finite(observation, {sizes[0]})) return 0;",
     ]
     source, target = "observation", "a"
     for i, (inputs, outputs) in enumerate(pairwise(sizes)):
@@ -79,9 +106,13 @@ def _command(name: str, sizes: tuple[int, ...]) -> list[str]:
         source, target = target, "b" if target == "a" else "a"
     return [
         *lines,
+        *(["    (void)b;"] if len(sizes) == 2 else []),
         "    for (int j = 0; j < 4; ++j)",
-        f"        command[j] = {name}_low[j] + ({name}_high[j] - {name}_low[j]) "
+        f"        u[j] = {name}_low[j] + ({name}_high[j] - {name}_low[j]) "
         f"/ (1.0f + expf(-({source}[j] + {name}_y0[j])));",
+        f"    if (!{name}_finite(u, 4)) return 0;",
+        "    memcpy(command, u, sizeof u);",
+        "    return 1;",
         "}",
         "",
     ]
@@ -90,21 +121,52 @@ def _command(name: str, sizes: tuple[int, ...]) -> list[str]:
 def _check(name: str, policy: Portable) -> list[str]:
     n, size = policy.test_observations.shape
     return [
-        "/* Largest error at the test vectors, as a share of the range of commands. */",
+        "/* Largest error at the test vectors, as a share of the range of commands; 1 if a number that is not finite",
+        "   changes anything. */",
         f"static inline float {name}_check(void)",
         "{",
         "    float worst = 0.0f, command[4];",
         f"    for (int k = 0; k < {n}; ++k) {{",
-        f"        {name}_command({name}_test_observations + {size} * k, command);",
+        f"        if (!{name}_command({name}_test_observations + {size} * k, command)) return 1.0f;",
         "        for (int j = 0; j < 4; ++j) {",
         f"            const float missed = fabsf(command[j] - {name}_test_commands[4 * k + j]) "
         f"/ ({name}_high[j] - {name}_low[j]);",
         "            if (!(missed <= worst)) worst = missed;",
         "        }",
         "    }",
+        f"    for (int k = 0; k < {len(BAD)} * {size}; ++k) {{",
+        f"        float spoilt[{size}], before[4];",
+        f"        memcpy(spoilt, {name}_test_observations, sizeof spoilt);",
+        f"        memcpy(spoilt + k % {size}, {name}_test_bits + k / {size}, sizeof(float));",
+        "        memcpy(before, command, sizeof before);",
+        f"        if ({name}_command(spoilt, command) || memcmp(before, command, sizeof before)) return 1.0f;",
+        "    }",
+        *([] if policy.observation is None else _check_steps(name)),
         "    return worst;",
         "}",
         "",
+    ]
+
+
+def _check_steps(name: str) -> list[str]:
+    return [
+        f"    {name}_memory memory, undisturbed;",
+        "    float other[4], x[15] = {0.1f, 0.2f, 0.3f, 1.0f, 0.0f, 0.0f, 0.0f, 1.0f, 0.0f, 0.0f, 0.0f, 1.0f};",
+        f"    {name}_reset(&memory);",
+        f"    {name}_reset(&undisturbed);",
+        "    for (int tick = 0; tick < 3; ++tick) {",
+        "        x[0] += 0.5f;",
+        f"        if (!{name}_step(&memory, x, x + 3, x + 12, command)) return 1.0f;",
+        f"        if (!{name}_step(&undisturbed, x, x + 3, x + 12, other)) return 1.0f;",
+        "        if (memcmp(command, other, sizeof other)) return 1.0f;",
+        f"        for (int k = 0; k < {len(BAD)} * 15; ++k) {{",
+        "            float spoilt[15];",
+        "            memcpy(spoilt, x, sizeof spoilt);",
+        f"            memcpy(spoilt + k % 15, {name}_test_bits + k / 15, sizeof(float));",
+        f"            if ({name}_step(&memory, spoilt, spoilt + 3, spoilt + 12, other)) return 1.0f;",
+        "            if (memcmp(command, other, sizeof other)) return 1.0f;",
+        "        }",
+        "    }",
     ]
 
 
@@ -115,13 +177,13 @@ def _step(name: str, policy: Portable) -> list[str]:
     seen, past = policy.observation, 4 * policy.observation["history"]
     gravity, size = _number(seen["gravity"]), policy.sizes[0]
     shift = [
-        f"    for (int i = 0; i < {past - 4}; ++i) memory->past[i] = memory->past[i + 4];",
-        f"    memory->past[{past - 4}] = memory->last[0] / {gravity} - 1.0f;",
+        f"    for (int i = 0; i < {past - 4}; ++i) next.past[i] = next.past[i + 4];",
+        f"    next.past[{past - 4}] = next.last[0] / {gravity} - 1.0f;",
         *(
-            f"    memory->past[{past - 4 + i}] = memory->last[{i}] / {_number(w)};"
+            f"    next.past[{past - 4 + i}] = next.last[{i}] / {_number(w)};"
             for i, w in enumerate(seen["rates_max"], 1)
         ),
-        f"    for (int i = 0; i < {past}; ++i) observation[15 + i] = memory->past[i];",
+        f"    memcpy(observation + 15, next.past, {past} * sizeof(float));",
     ]
     return [
         f"typedef struct {{ float last[4], past[{max(past, 1)}]; }} {name}_memory;",
@@ -132,18 +194,24 @@ def _step(name: str, policy: Portable) -> list[str]:
         f"    for (int i = 0; i < 4; ++i) memory->last[i] = i == 0 ? {gravity} : 0.0f;",
         "}",
         "",
-        "/* Once per control tick: p, v in the world, r the attitude, body to world, row by row. */",
-        f"static inline void {name}_step({name}_memory *memory, const float p[3], const float r[9], const float v[3], "
+        "/* Once per control tick: p, v in the world, r the attitude, body to world, row by row. Returns 1; or 0 if",
+        "   measurement or command are not finite: the command is then the last one, and the memory stays as it is. */",
+        f"static inline int {name}_step({name}_memory *memory, const float p[3], const float r[9], const float v[3], "
         "float command[4])",
         "{",
+        f"    {name}_memory next = *memory;",
         f"    float observation[{size}];",
+        "    memcpy(command, memory->last, sizeof memory->last);",
+        f"    if (!{name}_finite(p, 3) || !{name}_finite(r, 9) || !{name}_finite(v, 3)) return 0;",
         *(f"    observation[{i}] = (p[{i}] - {_number(x)}) / {_number(seen['position_scale'])};"
           for i, x in enumerate(seen["origin"])),
-        "    for (int i = 0; i < 9; ++i) observation[3 + i] = r[i];",
+        "    memcpy(observation + 3, r, 9 * sizeof(float));",
         f"    for (int i = 0; i < 3; ++i) observation[12 + i] = v[i] / {_number(seen['velocity_scale'])};",
         *(shift if past else []),
-        f"    {name}_command(observation, command);",
-        "    for (int i = 0; i < 4; ++i) memory->last[i] = command[i];",
+        f"    if (!{name}_command(observation, command)) return 0;",
+        "    memcpy(next.last, command, sizeof next.last);",
+        "    *memory = next;",
+        "    return 1;",
         "}",
         "",
     ]  # fmt: skip
@@ -159,3 +227,8 @@ def _number(value: float) -> str:
     """Return a number that single precision reads back exactly."""
     text = f"{np.float32(value):.9g}"
     return f"{text}f" if any(sign in text for sign in ".e") else f"{text}.0f"
+
+
+def _bits(value: float) -> str:
+    """Return the bits of a number in single precision."""
+    return f"0x{np.float32(value).view(np.uint32):08x}u"

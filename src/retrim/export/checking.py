@@ -1,5 +1,9 @@
-"""Does an exported policy compute what JAX does? It is run, on 10,000 observations, and its steps are timed."""
+"""Does an exported policy compute what JAX does? It is run, on 10,000 observations, and its steps are timed.
 
+NaN, infinite and too large numbers are among its test vectors, in each format.
+"""
+
+import math
 import shutil
 import subprocess
 import tempfile
@@ -12,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from ..control.finite_controller import LARGEST
 from ..errors import ConfigError
 from .c_header import name_of
 from .portable import Portable
@@ -65,6 +70,9 @@ def check_onnx(path: Path, policy: Portable, rows: np.ndarray, wanted: np.ndarra
 
     session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
     found = session.run(["command"], {"observation": rows})[0]
+    spoilt = session.run(["command", "finite"], {"observation": _spoilt(rows)})
+    if not np.isnan(spoilt[0]).all() or np.any(spoilt[1]):
+        return Parity("ONNX Runtime, for numbers that are not finite,", math.inf, math.inf)
     step = _timed(lambda o: session.run(["command"], {"observation": o[None]}), rows)
     return Parity("ONNX Runtime", _worst(policy, np.asarray(found), wanted), step)
 
@@ -92,6 +100,13 @@ def check_c(path: Path, policy: Portable, rows: np.ndarray, wanted: np.ndarray) 
     seconds, own = (float(word) for word in ran.stderr.split())
     given = np.frombuffer(ran.stdout, dtype=np.float32).reshape(-1, 4)
     return Parity(Path(compiler).name, max(own, _worst(policy, given, wanted)), seconds / len(rows))
+
+
+def _spoilt(rows: np.ndarray) -> np.ndarray:
+    """The first row with NaN, infinity and the smallest number that is too large, in each place."""
+    size = rows.shape[1]
+    bad = (math.nan, math.inf, -math.inf, LARGEST)
+    return np.array([np.where(np.arange(size) == i, x, rows[0]) for x in bad for i in range(size)], np.float32)
 
 
 def _worst(policy: Portable, found: np.ndarray, wanted: np.ndarray) -> float:

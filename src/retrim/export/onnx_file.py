@@ -3,9 +3,11 @@
 import json
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from ..control.finite_controller import LARGEST
 from ..errors import ConfigError
 from ..io.files import write_whole
 from .portable import Portable
@@ -14,7 +16,12 @@ OPSET, IR = 17, 8  # old enough for every runtime that is in use
 
 
 def write_onnx(path: Path, policy: Portable) -> list[Path]:
-    """Write a model from ``observation`` (rows x numbers) to ``command`` (rows x 4); return its path.
+    """Write a model from ``observation`` (rows x numbers) to ``command`` (rows x 4) and ``finite`` (rows x 1).
+
+    It has no memory: where an observation or a command is not finite, the command is NaN, and ``finite`` is false.
+
+    Returns:
+        Its path.
 
     Raises:
         ConfigError: What writes it is not installed.
@@ -24,7 +31,27 @@ def write_onnx(path: Path, policy: Portable) -> list[Path]:
     import onnx
     from onnx import TensorProto, helper, numpy_helper
 
-    nodes, values, h = [], dict[str, np.ndarray](), "observation"
+    values = {"largest": _scalar(LARGEST), "zero": _scalar(0.0), "nan": _scalar(np.nan)}
+
+    def finite(x: str, out: str) -> list[onnx.NodeProto]:
+        """Nodes that say whether all numbers of a row are smaller than LARGEST; a comparison with NaN is false."""
+        steps: tuple[tuple[str, list[str], dict[str, Any]], ...] = (
+            ("Abs", [x], {}),
+            ("Less", [f"{out}_Abs", "largest"], {}),
+            ("Cast", [f"{out}_Less"], {"to": TensorProto.FLOAT}),
+            ("ReduceMin", [f"{out}_Cast"], {"axes": [1], "keepdims": 1}),
+            ("Greater", [f"{out}_ReduceMin", "zero"], {}),
+        )
+        return [
+            helper.make_node(kind, inputs, [out if kind == "Greater" else f"{out}_{kind}"], **how)
+            for kind, inputs, how in steps
+        ]
+
+    nodes = [
+        *finite("observation", "observation_is_finite"),
+        helper.make_node("Where", ["observation_is_finite", "observation", "zero"], ["kept"]),
+    ]
+    h = "kept"
     for i, (w, b) in enumerate(policy.layers):
         values |= {f"w{i}": w, f"b{i}": b}
         nodes.append(helper.make_node("Gemm", [h, f"w{i}", f"b{i}"], [f"y{i}"]))
@@ -37,14 +64,20 @@ def write_onnx(path: Path, policy: Portable) -> list[Path]:
         helper.make_node("Add", [h, "hover"], ["centred"]),
         helper.make_node("Sigmoid", ["centred"], ["share"]),
         helper.make_node("Mul", ["share", "range"], ["above"]),
-        helper.make_node("Add", ["above", "low"], ["command"]),
+        helper.make_node("Add", ["above", "low"], ["within"]),
+        *finite("within", "command_is_finite"),
+        helper.make_node("And", ["observation_is_finite", "command_is_finite"], ["finite"]),
+        helper.make_node("Where", ["finite", "within", "nan"], ["command"]),
     ]
     size = policy.sizes
     graph = helper.make_graph(
         nodes,
         "policy",
         [helper.make_tensor_value_info("observation", TensorProto.FLOAT, ["rows", size[0]])],
-        [helper.make_tensor_value_info("command", TensorProto.FLOAT, ["rows", 4])],
+        [
+            helper.make_tensor_value_info("command", TensorProto.FLOAT, ["rows", 4]),
+            helper.make_tensor_value_info("finite", TensorProto.BOOL, ["rows", 1]),
+        ],
         [numpy_helper.from_array(value, name) for name, value in values.items()],
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR)
@@ -54,3 +87,7 @@ def write_onnx(path: Path, policy: Portable) -> list[Path]:
     onnx.checker.check_model(model, full_check=True)
     write_whole(path, model.SerializeToString())
     return [path]
+
+
+def _scalar(value: float) -> np.ndarray:
+    return np.asarray(value, dtype=np.float32)

@@ -3,6 +3,7 @@
     policy = Runner("policy.npz")
     policy.reset()
     c, *omega = policy.step(p, R, v)      # at every control tick
+    if policy.repeats > 50: ...           # for 50 ticks, no measurement was finite: the last command was repeated
 
 World ENU, body forward-left-up; the command is the collective thrust, mass-normalised [m/s^2], and body rates [rad/s].
 """
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 
 TOLERANCE = 1e-5  # of the command range, by which the test vectors in the file may be missed
+LARGEST = 2.0**20  # a number of this size or more is no measurement
 
 
 class Runner:
@@ -37,6 +39,8 @@ class Runner:
         missed = np.abs(found - self._arrays["test_commands"]) / (self._arrays["high"] - self._arrays["low"])
         if not missed.max() <= TOLERANCE:
             raise ValueError(f"{path}: its test vectors are missed by {missed.max():.1e} of the command range")
+        if not self._survives_bad_numbers():
+            raise ValueError(f"{path}: a number that is not finite changes more than the command of its tick")
         if delta is not None:
             self._apply(delta)
         self.reset()
@@ -46,33 +50,52 @@ class Runner:
         """Control tick [s]."""
         return float(self.about["dt"])
 
+    @property
+    def repeats(self) -> int:
+        """For how many ticks the last command has been repeated; 0: the command follows from the newest state."""
+        return self._repeats
+
     def command(self, observation: np.ndarray) -> np.ndarray:
-        """Return the command [c, omega] for an observation, or for rows of them."""
-        h = np.asarray(observation, dtype=np.float32)
-        for w, b in self._layers[:-1]:
-            h = np.maximum(h @ w + b, np.float32(0.0))
-        w, b = self._layers[-1]
-        y = h @ w + b + self._arrays["y0"]
-        low, high = self._arrays["low"], self._arrays["high"]
-        return np.asarray(low + (high - low) / (np.float32(1.0) + np.exp(-y)))
+        """Return the command [c, omega] for an observation, or for rows of them; NaN where one is not finite."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            o = np.asarray(observation, dtype=np.float32)
+            is_finite = _is_finite(o)
+            h = np.where(is_finite, o, np.float32(0.0))
+            for w, b in self._layers[:-1]:
+                h = np.maximum(h @ w + b, np.float32(0.0))
+            w, b = self._layers[-1]
+            y = h @ w + b + self._arrays["y0"]
+            low, high = self._arrays["low"], self._arrays["high"]
+            u = low + (high - low) / (np.float32(1.0) + np.exp(-y))
+            return np.where(is_finite & _is_finite(u), u, np.float32(np.nan))
 
     def reset(self) -> None:
         """Forget the last commands: the vehicle hovers."""
+        self._repeats = 0
         seen = self.about["observation"]
         self._past = np.zeros((0 if seen is None else seen["history"], 4), dtype=np.float32)
-        self._last = np.array([0.0, 0.0, 0.0, 0.0] if seen is None else [seen["gravity"], 0.0, 0.0, 0.0])
+        self._last = np.array([0.0 if seen is None else seen["gravity"], 0.0, 0.0, 0.0], np.float32)
 
     def step(self, p: np.ndarray, R: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Return the command for a state, once per control tick.
+
+        While state or command are not finite, the last command is repeated, :attr:`repeats` counts, and the memory
+        stays as it is.
 
         Args:
             p: Position, world [m].
             R: Attitude, body to world, 3 x 3.
             v: Velocity, world [m/s].
         """
-        o = self.observe(p, R, v)
-        self._last = self.command(o)
-        return self._last
+        past = self._past
+        with np.errstate(over="ignore", invalid="ignore"):
+            x = np.concatenate([np.ravel(each) for each in (p, R, v)]).astype(np.float32)
+            u = self.command(self.observe(p, R, v))
+        if _is_finite(x).item() and _is_finite(u).item():
+            self._last, self._repeats = u, 0
+        else:
+            self._past, self._repeats = past, self._repeats + 1
+        return self._last.copy()
 
     def observe(self, p: np.ndarray, R: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Return the observation of a state, after the last command that :meth:`step` gave."""
@@ -84,6 +107,25 @@ class Runner:
         near = (np.asarray(p) - np.array(seen["origin"])) / seen["position_scale"]
         parts = [near, np.asarray(R).reshape(9), np.asarray(v) / seen["velocity_scale"], self._past.reshape(-1)]
         return np.concatenate(parts).astype(np.float32)
+
+    def _survives_bad_numbers(self) -> bool:
+        """Whether NaN, infinite and too large numbers, in each place, leave the memory as it is, and are reported."""
+        rows, bad = self._arrays["test_observations"], (np.nan, np.inf, -np.inf, LARGEST)
+        spoilt = [np.where(np.arange(rows.shape[1]) == i, x, rows[0]) for x in bad for i in range(rows.shape[1])]
+        if not np.isnan(self.command(np.array(spoilt))).all():
+            return False
+        if self.about["observation"] is None:
+            return True
+        self.reset()
+        state = np.concatenate([[0.1, 0.2, 0.3], np.eye(3).ravel(), np.zeros(3)])
+        first = self.step(state[:3], state[3:12].reshape(3, 3), state[12:])
+        past = self._past
+        for number in bad:
+            for i in range(15):
+                x = np.where(np.arange(15) == i, number, state)
+                if not np.array_equal(self.step(x[:3], x[3:12].reshape(3, 3), x[12:]), first):
+                    return False
+        return self._repeats == 15 * len(bad) and self._past is past
 
     def _apply(self, path: str | Path) -> None:
         with np.load(path, allow_pickle=False) as file:
@@ -97,3 +139,8 @@ class Runner:
             self._layers[i] = (w + np.float32(about["scale"]) * (delta[f"up{i}"] @ delta[f"down{i}"]).T, b)
         w, b = self._layers[-1]
         self._layers[-1] = (w, b + delta["shift"])
+
+
+def _is_finite(x: np.ndarray) -> np.ndarray:
+    """Whether all numbers of each row are smaller than LARGEST; NaN is not."""
+    return np.asarray((np.abs(x) < LARGEST).all(axis=-1, keepdims=True))

@@ -1,0 +1,73 @@
+"""A controller that survives measurements that are no numbers."""
+
+from typing import Any, Generic, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from ..physics.felt_frame import FeltFrame
+from ..physics.state import Command, State
+from .controller import AbstractController
+
+LARGEST = float(2**20)
+"""A number of this size or more, in SI units, is no measurement; networks overflow far beyond it."""
+
+M = TypeVar("M")
+
+
+class FiniteMemory(eqx.Module, Generic[M]):
+    """Memory of a :class:`FiniteController`."""
+
+    inner: M
+    """Memory of the controller inside, after the last tick with a finite measurement."""
+    last: Command
+    """Command of that tick."""
+    is_finite: Bool[Array, ""]
+    """Whether the newest command follows from the newest measurement."""
+
+
+class FiniteController(AbstractController[FiniteMemory[Any]]):
+    """Repeats the last command and keeps its memory while measurement or command are not finite.
+
+    Exported policies behave in the same way, tick by tick.
+    """
+
+    base: AbstractController[Any]
+
+    def init(self, x: State) -> FiniteMemory[Any]:
+        """Return the memory of a vehicle that has hovered until now."""
+        return FiniteMemory(self.base.init(x), Command.hover(x.p.dtype), jnp.array(True))
+
+    def __call__(
+        self, memory: FiniteMemory[Any], t: Float[Array, ""], x: State
+    ) -> tuple[Command, FiniteMemory[Any]]:  # fmt: skip
+        """Evaluate the controller inside, or repeat the last command."""
+        u, inner = self.base(memory.inner, t, x)
+        is_finite = _all_below(x) & _all_below(u)
+        last, inner = jax.tree.map(
+            lambda new, old: jnp.where(is_finite, new, old), (u, inner), (memory.last, memory.inner)
+        )
+        return last, FiniteMemory(inner, last, is_finite)
+
+    def accepted(self, memory: FiniteMemory[Any], u: Command) -> FiniteMemory[Any]:
+        """Remember ``u`` as the last command."""
+        return FiniteMemory(self.base.accepted(memory.inner, u), u, memory.is_finite)
+
+    def aged(self, age: float | Float[Array, ""]) -> "FiniteController":
+        """Return the same for measurements that are ``age`` old [s]."""
+        return FiniteController(self.base.aged(age))
+
+    def sensing(self, omega: Float[Array, "3"], a: Float[Array, "3"]) -> "FiniteController":
+        """Return the same for a tick in which body rates and acceleration were measured."""
+        return FiniteController(self.base.sensing(omega, a))
+
+    def in_frame(self, frame: FeltFrame) -> "FiniteController":
+        """Return the same for states and commands of ``frame``."""
+        return FiniteController(self.base.in_frame(frame))
+
+
+def _all_below(tree: State | Command) -> Bool[Array, ""]:
+    """Whether all numbers are; NaN is not."""
+    return jnp.all(jnp.stack([jnp.all(jnp.abs(leaf) < LARGEST) for leaf in jax.tree.leaves(tree)]))

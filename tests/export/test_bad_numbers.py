@@ -1,0 +1,200 @@
+"""Exported policies survive numbers that are not finite, as the controller in JAX does, tick by tick."""
+
+import shutil
+import subprocess
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax, random
+
+from helpers import tiny_preset
+from retrim.config.setup import Setup
+from retrim.control.controller import PolicyController
+from retrim.control.finite_controller import LARGEST, FiniteController
+from retrim.experiments.reporter import Silent
+from retrim.export import runner
+from retrim.export.checking import FLAGS
+from retrim.export.export import export
+from retrim.export.runner import Runner
+from retrim.io.trained import save_policy
+from retrim.physics import State
+from retrim.physics.so3 import exp
+from retrim.testing import check_controller
+
+BEFORE, AFTER, SHARE = 6, 12, 1e-5
+NUMBERS = {"nan": np.nan, "inf": np.inf, "-inf": -np.inf, "1e30": 1e30, "frozen": None}
+FAST = ("-std=c99", "-O3", "-ffast-math", "-Wall", "-Wextra", "-Werror")
+CAREFUL = (*FLAGS, "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+MAIN = """
+#include <stdio.h>
+#include "quad.h"
+int main(void) {
+    quad_memory memory; float x[15], u[5];
+    if (!(quad_check() < 1e-5f)) return 2;
+    quad_reset(&memory);
+    while (fread(x, sizeof x, 1, stdin) == 1) {
+        u[4] = (float)quad_step(&memory, x, x + 3, x + 12, u);
+        fwrite(u, sizeof u, 1, stdout);
+    }
+    return 0;
+}
+"""
+
+
+@pytest.fixture(scope="module")
+def setup():
+    return Setup.of(tiny_preset(command_history=3))
+
+
+@pytest.fixture(scope="module")
+def policy(setup):
+    """Weights large enough that commands move."""
+    fresh = setup.new_policy(random.key(0))
+    return fresh.with_params(jax.tree.map(lambda leaf: jnp.asarray(12.0 * np.asarray(leaf)), fresh.layers))
+
+
+@pytest.fixture(scope="module")
+def folder(policy, setup, tmp_path_factory):
+    """The policy in every format."""
+    place = tmp_path_factory.mktemp("formats")
+    save_policy(place / "policy.safetensors", policy, setup.preset)
+    for to, name in (("npz", "quad.npz"), ("c", "quad.h")):
+        export(place / "policy.safetensors", to, place / name, None, Silent())
+    (place / "main.c").write_text(MAIN)
+    return place
+
+
+@pytest.fixture(scope="module")
+def good():
+    """Rows of p, R, v."""
+    rng = np.random.default_rng(5)
+    p, v, phi = (0.5 * rng.normal(size=(BEFORE + AFTER, 3)) for _ in range(3))
+    R = np.asarray(jax.jit(jax.vmap(exp))(phi)).reshape(-1, 9)
+    return np.concatenate([p + np.array([[0.0, 0.0, 1.0]]), R, v], axis=1)
+
+
+def sequence(good, kind, ticks, place):
+    """Good ticks, bad ones, good ones again; and which ticks are good."""
+    bad = np.repeat(good[BEFORE - 1 : BEFORE], ticks, axis=0)
+    frozen = NUMBERS[kind] is None
+    if not frozen:
+        bad[:, place] = NUMBERS[kind]
+    fine = np.concatenate([np.full(BEFORE, True), np.full(ticks, frozen), np.full(AFTER, True)])
+    return np.concatenate([good[:BEFORE], bad, good[BEFORE:]]), fine
+
+
+def commands(controller, rows):
+    return jax.tree.map(np.asarray, scanned(controller, jnp.asarray(rows)))
+
+
+@eqx.filter_jit
+def scanned(controller, rows):
+    def tick(memory, row):
+        u, memory = controller(memory, jnp.array(0.0), State(row[:3], row[3:12].reshape(3, 3), row[12:]))
+        return memory, (u.vector(), getattr(memory, "is_finite", jnp.array(True)))
+
+    first = State(rows[0, :3], rows[0, 3:12].reshape(3, 3), rows[0, 12:])
+    return lax.scan(tick, controller.init(first), rows)[1]
+
+
+@pytest.fixture(scope="module")
+def plain(policy, setup):
+    return PolicyController(setup.env.task.observation, policy)
+
+
+@pytest.fixture(scope="module")
+def programs(folder):
+    if shutil.which("gcc") is None:
+        pytest.skip("there is no C compiler")
+    for name, flags in (("fast", FAST), ("careful", CAREFUL)):
+        subprocess.run(["gcc", *flags, "main.c", "-o", name, "-lm"], cwd=folder, check=True)
+    return [folder / "fast", folder / "careful"]
+
+
+CASES = [(kind, ticks, place) for kind in NUMBERS for ticks, place in ((1, 0), (50, 7))] + [("nan", 3, 14)]
+
+
+@pytest.mark.parametrize(("kind", "ticks", "place"), CASES)
+def test_jax_goes_on_as_if_the_bad_ticks_had_not_been(kind, ticks, place, plain, good):
+    rows, fine = sequence(good, kind, ticks, place)
+    found, told = commands(FiniteController(plain), rows)
+    np.testing.assert_array_equal(told, fine)
+    wanted, _ = commands(plain, rows[fine])
+    np.testing.assert_allclose(found[fine], wanted, rtol=1e-12)
+    for tick in np.flatnonzero(~fine):
+        np.testing.assert_array_equal(found[tick], found[tick - 1])
+
+
+@pytest.mark.parametrize(("kind", "ticks", "place"), CASES)
+def test_c_and_numpy_do_what_jax_does(kind, ticks, place, plain, good, folder, programs, setup):
+    """Also under -ffast-math, and without a word of the sanitizers."""
+    rows, fine = sequence(good, kind, ticks, place)
+    wanted, _ = commands(FiniteController(plain), rows)
+    low, high = (np.asarray(u.vector()) for u in (plain.policy.u_min, plain.policy.u_max))
+    assert np.all(np.ptp(wanted, axis=0) > 0.05 * (high - low))
+    loaded, counts = Runner(folder / "quad.npz"), []
+    found = {"NumPy": []}
+    for row in rows:
+        found["NumPy"].append(loaded.step(row[:3], row[3:12].reshape(3, 3), row[12:]))
+        counts.append(loaded.repeats)
+    assert max(counts) == np.sum(~fine)
+    np.testing.assert_array_equal(np.array(counts) == 0, fine)
+    for program in programs:
+        ran = subprocess.run([program], input=rows.astype(np.float32).tobytes(), capture_output=True, check=True)
+        assert ran.stderr == b""
+        given = np.frombuffer(ran.stdout, np.float32).reshape(-1, 5)
+        np.testing.assert_array_equal(given[:, 4], fine)
+        found[program.name] = given[:, :4]
+    for name, given in found.items():
+        assert np.max(np.abs(np.array(given) - wanted) / (high - low)) <= SHARE, name
+
+
+def test_the_controller_keeps_every_law(plain):
+    check_controller(FiniteController(plain))
+
+
+def test_a_flight_may_begin_with_numbers_that_are_not_finite(plain, good, folder, programs):
+    """Hover is the last command then."""
+    rows = np.concatenate([np.full((2, 15), np.nan), good[:3]])
+    wanted, _ = commands(FiniteController(plain), rows)
+    np.testing.assert_allclose(wanted[:2], [[9.81, 0.0, 0.0, 0.0]] * 2)
+    loaded = Runner(folder / "quad.npz")
+    numpy = [loaded.step(row[:3], row[3:12].reshape(3, 3), row[12:]) for row in rows]
+    np.testing.assert_allclose(numpy, wanted, atol=1e-4)
+    for program in programs:
+        ran = subprocess.run([program], input=rows.astype(np.float32).tobytes(), capture_output=True, check=True)
+        np.testing.assert_allclose(np.frombuffer(ran.stdout, np.float32).reshape(-1, 5)[:, :4], wanted, atol=1e-4)
+
+
+def test_without_memory_a_bad_row_gives_nan_and_says_so(folder, good):
+    loaded = Runner(folder / "quad.npz")
+    rows = np.tile(loaded._arrays["test_observations"][:1], (4, 1))
+    rows[1, 5], rows[2, 20], rows[3, 0] = np.nan, np.inf, LARGEST
+    np.testing.assert_array_equal(np.isnan(loaded.command(rows)).all(axis=1), [False, True, True, True])
+    pytest.importorskip("onnx")
+    runtime = pytest.importorskip("onnxruntime")
+    export(folder / "policy.safetensors", "onnx", folder / "quad.onnx", None, Silent())
+    session = runtime.InferenceSession(str(folder / "quad.onnx"), providers=["CPUExecutionProvider"])
+    commanded, finite = session.run(["command", "finite"], {"observation": rows})
+    np.testing.assert_array_equal(finite[:, 0], [True, False, False, False])
+    np.testing.assert_allclose(commanded, loaded.command(rows), atol=1e-4)
+
+
+def test_the_limit_is_the_same_everywhere(folder):
+    assert runner.LARGEST == LARGEST
+    bits = np.float32(LARGEST).view(np.uint32)
+    assert f">= 0x{bits:08x}u) return 0;" in (folder / "quad.h").read_text()
+
+
+def test_the_check_notices_a_header_without_the_test_of_bits(folder, programs):
+    text = (folder / "quad.h").read_text()
+    blind = text.replace("u) return 0;", "u && 0) return 0;")
+    assert blind != text
+    (folder / "blind").mkdir()
+    (folder / "blind" / "quad.h").write_text(blind)
+    shutil.copy(folder / "main.c", folder / "blind")
+    subprocess.run(["gcc", *FLAGS, "main.c", "-o", "main", "-lm"], cwd=folder / "blind", check=True)
+    assert subprocess.run([folder / "blind" / "main"], input=b"", check=False).returncode == 2
