@@ -31,3 +31,7 @@ class CheckpointError(RetrimError, ValueError):
 
 class LogError(RetrimError, ValueError):
     """A flight log that cannot be read, or whose columns cannot be what the map says that they are."""
+
+
+class TrainingError(RetrimError, RuntimeError):
+    """Training that has come to nothing: its loss is not a number."""

@@ -140,6 +140,35 @@ IMPOSSIBLE = [
     ({"propeller_diameter": "0.178"}, r"propeller_diameter = 0\.178 does not fit"),  # m
     ({"drag_area": "[0.0, 0.1, 0.1]"}, r"drag_area\.0: Input should be greater than 0"),
     ({"propelller": "'5 inch'"}, r"propelller: unknown key; did you mean 'propeller'\?"),
+    ({"arm": "[105, 120]"}, r"arm = \(105\.0, 120\.0\) must be at most 2 m; is it in mm\? write \[0\.105, 0\.12\]"),
+    ({"arm": "[10.5, 12]"}, r"arm = \(10\.5, 12\.0\) must be at most 2 m; is it in cm\? write \[0\.105, 0\.12\]"),
+    ({"arm": "[1.05, 1.2]"}, r"inertia = .* is too small for 1\.2 kg with rotors 1\.59 m from the centre.* arm in m\?"),
+    ({"inertia": "[8e-6, 9e-6, 15e-6]"}, r"inertia = .* is too small .* which have 0\.0061 or so; is it in kg m\^2"),
+    ({"inertia": "[8.0, 9.0, 15.0]"}, r"inertia = .* is too large"),  # g m^2
+    (
+        {"rates_max": "[700, 700, 300]"},
+        r"rates_max\.0: Input should be .* 40 rad/s; is it in deg/s\? 700 deg/s are 12\.2",
+    ),
+    ({"thrust_max": "13.0"}, r"thrust_max = 13\.0 N must exceed 1\.2 .* one rotor\? four have 52 N"),
+    (
+        {"thrust_max": "15.0"},
+        r"thrust_max = 15\.0 N is 1\.27 times the weight of 11\.77 N, .* 1\.6 times and more; .* 60 N",
+    ),
+    ({"thrust_max": "5300"}, r"thrust_max = 5300\.0 N is 450 times the weight .* is it in g\? 5300 g are 51\.99 N"),
+    ({"thrust_max": "3.0", "mass": "1.0"}, r"thrust_max = 3\.0 N must exceed .* is it in kg\? 3 kg are 29\.43 N"),
+    ({"thrust_max": "0.6", "mass": "35.0", "inertia": "[0.1, 0.1, 0.2]"}, r"thrust_max = 0\.6 N .* 35 g are 0\.035 kg"),
+    (
+        {"mass": "1200.0"},
+        r"mass: .* 50 kg; is it in g\? 1\.2e\+03 g are 1\.2 kg|mass: .*; is it in g\? 1200 g are 1\.2 kg",
+    ),
+    ({"motor_tau": "40.0"}, r"motor_tau: .* 0\.5 s; is it in ms\? 40 ms are 0\.04 s"),
+    (
+        {"motor_tau": "0.5"},
+        r"the roll rate cannot be controlled: a step of 1 rad/s overshoots by \d+% and reaches 63 %",
+    ),
+    ({"rate_lag": "[80.0, 80.0, 80.0]"}, r"rate_lag\.0: .* 2 s; is it in ms\? 80 ms are 0\.08 s"),
+    ({"command_delay": "20"}, r"command_delay: .* 0\.2 s; is it in ms\? 20 ms are 0\.02 s"),
+    ({"drag_area": "[350.0, 350.0, 700.0]"}, r"drag_area = .* is too large .* is it in cm\^2\?"),
     ({"name": "3"}, r"name: Input should be a valid string"),
 ]
 

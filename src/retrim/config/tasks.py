@@ -8,6 +8,7 @@ import jax.numpy as jnp
 
 from ..errors import ConfigError
 from ..physics.state import Command
+from ..physics.step_response import step_responses
 from ..physics.vehicle import Vehicle
 from ..tasks.hover import AbstractHover, Hover, L2Hover
 from ..tasks.keypoints import Keypoints
@@ -25,6 +26,7 @@ from .presets import Track as TrackTable
 from .presets import Vision as VisionTable
 from .registry import Registry
 from .vehicle_file import VehicleSpec
+from .vehicles import is_published
 
 LEAD = 0.04  # [s]: about as late as commands act, behind a delay and motors
 VISION_REWARDS: dict[str, type[AbstractHover]] = {"paper": Hover, "l2": L2Hover, "view": ViewHover}
@@ -106,9 +108,15 @@ def _hover(request: TaskRequest) -> AbstractTask:
 
 
 def lag_of(preset: Preset, vehicle: Vehicle) -> Command | None:
-    """Return the time constants of thrust and rates [s]: the vehicle's where they are known, else the preset's."""
+    """Return the time constants of thrust and rates [s], or None for a model without lag.
+
+    They are the vehicle's where they are known. A published vehicle has those of the preset; the rates of any other one
+    follow as those of its simulated rate loop do, and its thrust as its motors do.
+    """
     if vehicle.rate_lag is not None:
         return Command(vehicle.motor_tau, vehicle.rate_lag)
+    if not is_published(preset.vehicle):
+        return Command(vehicle.motor_tau, jnp.array([about.rise for about in step_responses(vehicle)]))
     tau = preset.actuator_tau
     return None if tau is None else Command(jnp.array(tau), jnp.full(3, tau))
 

@@ -6,16 +6,27 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import jax.numpy as jnp
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import AfterValidator, ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
+from ..errors import ConfigError
 from ..physics.state import STANDARD_GRAVITY
+from ..physics.step_response import step_responses
 from ..physics.vehicle import Vehicle, kingfisher, small
+from .units import Positive, Three, at_most, likely
 from .validation import read_toml, validated
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
-Three = tuple[Positive, Positive, Positive]
 INCH = 0.0254  # [m]
+MILLI = (("ms", 1e-3),)
+Rate = Annotated[Positive, AfterValidator(at_most(40.0, "rad/s", ("deg/s", math.pi / 180.0)))]
+Lag = Annotated[Positive, AfterValidator(at_most(2.0, "s", *MILLI))]
+
+
+OVERSHOOT, SLOWEST = 0.6, (0.25, 0.25, 1.5)
+"""Of a step of the rates: largest overshoot, and longest time to 63 % about each axis [s]."""
+LONGEST_ARM = 2.0  # [m]
+ENOUGH = (1.6, 20.0)
+"""Thrust of all rotors over weight, at least and at most."""
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -23,7 +34,7 @@ class VehicleSpec:
     """A quadrotor in X configuration."""
 
     name: str
-    mass: Annotated[float, Field(gt=0.005, le=50.0, strict=True)]
+    mass: Annotated[float, Field(gt=0.005, strict=True), AfterValidator(at_most(50.0, "kg", ("g", 1e-3)))]
     """All-up mass [kg]."""
     inertia: Three
     """Diagonal of the inertia, body frame [kg m^2]."""
@@ -31,14 +42,15 @@ class VehicleSpec:
     """Distance of the rotors from the centre along body x and y [m]."""
     thrust_max: Positive
     """Static thrust of all four rotors together [N]."""
-    rates_max: Three
+    rates_max: tuple[Rate, Rate, Rate]
     """Largest body rates that the rate controller accepts [rad/s]."""
-    motor_tau: Annotated[float, Field(gt=0, le=0.5, strict=True)]
+    motor_tau: Annotated[float, Field(gt=0, strict=True), AfterValidator(at_most(0.5, "s", *MILLI))]
     """Time constant of the motors [s]."""
-    rate_lag: Three | None = None
-    """Time constants of the body rates behind their commands: roll, pitch, yaw [s]; those of the preset by default.
-    Policies are trained for them, and for a thrust that follows as the motors do."""
-    command_delay: Annotated[float, Field(ge=0, le=0.2, strict=True)] | None = None
+    rate_lag: tuple[Lag, Lag, Lag] | None = None
+    """Time constants of the body rates behind their commands: roll, pitch, yaw [s]; those of the simulated rate loop
+    by default, which follow from the motors. Policies are trained for them, and for a thrust that follows as the motors
+    do."""
+    command_delay: Annotated[float, Field(ge=0, strict=True), AfterValidator(at_most(0.2, "s", *MILLI))] | None = None
     """Between a command and its effect [s]; that of the preset by default. Policies are trained for it, in whole ticks,
     and learners pair accelerations with the commands that caused them."""
     propeller: Literal["3 inch", "5 inch"] | None = None
@@ -51,20 +63,42 @@ class VehicleSpec:
     @model_validator(mode="after")
     def _possible(self) -> "VehicleSpec":
         """Raise if no such vehicle can exist."""
-        weight = self.mass * STANDARD_GRAVITY
-        if self.thrust_max <= 1.2 * weight:
+        weight, thrust = self.mass * STANDARD_GRAVITY, self.thrust_max
+        if thrust <= 1.2 * weight:
             raise ValueError(
-                f"thrust_max = {self.thrust_max} N must exceed 1.2 times the weight of {weight:.2f} N, or nothing is "
-                f"left to steer with"
+                f"thrust_max = {thrust} N must exceed 1.2 times the weight of {weight:.2f} N, or nothing is "
+                f"left to steer with{likely(self._thrust_units(), *ENOUGH)}"
+            )
+        if thrust < ENOUGH[0] * weight:
+            raise ValueError(
+                f"thrust_max = {thrust} N is {thrust / weight:.2f} times the weight of {weight:.2f} N, and quadrotors "
+                f"have {ENOUGH[0]:g} times and more{likely(self._thrust_units(), *ENOUGH)}"
+            )
+        if thrust > ENOUGH[1] * weight:
+            raise ValueError(
+                f"thrust_max = {thrust} N is {thrust / weight:.3g} times the weight of {weight:.2f} N, and no "
+                f"quadrotor has more than {ENOUGH[1]:g} times{likely(self._thrust_units(), *ENOUGH)}"
             )
         a, b, c = sorted(self.inertia)
         if a + b < 0.999 * c:
             raise ValueError(f"inertia = {self.inertia}: no body has one moment larger than the sum of the others")
         reach = math.hypot(*self.arm)
-        if max(self.inertia) > 3.0 * self.mass * reach**2:
+        if max(self.arm) > LONGEST_ARM:
+            x, y = self.arm
+            units = (
+                (f"is it in {name}? write [{m * x:g}, {m * y:g}]", a / (self.mass * (m * reach) ** 2))
+                for name, m in (("cm", 0.01), ("mm", 0.001))
+            )
+            raise ValueError(f"arm = {self.arm} must be at most {LONGEST_ARM:g} m{likely(units, 0.03, 3.0)}")
+        if c > 3.0 * self.mass * reach**2:
             raise ValueError(
                 f"inertia = {self.inertia} kg m^2 is too large for {self.mass} kg within {reach:.3f} m of the centre; "
                 f"is it in g cm^2 or kg mm^2?"
+            )
+        if a < 0.01 * self.mass * reach**2:
+            raise ValueError(
+                f"inertia = {self.inertia} kg m^2 is too small for {self.mass} kg with rotors {reach:.3g} m from the "
+                f"centre, which have {0.2 * self.mass * reach**2:.2g} or so; is it in kg m^2, and arm in m?"
             )
         apart = 2.0 * min(self.arm) / INCH
         if self.propeller_diameter is not None and not 0.3 * apart <= self.propeller_diameter <= 1.3 * apart:
@@ -72,7 +106,24 @@ class VehicleSpec:
                 f"propeller_diameter = {self.propeller_diameter:g} does not fit rotors that are {apart:.3g} inches "
                 f"apart; is it in inches, and arm in m?"
             )
+        usual = 0.031 * (reach / 0.125) ** 2
+        if self.drag_area is not None and max(self.drag_area) > 20.0 * usual:
+            raise ValueError(
+                f"drag_area = {self.drag_area} m^2 is too large for rotors {reach:.3g} m from the centre, which have "
+                f"{usual:.2g} or so; is it in cm^2?"
+            )
         return self
+
+    def _thrust_units(self) -> tuple[tuple[str, float], ...]:
+        """What ``thrust_max`` and ``mass`` may be instead, and the ratio of thrust and weight that follows."""
+        ratio = self.thrust_max / (self.mass * STANDARD_GRAVITY)
+        gram = STANDARD_GRAVITY / 1000.0
+        return (
+            (f"is it the thrust of one rotor? four have {4.0 * self.thrust_max:.4g} N", 4.0 * ratio),
+            (f"is it in g? {self.thrust_max:g} g are {self.thrust_max * gram:.4g} N", ratio * gram),
+            (f"is it in kg? {self.thrust_max:g} kg are {self.thrust_max * 1000.0 * gram:.4g} N", ratio * 1000.0 * gram),
+            (f"is mass in g? {self.mass:g} g are {self.mass / 1000.0:.4g} kg", ratio * 1000.0),
+        )
 
     def build(self) -> Vehicle:
         """Return the vehicle.
@@ -117,12 +168,34 @@ class VehicleSpec:
         )
 
 
+def check_flyable(vehicle: Vehicle) -> None:
+    """Raise if a simulated rate loop cannot fly a vehicle.
+
+    Raises:
+        ValueError: A step of the rates overshoots too much or rises too slowly; its numbers are in the message.
+    """
+    for axis, found, slowest in zip(("roll", "pitch", "yaw"), step_responses(vehicle), SLOWEST, strict=True):
+        if found.overshoot > OVERSHOOT or found.rise > slowest:
+            raise ValueError(
+                f"the {axis} rate cannot be controlled: a step of 1 rad/s overshoots by {found.overshoot:.0%} "
+                f"and reaches 63 % after {found.rise:.2g} s, and {OVERSHOOT:.0%} and {slowest:g} s can be flown; the "
+                f"motors are too slow (motor_tau = {float(vehicle.motor_tau):g} s), or the thrust too small for arm "
+                f"and inertia"
+            )
+
+
 def read_vehicle(path: Path) -> VehicleSpec:
     """Read a vehicle file.
 
     Raises:
-        ConfigError: The file cannot be read, or a value is missing, unknown or impossible.
+        ConfigError: The file cannot be read, a value is missing, unknown or impossible, or no rate loop can fly the
+            vehicle.
     """
     tables = read_toml(path)
     tables.setdefault("name", path.stem)
-    return validated(VehicleSpec, tables, source=str(path))
+    spec = validated(VehicleSpec, tables, source=str(path))
+    try:
+        check_flyable(spec.build())
+    except ValueError as error:
+        raise ConfigError(f"{path}: {error}") from error
+    return spec

@@ -6,15 +6,21 @@ from pathlib import Path
 from ..errors import ConfigError
 from ..physics.vehicle import Vehicle, kingfisher, large, small
 from .registry import Registry
-from .vehicle_file import VehicleSpec, read_vehicle
+from .vehicle_file import VehicleSpec, check_flyable, read_vehicle
 
 VEHICLES: Registry[Callable[[], Vehicle]] = Registry(
     "vehicle", example="a vehicle file, as my_quad.toml, or module:name"
 )
-for _name, _make in (("small", small), ("large", large), ("kingfisher", kingfisher)):
+PUBLISHED = {"small": small, "large": large, "kingfisher": kingfisher}
+for _name, _make in PUBLISHED.items():
     VEHICLES.register(_name, _make)
 
 register_vehicle = VEHICLES.register
+
+
+def is_published(vehicle: str | VehicleSpec) -> bool:
+    """Return whether others have flown a vehicle, with a rate loop of its own."""
+    return isinstance(vehicle, str) and vehicle in PUBLISHED
 
 
 def vehicle_from(name: str | VehicleSpec) -> str | VehicleSpec:
@@ -35,13 +41,15 @@ def make_vehicle(vehicle: str | VehicleSpec | Vehicle) -> Vehicle:
     """Build a vehicle; one that is built already is returned.
 
     Raises:
-        ConfigError: There is no such vehicle, or it cannot exist.
+        ConfigError: There is no such vehicle, or it cannot exist, or no rate loop can fly it.
     """
     if isinstance(vehicle, Vehicle):
         return vehicle
     try:
         found = vehicle_from(vehicle)
         made = found.build() if isinstance(found, VehicleSpec) else VEHICLES.find(found)()
+        if isinstance(made, Vehicle) and not is_published(found):
+            check_flyable(made)
     except (ValueError, TypeError) as error:
         raise (
             error if isinstance(error, ConfigError) else ConfigError(f"vehicle {name_of(vehicle)}: {error}")

@@ -1,5 +1,6 @@
 """Pretraining in the nominal model (paper, Sec. IV-A.2)."""
 
+import math
 from collections.abc import Iterator
 
 import equinox as eqx
@@ -9,10 +10,13 @@ from jax import random
 from jaxtyping import Array, Float, Key
 
 from ..control.policy import Policy
+from ..errors import TrainingError
 from ..tasks.task import AbstractTask, Start
 from .bptt import PolicyState, bptt
 from .devices import gathered, spread, whole
 from .env import Env
+
+PATIENCE = 10  # steps in a row without a loss; fewer are bad starts, which are left out
 
 
 def random_starts(task: AbstractTask, key: Key[Array, ""], num_updates: int, num_envs: int) -> Start:
@@ -64,10 +68,19 @@ def pretrain(
 
     Raises:
         ValueError: ``num_updates`` is not a positive multiple of ``chunk``.
+        TrainingError: The loss is not a number, ten steps in a row or at the end.
     """
     if num_updates % chunk or num_updates <= 0:
         raise ValueError(f"num_updates = {num_updates} must be a positive multiple of {chunk}")
     state = PolicyState(policy, optimiser.init(policy.params))
+    steps, bad = 0, 0
     for k in random.split(key, num_updates // chunk):
         state, losses = gathered(train_chunk(state, env, k, optimiser, chunk, num_envs))
+        for loss in losses.tolist():
+            steps, bad = steps + 1, 0 if math.isfinite(loss) else bad + 1
+            if bad >= PATIENCE or (bad and steps == num_updates):
+                raise TrainingError(
+                    f"training: the loss is not a number in steps {steps - bad + 1} to {steps} of {num_updates}, and "
+                    f"no policy is kept; look at the vehicle's limits, the reward and the learning rate"
+                )
         yield state, losses

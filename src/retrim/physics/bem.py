@@ -72,8 +72,9 @@ class BemQuadrotor(AbstractSubstepDynamics[BemState]):
 
         T / Omega^2 of a propeller in still air is constant, so one number calibrates the whole range.
         """
-        true = FRAME_FACTOR * hover_coefficient(vehicle.propeller, vehicle.hover_speed)
-        return cls(vehicle, Betaflight.of(true / (1.0 + thrust_error)), dt)
+        blades = hover_coefficient(vehicle.propeller, vehicle.hover_speed)
+        thrust_map = FRAME_FACTOR * blades / (1.0 + thrust_error)
+        return cls(vehicle, Betaflight.suited(vehicle, thrust_map, blades), dt)
 
     def init(self, x: State) -> BemState:
         """Return the state of a vehicle that hovers at ``x``: rotor speeds of u_hover, settled inflow, no rotation."""

@@ -1,9 +1,12 @@
 """Rate controller of flight firmware: PID in throttle units, mixer, speed controllers, at 1 kHz."""
 
+import dataclasses
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .rate_tuning import Authority, Gains, authority, is_damped, tuned
 from .state import Command
 from .substep import SUBSTEP, RotorState, signs
 from .vehicle import Vehicle
@@ -37,6 +40,34 @@ class Betaflight(eqx.Module):
             integral_max=jnp.array(0.36),
             thrust_map=thrust_map,
         )
+
+    @classmethod
+    @eqx.filter_jit
+    def suited(cls, vehicle: Vehicle, thrust_map: Float[Array, ""], coefficient: Float[Array, ""]) -> "Betaflight":
+        """Return the settings of :meth:`of` where the vehicle's step response is damped, else settings of its own.
+
+        Args:
+            vehicle: Its constants.
+            thrust_map: As in :meth:`of`.
+            coefficient: True T / Omega^2 of one rotor [N s^2].
+        """
+        found, power = cls.of(thrust_map), authority(vehicle, coefficient)
+        plain = found.gains(power)
+        keep, own = is_damped(plain, power.lead, vehicle.motor_tau), tuned(plain, vehicle.motor_tau)
+        scaled = (own.a / P_SCALE, own.i / I_SCALE, own.b / D_SCALE)
+        kp, ki, kd = (
+            jnp.where(keep, old, new / power.alpha)
+            for old, new in zip((found.kp, found.ki, found.kd), scaled, strict=True)
+        )
+        return dataclasses.replace(found, kp=kp, ki=ki, kd=kd)
+
+    def gains(self, power: Authority) -> Gains:
+        """Return the gains in units of angular acceleration.
+
+        Args:
+            power: Authority of the vehicle.
+        """
+        return Gains(power.alpha * P_SCALE * self.kp, power.alpha * I_SCALE * self.ki, power.alpha * D_SCALE * self.kd)
 
     def __call__(
         self, vehicle: Vehicle, s: RotorState, u: Command

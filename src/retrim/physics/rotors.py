@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .effects import ExternalEffects
+from .rate_tuning import Gains, is_damped, tuned
 from .state import Command, State
 from .substep import SUBSTEP, AbstractSubstepDynamics, RotorState, check_tick, rigid_body, signs
 from .vehicle import Vehicle
@@ -27,14 +28,16 @@ class RateLoop(eqx.Module):
     """Clamp of the integral [rad]."""
 
 
-def default_rate_loop() -> RateLoop:
-    """Return gains that settle in about 0.1 s on both quadrotors of the paper."""
-    return RateLoop(
-        kp=jnp.array([25.0, 25.0, 12.5]),
-        ki=jnp.array([37.0, 37.0, 37.0]),
-        kd=jnp.array([0.05, 0.05, 0.0]),
-        integral_max=jnp.array(0.1),
-    )
+def rate_loop(motor_tau: Float[Array, ""]) -> RateLoop:
+    """Return gains that settle in about 0.1 s on both quadrotors of the paper; for slow motors, gains that suit them.
+
+    Args:
+        motor_tau: Time constant of the motors [s].
+    """
+    plain = Gains(jnp.array([25.0, 25.0, 12.5]), jnp.array([37.0, 37.0, 37.0]), jnp.array([0.05, 0.05, 0.0]))
+    keep = is_damped(plain, jnp.zeros(3), motor_tau, least_margin=5.0)
+    kp, ki, kd = (jnp.where(keep, old, new) for old, new in zip(plain, tuned(plain, motor_tau), strict=True))
+    return RateLoop(kp=kp, ki=ki, kd=kd, integral_max=jnp.array(0.1))
 
 
 class LinearDragQuadrotor(AbstractSubstepDynamics[RotorState]):
@@ -63,7 +66,9 @@ class LinearDragQuadrotor(AbstractSubstepDynamics[RotorState]):
             dt: Control tick [s], a whole number of milliseconds.
             thrust_error: By how much more than commanded the rotors give, as a share.
         """
-        return cls(vehicle, default_rate_loop(), jnp.array(1.0 + thrust_error), jnp.array([0.3, 0.3, 0.37]), dt)
+        return cls(
+            vehicle, rate_loop(vehicle.motor_tau), jnp.array(1.0 + thrust_error), jnp.array([0.3, 0.3, 0.37]), dt
+        )
 
     def init(self, x: State) -> RotorState:
         """Return the state of a vehicle that hovers at ``x``, without rotation."""
