@@ -1,0 +1,78 @@
+"""Training that comes to nothing ends with one line, and leaves no policy."""
+
+import sys
+from types import SimpleNamespace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import random
+
+from commands import retrim
+from retrim.errors import TrainingError
+from retrim.learn.pretrain import pretrain
+
+
+@pytest.fixture
+def losses(monkeypatch):
+    """Training that only tells losses."""
+
+    def told(values):
+        rest = iter(values)
+        monkeypatch.setattr(
+            sys.modules[pretrain.__module__],
+            "train_chunk",
+            lambda state, env, key, optimiser, n, envs: (state, jnp.array([next(rest)] * n)),
+        )
+
+    return told
+
+
+def run(num_updates, chunk):
+    policy, optimiser = SimpleNamespace(params=()), SimpleNamespace(init=lambda params: ())
+    sizes = {"num_updates": num_updates, "num_envs": 2, "chunk": chunk}
+    return len(list(pretrain(policy, None, random.key(0), optimiser=optimiser, **sizes)))
+
+
+def test_ten_steps_without_a_loss_end_training(losses):
+    losses([1.0, np.nan, 0.5])
+    with pytest.raises(TrainingError, match=r"not a number in steps 11 to 20 of 30, and no policy is kept"):
+        run(30, 10)
+
+
+def test_so_does_a_last_step_without_one(losses):
+    losses([1.0, 1.0, np.inf])
+    with pytest.raises(TrainingError, match=r"in steps 3 to 3 of 3"):
+        run(3, 1)
+
+
+def test_a_bad_start_is_left_out(losses):
+    losses([1.0, np.nan, 0.5, np.inf, 0.4])
+    assert run(5, 1) == 5
+
+
+NAN = """
+import jax.numpy as jnp
+from retrim.tasks.hover import L2Hover
+
+
+class Empty(L2Hover):
+    def reward(self, t, x, u):
+        return jnp.nan * jnp.sum(x.p)
+
+
+def empty(request):
+    o = request.state_observation()
+    p = request.preset
+    return Empty(jnp.array(p.goal), o, jnp.array(5.0), jnp.array(1.0), p.dt, 5)
+"""
+
+
+@pytest.mark.usefixtures("as_a_user")
+def test_nothing_is_saved(tmp_path):
+    (tmp_path / "nan_task.py").write_text(NAN)
+    words = ("pretrain", "nan_task:empty", "--updates", "10", "--envs", "1", "--out", "p")
+    said = [line for line in retrim(*words, cwd=tmp_path, code=1).splitlines() if line.startswith("retrim:")]
+    assert len(said) == 1
+    assert "the loss is not a number in steps 1 to 10 of 10, and no policy is kept" in said[0]
+    assert not list(tmp_path.rglob("policy.safetensors"))
