@@ -1,7 +1,6 @@
 """Training that comes to nothing ends with one line, and leaves no policy."""
 
 import sys
-from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +8,8 @@ import pytest
 from jax import random
 
 from commands import retrim
+from helpers import tiny_preset
+from retrim.config import Setup
 from retrim.errors import TrainingError
 from retrim.learn.pretrain import pretrain
 
@@ -29,9 +30,10 @@ def losses(monkeypatch):
 
 
 def run(num_updates, chunk):
-    policy, optimiser = SimpleNamespace(params=()), SimpleNamespace(init=lambda params: ())
+    setup = Setup.of(tiny_preset())
     sizes = {"num_updates": num_updates, "num_envs": 2, "chunk": chunk}
-    return len(list(pretrain(policy, None, random.key(0), optimiser=optimiser, **sizes)))
+    policy = setup.new_policy(random.key(0))
+    return len(list(pretrain(policy, setup.env, random.key(1), optimiser=setup.optimiser, **sizes)))
 
 
 def test_ten_steps_without_a_loss_end_training(losses):
