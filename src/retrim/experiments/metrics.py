@@ -7,6 +7,9 @@ import numpy as np
 
 from ..config.methods import find_method
 from ..config.presets import Preset
+from ..config.tasks import lag_of
+from ..config.vehicles import make_vehicle
+from .crash_cause import likely_cause
 from .flights import Flight, FlightSpec
 
 
@@ -220,14 +223,26 @@ def _finite(value: float) -> float | None:
 
 
 def notes(flights: Sequence[Flight], preset: Preset) -> list[str]:
-    """Return which flights crashed, and whether no update took effect, a line each."""
+    """Return which flights crashed and why, a line for each method, and whether no update took effect."""
     lines = []
-    for flight in flights:
-        if flight.log.terminated:
-            about = f"{flight.spec.method}, start {flight.spec.start}"
-            lines.append(f"crashed: {about}, after {flight.log.t[-1]:.2f} s: {flight.events[-1].note}")
+    for method in dict.fromkeys(flight.spec.method for flight in flights):
+        same = [flight for flight in flights if flight.spec.method == method]
+        if crashed := [flight for flight in same if flight.log.terminated]:
+            lines.append(_crashes(method, crashed, len(same), preset))
     learning = [flight for flight in flights if flight.learnt is not None]
     if learning and not any(flight.swaps for flight in learning):
         first = preset.adapt.update_every + preset.adapt.update_latency
         lines.append(f"no policy update took effect; with fixed latencies the first one comes at {first:g} s")
     return lines
+
+
+def _crashes(method: str, crashed: Sequence[Flight], n: int, preset: Preset) -> str:
+    """Tell the first crash of a method, with its likely cause."""
+    first = min(crashed, key=lambda flight: float(flight.log.t[-1]))
+    lag = lag_of(preset, make_vehicle(preset.vehicle))
+    lateness = preset.plant_delay_ticks * preset.dt + (0.0 if lag is None else float(lag.omega[0]))
+    which = f"start {first.spec.start}"
+    which = which if len(crashed) == 1 else f"{len(crashed)} of {n} starts, {which}"
+    cause = likely_cause(first.log, lateness)
+    told = f"crashed: {method}, {which}, after {first.log.t[-1]:.2f} s: {first.events[-1].note}"
+    return told if cause is None else f"{told}; likely because {cause}"
