@@ -9,6 +9,7 @@ from jax import random
 
 from retrim import ConfigError
 from retrim.config import PRESETS, Scenario, Setup, changed, read_vehicle, register_vehicle
+from retrim.config.baselines import BASELINES, slowness
 from retrim.config.tasks import lag_of
 from retrim.config.vehicles import PUBLISHED, make_vehicle
 from retrim.physics.step_response import step_responses
@@ -62,6 +63,20 @@ def test_the_model_of_training_follows_as_the_vehicle_does(spec):
     measured = dataclasses.replace(spec, rate_lag=(0.05, 0.06, 0.2))
     said = lag_of(changed(preset, vehicle=measured), make_vehicle(measured))
     np.testing.assert_allclose(said.omega, [0.05, 0.06, 0.2])
+
+
+def test_classical_controllers_are_as_slow_as_the_vehicle(spec):
+    """A time that is n times as long makes gains of 1/s, 1/s^2 and 1/s^3 so many times n, n^2 and n^3 less."""
+    for name in ("hover/retrim", "hover/fast", "track/retrim", "track/fast"):
+        assert slowness(Setup.of(PRESETS[name])) == 1.0
+    usual, slow = (Setup.of(changed(PRESETS["hover/retrim"], vehicle=vehicle)) for vehicle in ("small", spec))
+    n = slowness(slow)
+    assert n == pytest.approx((0.02 + step_responses(slow.vehicle)[0].rise) / 0.053)
+    for method in ("geometric-i", "indi"):
+        one, other = (BASELINES[method].controller(setup).gains for setup in (usual, slow))
+        assert float(one.position) == pytest.approx(BASELINES[method].settings["position"])
+        for part, power in (("position", 2), ("velocity", 1), ("attitude", 1), ("integral", 3)):
+            assert float(getattr(one, part)) == pytest.approx(n**power * float(getattr(other, part)))
 
 
 def test_a_vehicle_that_no_rate_loop_can_fly_is_refused_with_its_step_response(tmp_path):

@@ -70,8 +70,16 @@ def prediction_of(setup: "Setup") -> Prediction:
     return Prediction(tau, preset.dt, preset.plant_delay_ticks)
 
 
-def _gains(s: Settings) -> Gains:
-    values = (s["position"], s["velocity"], s["attitude"], s.get("integral", 0.0))
+def slowness(setup: "Setup") -> float:
+    """Return how many times later a vehicle turns after a command than in the search for settings, at least 1."""
+    delay, lag = setup.preset.plant_delay_ticks * setup.preset.dt, lag_of(setup.preset, setup.vehicle)
+    return 1.0 if lag is None else max(1.0, (delay + float(lag.omega[0])) / (delay + ACTUATOR_TAU))
+
+
+def _gains(setup: "Setup", s: Settings) -> Gains:
+    """The same loops, but slower as the vehicle is: a time that is n times as long makes a gain of 1/s^k n^k less."""
+    n = slowness(setup)
+    values = (s["position"] / n**2, s["velocity"] / n, s["attitude"] / n, s.get("integral", 0.0) / n**3)
     return Gains(*(jnp.array(value) for value in values))
 
 
@@ -79,7 +87,7 @@ def _geometric(setup: "Setup", s: Settings, key: Key[Array, ""]) -> Geometric:
     vehicle = setup.vehicle
     return Geometric(
         setup.flown,
-        _gains(s),
+        _gains(setup, s),
         prediction_of(setup),
         jnp.array(INTEGRAL_LIMIT),
         vehicle.command_min,
@@ -91,9 +99,9 @@ def _indi(setup: "Setup", s: Settings, key: Key[Array, ""]) -> Incremental:
     vehicle = setup.vehicle
     return Incremental(
         setup.flown,
-        _gains(s),
+        _gains(setup, s),
         prediction_of(setup),
-        jnp.array(s["filter"]),
+        jnp.array(slowness(setup) * s["filter"]),
         vehicle.command_min,
         vehicle.command_max,
     )
