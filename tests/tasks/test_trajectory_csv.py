@@ -288,6 +288,37 @@ def test_headers(header, tmp_path):
     np.testing.assert_array_equal(read_table(written(tmp_path, text)), ROWS)
 
 
+@pytest.mark.parametrize(
+    "names",
+    [
+        "t,p_x,p_y,p_z",
+        "time,pos_x,pos_y,pos_z",
+        "timestamp,position.x,position.y,position.z",
+        "t,px,py,pz",
+        "t,x,y,z,vx,vy,vz",
+        "t,p_x,p_y,p_z,q_w,q_x,q_y,q_z,v_x,v_y,v_z,w_x,w_y,w_z,a_lin_x,a_lin_y,a_lin_z,a_rot_x,u_1,u_2,u_3,u_4,jerk_x",
+        "t,x,y,z,_gate,_note",
+    ],
+)
+def test_names_of_others_and_columns_that_the_positions_determine(names, tmp_path):
+    """The first is that of rpg_time_optimal and gym-pybullet-drones; what is not read may hold anything."""
+    more = ",oops" * (names.count(",") - 3)
+    text = names + "\n" + "".join(",".join(f"{x:g}" for x in row[:4]) + more + "\n" for row in ROWS)
+    np.testing.assert_array_equal(read_table(written(tmp_path, text))[:, :4], ROWS[:, :4])
+
+
+@pytest.mark.parametrize("later", [0.0, 5e-7, -5e-7])
+def test_a_point_that_two_segments_share_is_there_once(later, tmp_path):
+    again = np.insert(ROWS, 2, ROWS[1] + [later, 0.0, 0.0, 0.0, 0.0], axis=0)
+    text = "\n".join(",".join(f"{x:.9f}" for x in row) for row in again)
+    np.testing.assert_array_equal(read_table(written(tmp_path, text)), ROWS)
+
+
+def test_two_places_at_one_time_are_refused(tmp_path):
+    with pytest.raises(ConfigError, match="line 3: time 1 s does not come after 1 s"):
+        read_table(written(tmp_path, "0,0,0,1\n1,0,0,1\n1,0.1,0,1\n"))
+
+
 def test_a_commented_header_sets_the_order(tmp_path):
     """NumPy writes its headers so."""
     order = ("t", "y", "x", "z")
@@ -361,7 +392,7 @@ EXPECTED = r"t \[s\], x, y, z \[m\] and, if wanted, yaw \[rad\]"
     ("text", "message"),
     [
         # header
-        ("t,x,y,z,vx\n0,0,0,1,0\n", rf"line 1: column 'vx' is not known; {EXPECTED}"),
+        ("t,x,y,z,gate\n0,0,0,1,0\n", rf"line 1: column 'gate' is not known; {EXPECTED}.* begins with _ is not read"),
         ("# t x y z q\n0 0 0 1 0\n", "line 1: column 'q' is not known"),
         ("t,x,y\n0,0,0\n", rf"line 1: no column z; {EXPECTED}"),
         ("x,y\n0,0\n", "line 1: no column t, z"),

@@ -13,6 +13,13 @@ from ..errors import ConfigError
 EXPECTED = "t [s], x, y, z [m] and, if wanted, yaw [rad]"
 COLUMNS = ("t", "x", "y", "z", "yaw")
 ALIASES = {"time": "t", "timestamp": "t", "heading": "yaw", "psi": "yaw"}
+POSITION = re.compile(r"(?:p|pos|position)[_.]?([xyz])")
+LEFT_OUT = re.compile(
+    r"_.*"
+    r"|(?:v|vel|velocity|a|acc|accel|acceleration|a_lin|a_rot|j|jerk|s|snap|w|omega|rates?|alpha|tau|torque)[_.]?[xyz]"
+    r"|(?:q|quat|orientation)[_.]?[wxyz]|q[0-3]|u[_.]?\d|thrust|roll|pitch|yaw_?(?:rate|dot)|d?heading_?rate"
+)
+"""Columns that the positions and the yaw determine, by their usual names, and those whose name begins with _."""
 UNITS = {
     "t": ("s", "sec", "second", "seconds"),
     **dict.fromkeys("xyz", ("m", "meter", "meters", "metre", "metres")),
@@ -22,6 +29,7 @@ FARTHEST = 1000.0  # [m]
 LARGEST_YAW = 2.0 * math.pi + 0.1  # [rad]: what is beyond looks like degrees
 LONGEST = 600.0  # [s]
 FASTEST = 100.0  # [m/s] between points
+SAME_TIME, SAME_PLACE, SAME_YAW = 1e-6, 1e-3, 0.02  # [s], [m], [rad]: a point that is nearer to the last repeats it
 SLOWEST = 0.02  # [m/s]: a vehicle of 20 m/s whose times are in ms seems to be slower
 
 
@@ -31,8 +39,11 @@ def read_table(file: Path) -> np.ndarray:
     Args:
         file: UTF-8 text with one point a line. Columns are separated by comma, semicolon, tab or spaces; ``#`` starts a
             comment; blank lines, quotes and separators at the end of a line do not count. A header names the columns,
-            in any order: t (time, timestamp), x, y, z, yaw (heading, psi), with units in brackets or without. Without
-            a header the order is t, x, y, z[, yaw]. A comment of column names before the first point is a header, too.
+            in any order: t (time, timestamp), x, y, z (p_x, pos_x, position.x), yaw (heading, psi), with units in
+            brackets or without. Columns of velocities, accelerations, quaternions, rates and thrusts by their usual
+            names, and columns whose name begins with ``_``, are not read: the positions determine them. Without a
+            header the order is t, x, y, z[, yaw]. A comment of column names before the first point is a header, too. A
+            point that repeats the one before, as where two segments meet, is left out.
 
     Returns:
         One row a point: time since the first point [s], x, y, z, world [m], and yaw [rad], unwrapped; 0 without yaw.
@@ -60,6 +71,8 @@ def read_table(file: Path) -> np.ndarray:
             point = _point(words, columns or list(COLUMNS[: max(4, len(words))]))
             if points and len(point) != len(points[0]):
                 raise ConfigError(f"{line!r} has {len(words)} columns, the first point {len(points[0])}")
+            if points and _repeats(point, points[-1]):
+                continue
             if points and point[0] <= points[-1][0]:
                 raise ConfigError(f"time {point[0]:g} s does not come after {points[-1][0]:g} s")
         except ConfigError as error:
@@ -73,6 +86,13 @@ def read_table(file: Path) -> np.ndarray:
     table[:, 4] = np.unwrap(table[:, 4])
     _check_times(table, numbers, file)
     return table
+
+
+def _repeats(point: list[float], last: list[float]) -> bool:
+    """Return whether a point has the time, the place and the heading of the last."""
+    turned = math.remainder(point[4] - last[4], 2.0 * math.pi) if len(point) > 4 else 0.0
+    near = math.dist(point[1:4], last[1:4]) <= SAME_PLACE and abs(turned) <= SAME_YAW
+    return near and abs(point[0] - last[0]) <= SAME_TIME
 
 
 def _lines(text: str) -> Iterator[tuple[int, str, bool]]:
@@ -113,12 +133,17 @@ def _header(words: list[str], *, comment: bool) -> list[str] | None:
         return None
     parts = [re.fullmatch(r"([^\[(]*?)\s*(?:[\[(]\s*(.*?)\s*[\])])?", word) for word in words]
     names = [part[1].lower() if part else word for part, word in zip(parts, words, strict=True)]
-    names = [ALIASES.get(name, name) for name in names]
+    names = [ALIASES.get(name, POSITION.sub(r"\1", name) if POSITION.fullmatch(name) else name) for name in names]
     if comment and not set(COLUMNS[:4]) <= set(names):
         return None  # a remark
     for word, name, part in zip(words, names, parts, strict=True):
         if name not in COLUMNS:
-            raise ConfigError(f"column {word!r} is not known; {EXPECTED} are expected")
+            if LEFT_OUT.fullmatch(name):
+                continue
+            raise ConfigError(
+                f"column {word[:40]!r} is not known; {EXPECTED} are expected; a column whose name begins with _ is not "
+                f"read"
+            )
         if names.count(name) > 1:
             raise ConfigError(f"column {name!r} is there twice; {EXPECTED} are expected")
         unit = part[2] if part else None
@@ -143,10 +168,12 @@ def _point(words: list[str], columns: list[str]) -> list[float]:
         ConfigError: They are not that many plausible numbers.
     """
     shown = ", ".join(words) if len(words) <= 6 else ", ".join(words[:6]) + ", ..."
-    if len(words) != len(columns) or len(words) > len(COLUMNS):
+    if len(words) != len(columns):
         raise ConfigError(f"'{shown}' has {len(words)} columns; {', '.join(columns)} are expected: {EXPECTED}")
     values = dict[str, float]()
     for name, word in zip(columns, words, strict=True):
+        if name not in COLUMNS:
+            continue
         value = _number(word)
         if value is None:
             raise ConfigError(f"{name} = {word!r} in '{shown}' is not a number; {EXPECTED} are expected")
