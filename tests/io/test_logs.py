@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +12,8 @@ from made_up_log import MAP, G, columns, flown, turned_frames, write_csv, write_
 from retrim.errors import ConfigError, LogError, RetrimError
 from retrim.io.logs import read_flight_log, read_map
 from retrim.io.logs.flight_log import ENDS
+from retrim.io.logs.series import Series
+from retrim.io.logs.times import in_order
 
 FLIGHT = flown(12.0)
 
@@ -116,6 +119,52 @@ def test_ages_bring_states_to_their_own_time(tmp_path):
     np.testing.assert_allclose(log.p[:100], FLIGHT.p[2:102], atol=1e-6)
 
 
+EPOCH = 1.7e9
+
+
+def exact(path, table):
+    """Write columns with all the digits that a time since 1970 needs."""
+    rows = zip(*table.values(), strict=True)
+    path.write_text("\n".join([",".join(table), *(",".join(repr(float(x)) for x in row) for row in rows)]))
+    return path
+
+
+@pytest.mark.parametrize("stamp", [0.0, EPOCH - 300.0, EPOCH + 900.0, 1.8e13, np.nan])
+@pytest.mark.parametrize("place", [0, 1, 300, -1])
+def test_a_sample_with_an_impossible_time_is_left_out(stamp, place, tmp_path):
+    table = columns(FLIGHT) | {"t": EPOCH + FLIGHT.t}
+    table["t"][place] = stamp
+    log = read_flight_log(exact(tmp_path / "log.csv", table), read_map(write_map(tmp_path / "map.toml")))
+    assert any("1 of 601 samples" in note for note in log.notes)
+    assert log.valid.sum() > 585
+    np.testing.assert_allclose(log.c[log.valid], np.interp(
+        log.t[log.valid] + (0.02 * (place == 0)), FLIGHT.t, FLIGHT.c), atol=0.1)  # fmt: skip
+
+
+@pytest.mark.parametrize("back", [0.01, 0.025, 0.4])
+def test_commands_that_overtake_each_other_are_left_out(back, tmp_path):
+    """Stamps are taken in two threads; what is commanded is held over the place of what came late."""
+    series = Series(EPOCH + FLIGHT.t.copy(), FLIGHT.c[:, None])
+    series.t[7::50] -= back
+    found, notes = in_order(series, "thrust", Path("log"))
+    assert notes == ["thrust: 12 of 601 samples are not newer than the one before, and are left out"] or back == 0.01
+    assert np.all(np.diff(found.t) > 0.0)
+    assert len(found.t) == 601 - (12 if back > 0.02 else 0)
+
+
+def test_times_that_go_back_are_told_since_the_beginning():
+    t = EPOCH + np.concatenate([FLIGHT.t, FLIGHT.t])
+    with pytest.raises(LogError, match=r"goes back 1 times, first by 12\.000 s, 12\.000 s after the beginning"):
+        in_order(Series(t, np.ones((len(t), 1))), "thrust", Path("log"))
+
+
+@pytest.mark.parametrize("dt", [0.096, 0.1016, 0.104])
+def test_ten_samples_a_second_are_enough(dt, tmp_path):
+    log = read(tmp_path, columns(flown(40.0, dt=dt)))
+    assert log.dt == pytest.approx(dt, rel=1e-3)
+    assert log.seconds > 39.0
+
+
 WINDY = flown(12.0, wind=(6.0, -2.0, 1.0))
 """Pushed so hard that it does not accelerate along its thrust axis: every other map is tried, and none is better."""
 
@@ -219,6 +268,10 @@ DAMAGED_TABLES = {
     "time goes back": (spoil("t", back), "goes back 1 times.*several flights"),
     "time in ms": (scaled(1000.0, "t"), "every 20 s.*is time in ms"),
     "time too fine": (scaled(1e-6, "t"), "is time in ms, us or ns"),
+    "two flights": (
+        spoil("t", lambda t: np.concatenate([t[:300], t[: len(t) - 300]])),
+        "back 1 times, first by 5.980 s",
+    ),
     "too short": (lambda table: {n: x[:20] for n, x in table.items()}, "of flight are left, at least 1 s"),
     "one sample": (lambda table: {n: x[:1] for n, x in table.items()}, "1 samples, all at one time"),
     "too rare": (lambda table: {n: x[::20] for n, x in table.items()}, "every 0.4 s; accelerations need"),

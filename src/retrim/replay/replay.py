@@ -31,6 +31,7 @@ SHOWN = ("regression", "ensemble", "linear")  # residual models beside the yards
 ENSEMBLE_RATE = 1e-3  # learning rate: with that of hover/paper an ensemble learns the noise of a real log
 DEFAULT = "hover/retrim"
 SAMPLES = (12, 100_000)  # that a residual model can be fitted to; at least so many beside those of a command delay
+SLOWEST = 0.1  # [s]: the longest tick of a preset; a log may miss it by a little
 LOST = 0.5  # [m]: an error in a model that has nothing to do with a flight any more
 SPANS = {"buffer": (0.2, 600.0), "horizon": (0.1, 600.0), "delay": (0.0, 1.0), "lag": (0.0, 5.0)}  # [s]
 
@@ -135,7 +136,7 @@ def _foretold(
     found = list[Foretold]()
     home = np.mean(log.p[log.valid], axis=0)
     goal = tuple(float(x) for x in home)
-    preset = changed(setup.preset, goal=goal, dt=max(0.001, round(log.dt, 3)))
+    preset = changed(setup.preset, goal=goal, dt=min(max(0.001, round(log.dt, 3)), SLOWEST))
     adapt: dict[str, Any] = {"window": round(protocol.buffer / log.dt), "fit_every": protocol.every}
     names = dict.fromkeys([*SHOWN, *([asked.residual] if asked.residual else [])])
     predictors = yardsticks(log.dt)

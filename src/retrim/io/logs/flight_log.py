@@ -16,7 +16,8 @@ from .on_one_clock import STATES, UP, Ticks, grid_of, on_one_clock
 from .plausibility import check_plausible
 from .resampling import around, smoothed
 from .ros_bag import read_bag
-from .series import Clock, LogReader, Series, in_order, newer
+from .series import Clock, LogReader, Series
+from .times import in_order
 from .ulog_file import read_ulog
 
 READERS: dict[str, LogReader] = {
@@ -100,11 +101,9 @@ def read_flight_log(path: Path, log_map: LogMap | None = None, *, dt: float = 0.
         raise LogError(f"{error}; without a map it is read as {_usual(path)!r}: give --map map.toml") from error
     series = dict[str, Series]()
     age = raw.pop("age", None)
-    for name in STATES:
-        if age is not None and clock is not None:  # as old as the log says, they were true earlier
+    if age is not None and clock is not None:  # as old as the log says, they were true earlier
+        for name in STATES:
             raw[name] = Series(raw[name].t - clock.scale * age.values[:, 0], raw[name].values)
-        raw[name], more = newer(raw[name], name)
-        notes += more
     for name, each in raw.items():
         series[name], more = in_order(each, name, path)
         notes += more

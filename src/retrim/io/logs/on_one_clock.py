@@ -19,6 +19,8 @@ FLU_OF = {"FLU": np.eye(3), "FRD": np.diag(BODY)}
 UP = np.array([0.0, 0.0, STANDARD_GRAVITY])
 STATES = ("position", "velocity", "attitude")
 SLOWEST = 0.1  # [s]: states that come more rarely say nothing of accelerations, and no preset has such a tick
+ROUNDING = 0.045  # share by which a logger that is set to ten samples a second may miss them
+LONGEST = 5_000_000  # ticks of a log: times that are this far apart are no times of one flight
 ALIKE = 0.02  # share by which the periods of a log and of the control differ that count as the same
 COMMAND_HELD = 0.5  # [s]: some autopilots publish a command only when it changes
 
@@ -60,10 +62,11 @@ def grid_of(path: Path, series: dict[str, Series], part: maps.Part, dt: float) -
     """
     own = max(period(series[name]) for name in STATES)
     slowest = max(STATES, key=lambda name: period(series[name]))
-    if round(own, 3) > SLOWEST:
+    if own > (1.0 + ROUNDING) * SLOWEST:
+        remedy = "is time in ms or us?" if own > 5.0 else "log it at 50 Hz (PX4: SDLOG_PROFILE with high rate)"
         raise LogError(
-            f"{path}: {slowest} comes every {own:.3g} s; accelerations need a sample every {SLOWEST:g} s at least"
-            + ("; is time in ms or us?" if own > 5.0 else "")
+            f"{path}: {slowest} comes every {own:.3g} s; accelerations need a sample every {SLOWEST:g} s at least; "
+            + remedy
         )
     if own < 2e-5:
         raise LogError(f"{path}: {slowest} comes every {own:.3g} s; is time in ms, us or ns?")
@@ -74,6 +77,8 @@ def grid_of(path: Path, series: dict[str, Series], part: maps.Part, dt: float) -
     if last - first < 4.0 * tick:
         spans = "; ".join(f"{name} {s.t[0]:.2f} to {s.t[-1]:.2f} s" for name, s in series.items())
         raise LogError(f"{path}: the quantities have no time in common: {spans}")
+    if (last - first) / tick > LONGEST:
+        raise LogError(f"{path}: it lasts {last - first:.3g} s with a sample every {own:.3g} s; are the times right?")
     stamps = series["velocity"].t
     alike = all(np.array_equal(series[name].t, stamps) for name in STATES)
     steps = np.diff(stamps)

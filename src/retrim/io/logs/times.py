@@ -1,0 +1,91 @@
+"""Times of samples: impossible, late and repeated ones are left out; several flights in one file are named."""
+
+import math
+from bisect import bisect_right
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from ...errors import LogError
+from .series import Series
+
+LATE_S = 0.5  # [s] by which a sample may be older than the one before; more is of another flight
+RARE = 0.01  # share of samples whose time may be impossible
+FEWEST = 50  # samples, at least, of which one may be
+
+
+def in_order(series: Series, what: str, path: Path) -> tuple[Series, list[str]]:
+    """Return a series whose times rise and whose values are finite, and notes on what was left out.
+
+    Messages are logged when they come. A state is logged again while nothing newer comes, and a clock that is read with
+    an error makes it older then; two threads overtake each other; a stamp is never set. Such samples are left out.
+
+    Raises:
+        LogError: Times go back or stand still, or nothing is left.
+    """
+    notes, count = list[str](), len(series.t)
+    finite = np.isfinite(series.t) & np.all(np.isfinite(series.values), axis=1)
+    if not finite.any():
+        raise LogError(f"{path}: {what} has no finite sample among {count}")
+    rules: tuple[tuple[Callable[[np.ndarray], np.ndarray], str], ...] = (
+        (lambda _: ~finite, "are not finite"),
+        (impossible, "have an impossible time"),
+        (late, "are not newer than the one before"),
+        (repeated, "have the time of the one before"),
+    )
+    for rule, words in rules:
+        out = rule(series.t)
+        if lost := int(np.sum(out)):
+            notes.append(f"{what}: {lost} of {count} samples {words}, and are left out")
+            series = Series(series.t[~out], series.values[~out])
+    t = series.t
+    if (back := np.flatnonzero(np.diff(t) < 0)).size:
+        k = int(back[0])
+        raise LogError(
+            f"{path}: the time of {what} goes back {back.size} times, first by {t[k] - t[k + 1]:.3f} s, "
+            f"{t[k] - t[0]:.3f} s after the beginning (sample {k + 1}); are these several flights in one file?"
+        )
+    if len(t) < 2:
+        raise LogError(f"{path}: {what} has {count} samples, all at one time; a flight needs times that rise")
+    return series, notes
+
+
+def impossible(t: np.ndarray) -> np.ndarray:
+    """Return which times are far from those around them, as a stamp of zero in the middle: few, or none at all."""
+    none, most = np.zeros(len(t), dtype=bool), math.ceil(RARE * len(t))
+    if len(t) < FEWEST:
+        return none
+    first, last = np.quantile(t, [0.02, 0.98])
+    reach = max(LATE_S, last - first)
+    out = (t < first - reach) | (t > last + reach) | ((t == 0.0) & (first > LATE_S))
+    inside = t[~out]
+    if np.any(np.diff(inside) < -LATE_S):
+        kept = _longest_rise(inside)
+        newest = np.fmax.accumulate(np.where(kept, inside, -np.inf))
+        out[~out] = ~kept & (np.abs(inside - newest) > LATE_S)
+    return out if np.sum(out) <= most else none
+
+
+def late(t: np.ndarray) -> np.ndarray:
+    """Return which times are older than one before, but not so much that they are of another flight."""
+    newest = np.concatenate([[-np.inf], np.fmax.accumulate(t)[:-1]])
+    return np.asarray((t < newest) & (t > newest - LATE_S))
+
+
+def repeated(t: np.ndarray) -> np.ndarray:
+    """Return which times are the one before."""
+    return np.concatenate([[False], np.diff(t) == 0.0])
+
+
+def _longest_rise(t: np.ndarray) -> np.ndarray:
+    """Return which times are of the longest sequence that does not fall."""
+    ends, places, before = list[float](), list[int](), np.full(len(t), -1)
+    for k, x in enumerate(t.tolist()):
+        at = bisect_right(ends, x)
+        before[k] = places[at - 1] if at else -1
+        ends[at : at + 1], places[at : at + 1] = [x], [k]
+    kept, k = np.zeros(len(t), dtype=bool), places[-1]
+    while k >= 0:
+        kept[k], k = True, int(before[k])
+    return kept
