@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from made_up_log import MAP, G, columns, flown, turned_frames, write_csv, write_map
 from retrim.errors import ConfigError, LogError, RetrimError
 from retrim.io.logs import read_flight_log, read_map
-from retrim.io.logs.flight_log import ENDS
+from retrim.io.logs.flight_part import ENDS
 from retrim.io.logs.series import Series
 from retrim.io.logs.times import in_order
 

@@ -41,8 +41,9 @@ class Replay:
     """What is asked of a log."""
 
     map: str | None = None
-    """TOML file that says which field is what, in which unit and frame; or one that is known: retrim-csv, retrim-npz,
-    retrim-mcap, px4, mavros. By default what this package or the usual autopilot of the format writes."""
+    """TOML file that says which field is what, in which unit and frame; or a name: px4, px4-1.9, px4-dds,
+    px4-dds-1.13, mavros, mavros-pose, crazyflie, crazyflie-quaternion, crazyswarm, crazyswarm-quaternion,
+    crazyswarm-ros, retrim-csv, retrim-npz, retrim-mcap. By default the first of its format that has the fields."""
     buffer: float = 5.0
     """Residual models are fitted to the last so many seconds."""
     horizon: float = 5.0

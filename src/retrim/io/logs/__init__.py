@@ -3,4 +3,4 @@
 from .flight_log import FlightLog as FlightLog
 from .flight_log import read_flight_log as read_flight_log
 from .log_map import LogMap as LogMap
-from .log_map import read_map as read_map
+from .named_maps import read_map as read_map

@@ -7,7 +7,7 @@ import numpy as np
 from ...errors import LogError
 from .log_map import ANGLES, Attitude
 
-COLUMNS = {"xyzw": 4, "wxyz": 4, "matrix": 9, "roll pitch yaw": 3}
+COLUMNS = {"xyzw": 4, "wxyz": 4, "matrix": 9, "roll pitch yaw": 3, "rotation vector": 3}
 OFF = 0.05  # by which the norm of a quaternion, or a product of columns, may miss its value
 RARE = 0.01  # share of samples that may miss it by more: these are left out
 
@@ -25,7 +25,9 @@ def attitudes(values: np.ndarray, spec: Attitude, path: Path) -> tuple[np.ndarra
             f"{path}: attitude: form {spec.form!r} needs {COLUMNS[spec.form]} numbers, the fields hold "
             f"{values.shape[1]}"
         )
-    if spec.form == "roll pitch yaw":
+    if spec.form == "rotation vector":
+        turned, good = Rotation.from_rotvec(ANGLES[spec.unit] * values), np.ones(len(values), dtype=bool)
+    elif spec.form == "roll pitch yaw":
         angles = ANGLES[spec.unit] * values
         if np.abs(angles).max() > 2.0 * np.pi + OFF:
             raise LogError(

@@ -2,44 +2,57 @@
 
 import csv
 import json
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Collection, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
 from ...errors import LogError
-from .series import Clock, Series, missing_field
+from .series import Clock, Series, first_of, missing_field, sign_of
 
 
 def read_csv(
-    path: Path, wanted: Mapping[str, Sequence[str]], time: Clock | None
+    path: Path, wanted: Mapping[str, Sequence[str]], time: Clock | None, optional: Collection[str] = ()
 ) -> tuple[dict[str, Series], list[str]]:
-    """Read the columns of a CSV file; see :class:`~retrim.io.logs.series.LogReader`."""
+    """Read the columns of a CSV file; see :class:`~retrim.io.logs.series.LogReader`.
+
+    ``p[0]`` and ``p[0:3]`` are numbers of a column of lists. Where no name has the same letters, small and capital ones
+    are alike.
+    """
     if time is None:
         raise LogError(f'{path}: a CSV file needs a table [time] in the map, as field = "t" and unit = "s"')
     header, lines = _lines(path)
-    names = list(dict.fromkeys([time.field, *(name for fields in wanted.values() for name in fields)]))
-    places = [_place(path, name, header) for name in names]
+    places = {"": [_place(path, time.field, header)]}
+    for what, fields in wanted.items():
+        try:
+            places[what] = [first_of(name, lambda each: _place(path, each, header)) for name in fields]
+        except LogError:
+            if what not in optional:
+                raise
     notes = list[str]()
     if lines and len(lines[-1][1]) < len(header):
         notes.append(f"line {lines[-1][0]}, the last, is torn, and is left out")
         lines.pop()
-    columns = dict[str, list[list[float]]]()
-    for name in names:
-        columns[name] = []
+    columns: dict[int, list[list[float]]] = {place: [] for taken in places.values() for place, _ in taken}
     for number, cells in lines:
         if len(cells) != len(header):
             raise LogError(f"{path}, line {number}: {len(cells)} cells, but the header has {len(header)}")
-        for name, place in zip(names, places, strict=True):
-            columns[name].append(_numbers(cells[place], f"{path}, line {number}, column {name!r}"))
-    arrays = {name: _array(path, name, rows) for name, rows in columns.items()}
-    if arrays[time.field].shape[1] != 1:
+        for place, column in columns.items():
+            column.append(_numbers(cells[place], f"{path}, line {number}, column {header[place]!r}"))
+    arrays = {place: _array(path, header[place], rows) for place, rows in columns.items()}
+    times = arrays[places[""][0][0]][:, places[""][0][1]]
+    if times.shape[1] != 1:
         raise LogError(f"{path}: column {time.field!r} holds lists, not times")
-    t = time.scale * arrays[time.field][:, 0]
-    return {
-        what: Series(t, np.concatenate([arrays[name] for name in fields], axis=1)) for what, fields in wanted.items()
-    }, notes
+    found = dict[str, Series]()
+    for what, taken in list(places.items())[1:]:
+        parts = [
+            sign_of(name) * _part(path, name, arrays[place], part)
+            for name, (place, part) in zip(wanted[what], taken, strict=True)
+        ]
+        found[what] = Series(time.scale * times[:, 0], np.concatenate(parts, axis=1))
+    return found, notes
 
 
 def _lines(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
@@ -64,10 +77,24 @@ def _lines(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     return header, rows[1:]
 
 
-def _place(path: Path, name: str, header: list[str]) -> int:
-    if name not in header:
-        raise missing_field(path, name, [each for each in header if each])
-    return header.index(name)
+def _place(path: Path, name: str, header: list[str]) -> tuple[int, slice]:
+    """Return which column a field is, and which of its numbers."""
+    alike = [each.lower() for each in header]
+    if name in header:
+        return header.index(name), slice(None)
+    if alike.count(name.lower()) == 1:
+        return alike.index(name.lower()), slice(None)
+    if (part := re.fullmatch(r"(.+)\[(\d+)(?::(\d+))?\]", name, re.ASCII)) and part[1] in header:
+        first = int(part[2])
+        return header.index(part[1]), slice(first, int(part[3]) if part[3] else first + 1)
+    raise missing_field(path, name, [each for each in header if each])
+
+
+def _part(path: Path, name: str, array: np.ndarray, part: slice) -> np.ndarray:
+    chosen = array[:, part]
+    if not chosen.size:
+        raise LogError(f"{path}: field {name!r}: the column holds {array.shape[1]} numbers")
+    return chosen
 
 
 def _is_number(cell: str) -> bool:

@@ -1,29 +1,36 @@
-"""Which field of a log is what, in which unit and frame: a small TOML file."""
+"""Which field of a log is what, in which unit and frame: a small TOML file.
 
-from pathlib import Path
+A field may have a sign, as ``-pitch``, and alternatives, as ``stabilizer.thrust|controller.cmd_thrust``: the first that
+the log has.
+"""
+
 from typing import Annotated, Literal
 
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import AfterValidator, ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
-from ...config.validation import read_toml, validated
+from .axes import check_body, check_world, left_handed
 
 STRICT = ConfigDict(extra="forbid")
-Fields = Annotated[tuple[str, ...], Field(min_length=1, max_length=9)]
+Name = Annotated[str, Field(min_length=1, max_length=200)]
+Fields = Annotated[tuple[Name, ...], Field(min_length=1, max_length=9)]
+Flags = Annotated[tuple[Name, ...], Field(max_length=9)]
+World = Annotated[str, AfterValidator(check_world)]
+Body = Annotated[str, AfterValidator(check_body)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 SPEEDS = {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3, "km/h": 1.0 / 3.6}
 ANGLES = {"rad": 1.0, "deg": 0.017453292519943295}
-RATES = {"rad/s": 1.0, "deg/s": 0.017453292519943295}
+RATES = {"rad/s": 1.0, "deg/s": 0.017453292519943295, "mrad/s": 1e-3}
 ACCELERATIONS = {"m/s^2": 1.0, "g": 9.80665}
 
 
 @dataclass(frozen=True, config=STRICT)
 class Time:
-    """Of CSV and NPZ files; other formats have their own."""
+    """Of CSV and NPZ files; for ULogs and bags the field of each topic that is its time, where it has that field."""
 
-    field: str
+    field: Name
     unit: Literal["s", "ms", "us", "ns"] = "s"
     age: str | None = None
     """The field that says how old position, velocity and attitude were then, in the same unit."""
@@ -35,6 +42,10 @@ class Position:
 
     fields: Fields
     unit: Literal["m", "cm", "mm"] = "m"
+    valid: Flags = ()
+    """Fields that are not zero where the samples hold, if the log has them."""
+    resets: Flags = ()
+    """Counters that change where the estimator resets, if the log has them."""
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -44,6 +55,8 @@ class Velocity:
     fields: Fields
     unit: Literal["m/s", "cm/s", "mm/s", "km/h"] = "m/s"
     axes: Literal["world", "body"] = "world"
+    valid: Flags = ()
+    resets: Flags = ()
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -51,11 +64,16 @@ class Attitude:
     """Of the vehicle in the world."""
 
     fields: Fields
-    form: Literal["xyzw", "wxyz", "matrix", "roll pitch yaw"]
-    """Order of a quaternion; a rotation matrix row by row; or angles about the axes x, y, z."""
+    form: Literal["xyzw", "wxyz", "matrix", "roll pitch yaw", "rotation vector"]
+    """Order of a quaternion; a rotation matrix row by row; angles about the axes x, y, z; or an axis times an angle."""
     unit: Literal["rad", "deg"] = "rad"
     """Of angles."""
     turns: Literal["body to world", "world to body"] = "body to world"
+    world: World | None = None
+    """Axes of the world that the attitude refers to, if they are not those of [frames]."""
+    body: Body | None = None
+    valid: Flags = ()
+    resets: Flags = ()
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -68,13 +86,20 @@ class Thrust:
     positive: Literal["up", "down"] = "up"
     mass: Positive | None = None
     """[kg], for newtons."""
-    hover: Positive | str | None = None
+    hover: Positive | Name | None = None
     """For a share: the share at hover, or the field that holds it; by default it is found from the flight."""
+    full: Positive = 1.0
+    """For a share: the number that stands for all of the thrust, as 65535."""
 
     @property
     def scale(self) -> float | None:
         """Mass-normalised thrust of one unit [m/s^2]; None for a share, which the flight or ``hover`` tells."""
         return {"m/s^2": 1.0, "g": ACCELERATIONS["g"], "N": 1.0 / (self.mass or 1.0)}.get(self.unit)
+
+    @property
+    def sign(self) -> float:
+        """One for a thrust that is positive upwards, minus one otherwise."""
+        return 1.0 if self.positive == "up" else -1.0
 
     @model_validator(mode="after")
     def _complete(self) -> "Thrust":
@@ -82,6 +107,8 @@ class Thrust:
             raise ValueError('mass [kg] goes with unit = "N", and only with it')
         if self.hover is not None and self.unit != "share":
             raise ValueError('hover goes with unit = "share"')
+        if self.full != 1.0 and self.unit != "share":
+            raise ValueError('full goes with unit = "share"')
         return self
 
 
@@ -90,7 +117,9 @@ class BodyRates:
     """Commanded or measured."""
 
     fields: Fields
-    unit: Literal["rad/s", "deg/s"] = "rad/s"
+    unit: Literal["rad/s", "deg/s", "mrad/s"] = "rad/s"
+    optional: bool = False
+    """Whether the log is read without them if it has no such field."""
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -105,13 +134,26 @@ class Acceleration:
 
 
 @dataclass(frozen=True, config=STRICT)
-class Frames:
-    """Axes of the log."""
+class Landed:
+    """Fields that are not zero while the vehicle is on the ground, if the log has them."""
 
-    world: Literal["ENU", "NED"] = "ENU"
-    """z upwards, or z downwards; which way x points does not matter."""
-    body: Literal["FLU", "FRD"] = "FLU"
-    """Forward, left, up; or forward, right, down."""
+    fields: Fields
+
+
+@dataclass(frozen=True, config=STRICT)
+class Frames:
+    """Axes of the log, each by the first letter of where x, y and z point."""
+
+    world: World = "ENU"
+    """East, north, up; NED; NWU; EUS for y upwards; which way is north does not matter."""
+    body: Body = "FLU"
+    """Forward, left, up; FRD: forward, right, down; RFU; and so on."""
+
+    @model_validator(mode="after")
+    def _both(self) -> "Frames":
+        if left_handed(self.world) != left_handed(self.body):
+            raise ValueError(f"world = {self.world!r} and body = {self.body!r} must both be right-handed, or both left")
+        return self
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -126,15 +168,18 @@ class Part:
 class LogMap:
     """Which field of a log is what."""
 
-    position: Position
-    velocity: Velocity
     attitude: Attitude
     thrust: Thrust
+    position: Position | None = None
+    """Without it, positions are the integral of the velocities."""
+    velocity: Velocity | None = None
+    """Without it, velocities are the smoothed derivative of the positions."""
     rates: BodyRates | None = None
     """Commanded body rates."""
     measured_rates: BodyRates | None = None
     """From a gyroscope; by default they follow from the attitudes."""
     acceleration: Acceleration | None = None
+    landed: Landed | None = None
     time: Time | None = None
     frames: Frames = Frames()
     part: Part = Part()
@@ -143,60 +188,9 @@ class LogMap:
     def _fitting(self) -> "LogMap":
         if self.part.end is not None and self.part.end <= self.part.start:
             raise ValueError(f"part.end = {self.part.end} s must be after part.start = {self.part.start} s")
+        if self.position is None and self.velocity is None:
+            raise ValueError("[position], [velocity] or both must be there")
+        world, body = self.attitude.world or self.frames.world, self.attitude.body or self.frames.body
+        if left_handed(world) != left_handed(body):
+            raise ValueError(f"attitude: world = {world!r} and body = {body!r} must both be right-handed, or both left")
         return self
-
-
-KNOWN: dict[str, dict[str, object]] = {
-    "retrim-csv": {
-        "time": {"field": "t", "age": "age"},
-        "position": {"fields": ["x0", "x1", "x2"]},
-        "velocity": {"fields": ["x12", "x13", "x14"]},
-        "attitude": {"fields": [f"x{i}" for i in range(3, 12)], "form": "matrix"},
-        "thrust": {"fields": ["c"], "unit": "m/s^2"},
-        "rates": {"fields": ["omega0", "omega1", "omega2"]},
-    },
-    "retrim-npz": {
-        "time": {"field": "t", "age": "age"},
-        "position": {"fields": ["p_measured"]},
-        "velocity": {"fields": ["v_measured"]},
-        "attitude": {"fields": ["R_measured"], "form": "matrix"},
-        "thrust": {"fields": ["u[0]"], "unit": "m/s^2"},
-        "rates": {"fields": ["u[1:4]"]},
-    },
-    "retrim-mcap": {
-        "position": {"fields": ["/measured/pose.pose.position"]},
-        "velocity": {"fields": ["/measured/velocity.twist.linear"]},
-        "attitude": {"fields": ["/measured/pose.pose.orientation"], "form": "xyzw"},
-        "thrust": {"fields": ["/command.twist.linear.z"], "unit": "m/s^2"},
-        "rates": {"fields": ["/command.twist.angular"]},
-    },
-    "px4": {
-        "position": {"fields": [f"vehicle_local_position.{axis}" for axis in "xyz"]},
-        "velocity": {"fields": [f"vehicle_local_position.v{axis}" for axis in "xyz"]},
-        "attitude": {"fields": ["vehicle_attitude.q"], "form": "wxyz"},
-        "thrust": {"fields": ["vehicle_rates_setpoint.thrust_body[2]"], "unit": "share", "positive": "down"},
-        "rates": {"fields": [f"vehicle_rates_setpoint.{axis}" for axis in ("roll", "pitch", "yaw")]},
-        "measured_rates": {"fields": ["vehicle_angular_velocity.xyz"]},
-        "frames": {"world": "NED", "body": "FRD"},
-    },
-    "mavros": {
-        "position": {"fields": ["/mavros/local_position/odom.pose.pose.position"]},
-        "velocity": {"fields": ["/mavros/local_position/odom.twist.twist.linear"], "axes": "body"},
-        "attitude": {"fields": ["/mavros/local_position/odom.pose.pose.orientation"], "form": "xyzw"},
-        "thrust": {"fields": ["/mavros/setpoint_raw/attitude.thrust"], "unit": "share"},
-        "rates": {"fields": ["/mavros/setpoint_raw/attitude.body_rate"]},
-        "measured_rates": {"fields": ["/mavros/local_position/odom.twist.twist.angular"]},
-    },
-}
-"""Maps by name: of what retrim and usual autopilots write."""
-
-
-def read_map(source: str | Path) -> LogMap:
-    """Return a map by name, or from a TOML file.
-
-    Raises:
-        ConfigError: The file cannot be read, or a value is missing, unknown or impossible.
-    """
-    if str(source) in KNOWN:
-        return validated(LogMap, KNOWN[str(source)], source=f"map {source}")
-    return validated(LogMap, read_toml(Path(source)), source=str(source))

@@ -1,16 +1,16 @@
 """Logs as NPZ: arrays whose first axis is time, as `retrim fly` writes them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from ...errors import LogError
-from .series import Clock, Series, missing_field
+from .series import Clock, Series, first_of, missing_field, sign_of
 
 
 def read_npz(
-    path: Path, wanted: Mapping[str, Sequence[str]], time: Clock | None
+    path: Path, wanted: Mapping[str, Sequence[str]], time: Clock | None, optional: Collection[str] = ()
 ) -> tuple[dict[str, Series], list[str]]:
     """Read the arrays of an NPZ file; ``u[1:4]`` are columns of one. See :class:`~retrim.io.logs.series.LogReader`."""
     if time is None:
@@ -23,7 +23,12 @@ def read_npz(
     t = _flat(path, time.field, arrays)[:, 0] * time.scale
     found = dict[str, Series]()
     for what, fields in wanted.items():
-        columns = [_flat(path, name, arrays) for name in fields]
+        try:
+            columns = [sign_of(name) * first_of(name, lambda each: _flat(path, each, arrays)) for name in fields]
+        except LogError:
+            if what not in optional:
+                raise
+            continue
         for name, column in zip(fields, columns, strict=True):
             if len(column) != len(t):
                 raise LogError(f"{path}: {name!r} has {len(column)} samples, but {time.field!r} has {len(t)}")

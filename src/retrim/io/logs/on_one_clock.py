@@ -7,15 +7,13 @@ import numpy as np
 
 from ...errors import LogError
 from ...physics.state import STANDARD_GRAVITY
-from ...plants.bridges.frames import BODY, WORLD
 from . import log_map as maps
 from .attitudes import attitudes
+from .axes import to_body, to_world
 from .log_map import LogMap
 from .resampling import around, derivative, held, held_mean, interpolated, known, period, turned
 from .series import Series
 
-ENU_OF = {"ENU": np.eye(3), "NED": WORLD}
-FLU_OF = {"FLU": np.eye(3), "FRD": np.diag(BODY)}
 UP = np.array([0.0, 0.0, STANDARD_GRAVITY])
 STATES = ("position", "velocity", "attitude")
 SLOWEST = 0.1  # [s]: states that come more rarely say nothing of accelerations, and no preset has such a tick
@@ -42,6 +40,8 @@ class Ticks:
     """Where all of these are."""
     hover: np.ndarray | None
     dt: float
+    gyroscope: bool
+    """Whether the rates are measured, not those of the attitudes."""
 
 
 @dataclass(frozen=True)
@@ -60,8 +60,9 @@ def grid_of(path: Path, series: dict[str, Series], part: maps.Part, dt: float) -
     Raises:
         LogError: States come too rarely, or the quantities have no time in common.
     """
-    own = max(period(series[name]) for name in STATES)
-    slowest = max(STATES, key=lambda name: period(series[name]))
+    states = [name for name in STATES if name in series]
+    own = max(period(series[name]) for name in states)
+    slowest = max(states, key=lambda name: period(series[name]))
     if own > (1.0 + ROUNDING) * SLOWEST:
         remedy = "is time in ms or us?" if own > 5.0 else "log it at 50 Hz (PX4: SDLOG_PROFILE with high rate)"
         raise LogError(
@@ -70,17 +71,18 @@ def grid_of(path: Path, series: dict[str, Series], part: maps.Part, dt: float) -
         )
     if own < 2e-5:
         raise LogError(f"{path}: {slowest} comes every {own:.3g} s; is time in ms, us or ns?")
-    zero = min(each.t[0] for each in series.values())
-    first = max(max(each.t[0] for each in series.values()), zero + part.start)
-    last = min(min(series[name].t[-1] for name in STATES), np.inf if part.end is None else zero + part.end)
+    needed = {name: each for name, each in series.items() if " " not in name}  # marks hold before and after
+    zero = min(each.t[0] for each in needed.values())
+    first = max(max(each.t[0] for each in needed.values()), zero + part.start)
+    last = min(min(series[name].t[-1] for name in states), np.inf if part.end is None else zero + part.end)
     tick = dt if own <= (1.0 + ALIKE) * dt else own
     if last - first < 4.0 * tick:
-        spans = "; ".join(f"{name} {s.t[0]:.2f} to {s.t[-1]:.2f} s" for name, s in series.items())
+        spans = "; ".join(f"{name} {s.t[0]:.2f} to {s.t[-1]:.2f} s" for name, s in needed.items())
         raise LogError(f"{path}: the quantities have no time in common: {spans}")
     if (last - first) / tick > LONGEST:
         raise LogError(f"{path}: it lasts {last - first:.3g} s with a sample every {own:.3g} s; are the times right?")
     stamps = series["velocity"].t
-    alike = all(np.array_equal(series[name].t, stamps) for name in STATES)
+    alike = all(np.array_equal(series[name].t, stamps) for name in states)
     steps = np.diff(stamps)
     if alike and abs(own - tick) <= ALIKE * tick and np.all(np.abs(steps - own) < 0.25 * own):
         return Grid(stamps[(stamps >= first) & (stamps <= last)], own, True)
@@ -93,29 +95,36 @@ def on_one_clock(path: Path, log_map: LogMap, series: dict[str, Series], grid: G
     Raises:
         LogError: A quantity has the wrong number of columns, or is no attitude.
     """
-    W, B = ENU_OF[log_map.frames.world], FLU_OF[log_map.frames.body]
-    t, dt, of = grid.t, grid.dt, {name: _columns(path, name, series) for name in series}
+    W, B = to_world(log_map.frames.world), to_body(log_map.frames.body)
+    t, dt = grid.t, grid.dt
+    of = {name: _columns(path, name, series) for name in series if " " not in name}
     there = np.all([known(each, t, dt) for name, each in of.items() if name in STATES], axis=0)
     logged, rotations = attitudes(of["attitude"].values, log_map.attitude, path)
     stamps = of["attitude"].t
     R = logged[np.searchsorted(stamps, t)] if grid.sampled else turned(stamps[rotations], logged[rotations], t)
     if not rotations.all():
         there &= held(Series(stamps, rotations[:, None].astype(float)), t)[:, 0] > 0.5
-    R = W @ R @ B.T
-    p = maps.METRES[log_map.position.unit] * interpolated(of["position"], t) @ W.T
-    v = maps.SPEEDS[log_map.velocity.unit] * interpolated(of["velocity"], t)
-    v = v @ W.T if log_map.velocity.axes == "world" else np.einsum("nij,nj->ni", R, v @ B.T)
-    thrust = _told(of["thrust"], grid)[:, 0] * (1.0 if log_map.thrust.positive == "up" else -1.0)
+    own_world, own_body = log_map.attitude.world, log_map.attitude.body
+    R = (to_world(own_world) if own_world else W) @ R @ (to_body(own_body) if own_body else B).T
+    v = _speed(log_map) * interpolated(of["velocity"], t)
+    in_world = log_map.velocity is None or log_map.velocity.axes == "world"
+    v = v @ W.T if in_world else np.einsum("nij,nj->ni", R, v @ B.T)
+    if log_map.position is None:
+        p = np.concatenate([np.zeros((1, 3)), np.cumsum(0.5 * np.diff(t)[:, None] * (v[1:] + v[:-1]), axis=0)])
+    else:
+        p = maps.METRES[log_map.position.unit] * interpolated(of["position"], t) @ W.T
+    spin = B * np.linalg.det(B)  # a rate is a pseudovector
+    thrust = _told(of["thrust"], grid)[:, 0] * log_map.thrust.sign / log_map.thrust.full
     there &= known(of["thrust"], t, dt, held=COMMAND_HELD)
     command = measured = hover = None
-    if log_map.rates is not None:
-        command = maps.RATES[log_map.rates.unit] * _told(of["rates"], grid) @ B.T
+    if log_map.rates is not None and "rates" in of:
+        command = maps.RATES[log_map.rates.unit] * _told(of["rates"], grid) @ spin.T
         there &= known(of["rates"], t, dt, held=COMMAND_HELD)
-    if log_map.measured_rates is not None:
-        measured = maps.RATES[log_map.measured_rates.unit] * interpolated(of["measured_rates"], t) @ B.T
+    if log_map.measured_rates is not None and "measured_rates" in of:
+        measured = maps.RATES[log_map.measured_rates.unit] * interpolated(of["measured_rates"], t) @ spin.T
         there &= known(of["measured_rates"], t, dt)
     if "hover" in of:
-        hover = held(of["hover"], t)[:, 0]
+        hover = held(of["hover"], t)[:, 0] / log_map.thrust.full
     if log_map.acceleration is None:
         a = derivative(v, dt)
         there &= around(there, 2)
@@ -125,7 +134,14 @@ def on_one_clock(path: Path, log_map: LogMap, series: dict[str, Series], grid: G
         a = a - UP * (log_map.acceleration.gravity == "felt")
         there &= known(of["acceleration"], t, dt)
     rates = turning(R, dt) if measured is None else measured
-    return Ticks(t, p, R, v, a, rates, thrust, command, there, hover, dt)
+    return Ticks(t, p, R, v, a, rates, thrust, command, there, hover, dt, measured is not None)
+
+
+def _speed(log_map: LogMap) -> float:
+    """Return how many m/s a unit of velocity is; a velocity that is not in the log is in the unit of the position."""
+    if log_map.velocity is not None:
+        return maps.SPEEDS[log_map.velocity.unit]
+    return 1.0 if log_map.position is None else maps.METRES[log_map.position.unit]
 
 
 def _told(command: Series, grid: Grid) -> np.ndarray:
@@ -149,5 +165,6 @@ def _columns(path: Path, name: str, series: dict[str, Series]) -> Series:
     """Return a series after a look at how many columns it has."""
     wanted, found = {"thrust": 1, "hover": 1}.get(name, 3), series[name].values.shape[1]
     if name != "attitude" and found != wanted:
-        raise LogError(f"{path}: {name} needs {wanted} number{'s' * (wanted > 1)}, its fields hold {found}")
+        hint = "; add the motors' thrusts up into one column" if name == "thrust" and found == 4 else ""
+        raise LogError(f"{path}: {name} needs {wanted} number{'s' * (wanted > 1)}, its fields hold {found}{hint}")
     return series[name]

@@ -75,3 +75,12 @@ def around(valid: np.ndarray, reach: int) -> np.ndarray:
     """Return where all rows up to ``reach`` before and after are valid."""
     padded = np.concatenate([np.zeros(reach, bool), valid, np.zeros(reach, bool)])
     return np.asarray(np.all([padded[k : k + len(valid)] for k in range(2 * reach + 1)], axis=0))
+
+
+def runs(flags: np.ndarray, length: int) -> np.ndarray:
+    """Return where flags are part of a run of at least that length."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(int), [0]])))
+    found = np.zeros(len(flags), dtype=bool)
+    for first, last in zip(edges[::2], edges[1::2], strict=True):
+        found[first:last] = last - first >= length
+    return found

@@ -1,88 +1,136 @@
 """Bags of ROS 1 and ROS 2, and MCAP files with messages of ROS. Needs the extra ``logs``.
 
 A field is a topic and a path in its messages, as ``/odom.pose.pose.position``; vectors and quaternions are read whole,
-and ``[0]`` is an element of an array. The time is that of the header, or else that of the recording.
+and ``[0]`` is an element of an array. ``*`` in a topic stands for any letters.
 """
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from fnmatch import filter as fitting
 from importlib.util import find_spec
 from operator import attrgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ...errors import LogError
-from .series import Clock, Series, missing_field
+from .message_times import on_one_time, stamp_of
+from .series import Clock, Series, first_of, missing_field, sign_of
 
 NANOSECOND = 1e-9
 ORDER = ("x", "y", "z", "w")
 
 
+class Place(NamedTuple):
+    """Where a field is."""
+
+    topic: str
+    inner: str
+
+
 def read_bag(
-    path: Path, wanted: Mapping[str, Sequence[str]], time: Clock | None
+    path: Path, wanted: Mapping[str, Sequence[str]], time: Clock | None, optional: Collection[str] = ()
 ) -> tuple[dict[str, Series], list[str]]:
-    """Read topics of a bag; see :class:`~retrim.io.logs.series.LogReader`. Times are those of the messages."""
+    """Read topics of a bag; see :class:`~retrim.io.logs.series.LogReader`.
+
+    Times are those of a field that the map names, of the header, of the messages of PX4, or else of the recording.
+    """
     if find_spec("rosbags") is None:
         raise LogError(f"{path}: a bag needs rosbags: pip install 'retrim[logs]'")
-    asked = {name for fields in wanted.values() for name in fields}
     try:
-        samples = _samples(path, asked)
+        return _read(path, wanted, time, optional)
     except LogError:
         raise
     except Exception as error:  # whatever its parsers meet in bytes that are no bag
         hint = "; `mcap recover` mends a file whose recorder was killed" if path.suffix == ".mcap" else ""
-        raise LogError(f"{path}: cannot be read as a bag ({type(error).__name__}: {error}){hint}") from error
-    found = dict[str, Series]()
-    for what, fields in wanted.items():
-        if len({name.partition(".")[0] for name in fields}) > 1:
-            raise LogError(f"{path}: the fields of {what} come from several topics: {', '.join(fields)}")
-        times, first = samples[fields[0]]
-        found[what] = Series(times, np.concatenate([first, *(samples[name][1] for name in fields[1:])], axis=1))
-    return found, []
+        raise LogError(f"{path}: cannot be read as a bag ({type(error).__name__}: {str(error)[:200]}){hint}") from error
 
 
-def _samples(path: Path, asked: set[str]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Return times [s] and numbers of each field."""
+def _read(
+    path: Path, wanted: Mapping[str, Sequence[str]], time: Clock | None, optional: Collection[str]
+) -> tuple[dict[str, Series], list[str]]:
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
-    per_topic = dict[str, list[str]]()
-    for name in sorted(asked):
-        topic, _, field = name.partition(".")
-        if not field:
-            raise LogError(f"{path}: field {name!r} must be a topic and a path, as /odom.pose.pose.position")
-        per_topic.setdefault(topic, []).append(name)
-    taken: dict[str, list[list[float]]] = {name: [] for name in asked}
-    times: dict[str, list[float]] = {topic: [] for topic in per_topic}
     with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as bag:
-        known = sorted({connection.topic for connection in bag.connections})
-        for topic in per_topic:
-            if topic not in known:
-                raise missing_field(path, topic, known)
-        chosen = [connection for connection in bag.connections if connection.topic in per_topic]
+        places = _places(path, wanted, sorted({connection.topic for connection in bag.connections}), optional)
+        taken: dict[Place, list[list[float]]] = {place: [] for found in places.values() for place in found}
+        stamps: dict[str, list[tuple[float, float]]] = {place.topic: [] for place in taken}
+        chosen = [connection for connection in bag.connections if connection.topic in stamps]
         for connection, received, raw in bag.messages(connections=chosen):
-            message = bag.deserialize(raw, connection.msgtype)
-            times[connection.topic].append(NANOSECOND * _stamp(message, received))
-            for name in per_topic[connection.topic]:
-                taken[name].append(_numbers(path, name, message))
-    for topic, stamps in times.items():
-        if not stamps:
-            raise LogError(f"{path}: topic {topic!r} has no message")
-    return {name: (np.array(times[name.partition(".")[0]]), np.array(rows)) for name, rows in taken.items()}
+            topic, message = connection.topic, bag.deserialize(raw, connection.msgtype)
+            if not stamps[topic]:
+                _check_fields(path, topic, message, places, taken, optional)
+            stamps[topic].append((stamp_of(message, time), NANOSECOND * received))
+            for place in taken:
+                if place.topic == topic:
+                    taken[place].append(_numbers(path, place, message))
+    for what in [what for what, found in places.items() if not stamps[found[0].topic]]:
+        if what not in optional:
+            raise LogError(f"{path}: topic {places[what][0].topic!r} has no message")
+        del places[what]
+    times, notes = on_one_time({topic: np.array(both) for topic, both in stamps.items() if both})
+    found = dict[str, Series]()
+    for what, fields in places.items():
+        parts = [sign_of(name) * np.array(taken[place]) for name, place in zip(wanted[what], fields, strict=True)]
+        found[what] = Series(times[fields[0].topic], np.concatenate(parts, axis=1))
+    return found, notes
 
 
-def _stamp(message: Any, received: int) -> int:
-    """Return the time of a message [ns]."""
-    stamp = getattr(getattr(message, "header", None), "stamp", None)
-    told = 0 if stamp is None else stamp.sec * 10**9 + stamp.nanosec
-    return told or received
+def _places(
+    path: Path, wanted: Mapping[str, Sequence[str]], known: Sequence[str], optional: Collection[str]
+) -> dict[str, list[Place]]:
+    """Return where the fields of each quantity are."""
+    places = dict[str, list[Place]]()
+    for what, fields in wanted.items():
+        try:
+            places[what] = [first_of(name, lambda each: _place(path, each, known)) for name in fields]
+        except LogError:
+            if what not in optional:
+                raise
+            continue
+        if len({place.topic for place in places[what]}) > 1:
+            raise LogError(f"{path}: the fields of {what} come from several topics: {', '.join(fields)}")
+    return places
 
 
-def _numbers(path: Path, name: str, message: Any) -> list[float]:
+def _place(path: Path, name: str, known: Sequence[str]) -> Place:
+    topic, _, inner = name.partition(".")
+    if not inner:
+        raise LogError(f"{path}: field {name!r} must be a topic and a path, as /odom.pose.pose.position")
+    fit = [topic] if topic in known else fitting(known, topic)
+    if not fit:
+        raise missing_field(path, topic, known)
+    if len(fit) > 1:
+        raise LogError(f"{path}: {topic!r} fits several topics: {', '.join(fit[:5])}; name one in the map")
+    return Place(fit[0], inner)
+
+
+def _check_fields(
+    path: Path,
+    topic: str,
+    message: Any,
+    places: dict[str, list[Place]],
+    taken: dict[Place, list[list[float]]],
+    optional: Collection[str],
+) -> None:
+    """Leave out the optional quantities that the messages of a topic do not have."""
+    for what in [what for what, found in places.items() if what in optional and found[0].topic == topic]:
+        try:
+            for place in places[what]:
+                _numbers(path, place, message)
+        except LogError:
+            del places[what]
+    needed = {place for found in places.values() for place in found}
+    for place in [place for place in taken if place not in needed]:
+        del taken[place]
+
+
+def _numbers(path: Path, place: Place, message: Any) -> list[float]:
     """Return the numbers of a field."""
-    parsed = re.fullmatch(r"([\w.]+)(?:\[(\d+)\])?", name.partition(".")[2], re.ASCII)
+    name = f"{place.topic}.{place.inner}"
+    parsed = re.fullmatch(r"([\w.]+)(?:\[(\d+)\])?", place.inner, re.ASCII)
     if parsed is None:
         raise LogError(f"{path}: field {name!r} is no path in a message, as pose.position or data[0]")
     inner, element = parsed.groups()
@@ -91,10 +139,10 @@ def _numbers(path: Path, name: str, message: Any) -> list[float]:
         if element is not None:
             value = value[int(element)]
     except (AttributeError, IndexError, TypeError) as error:
-        raise missing_field(path, name, [f"{name.partition('.')[0]}.{each}" for each in _fields(message)]) from error
+        raise missing_field(path, name, [f"{place.topic}.{each}" for each in _fields(message)]) from error
     if isinstance(value, (float, int)):
         return [float(value)]
-    if isinstance(value, (np.ndarray, np.number)):
+    if isinstance(value, (np.ndarray, np.generic)):
         return [float(x) for x in np.ravel(value)]
     parts = [getattr(value, axis) for axis in ORDER if hasattr(value, axis)]
     if not parts or not all(isinstance(x, (float, int)) for x in parts):

@@ -58,7 +58,8 @@ def impossible(t: np.ndarray) -> np.ndarray:
         return none
     first, last = np.quantile(t, [0.02, 0.98])
     reach = max(LATE_S, last - first)
-    out = (t < first - reach) | (t > last + reach) | ((t == 0.0) & (first > LATE_S))
+    earliest = np.min(t, where=t > 0.0, initial=np.inf)
+    out = (t < first - reach) | (t > last + reach) | ((t == 0.0) & (earliest > LATE_S))
     inside = t[~out]
     if np.any(np.diff(inside) < -LATE_S):
         kept = _longest_rise(inside)

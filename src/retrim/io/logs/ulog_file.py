@@ -7,7 +7,7 @@ A field is ``topic.field``, as ``vehicle_local_position.vx``; ``vehicle_attitude
 import contextlib
 import io
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -15,15 +15,18 @@ from typing import Any
 import numpy as np
 
 from ...errors import LogError
-from .series import Clock, Series, missing_field
+from .series import Clock, Series, first_of, missing_field, sign_of
 
 MICROSECOND = 1e-6
 
 
 def read_ulog(
-    path: Path, wanted: Mapping[str, Sequence[str]], time: Clock | None
+    path: Path, wanted: Mapping[str, Sequence[str]], time: Clock | None, optional: Collection[str] = ()
 ) -> tuple[dict[str, Series], list[str]]:
-    """Read topics of a ULog; see :class:`~retrim.io.logs.series.LogReader`. Times are the topics' own."""
+    """Read topics of a ULog; see :class:`~retrim.io.logs.series.LogReader`.
+
+    Times are the topics' own, those of the sample where a topic has them, or those of a field that the map names.
+    """
     if find_spec("pyulog") is None:
         raise LogError(f"{path}: a ULog needs pyulog: pip install 'retrim[logs]'")
     log = _parsed(path)
@@ -34,17 +37,31 @@ def read_ulog(
         notes.append(f"the logger dropped out {len(log.dropouts)} times, for {lost:.2f} s in all")
     found = dict[str, Series]()
     for what, fields in wanted.items():
-        parts = [_field(path, name, topics) for name in fields]
+        try:
+            parts = [first_of(name, lambda each: _field(path, each, topics)) for name in fields]
+        except LogError:
+            if what not in optional:
+                raise
+            continue
         if len({id(topic) for topic, _ in parts}) > 1:
             raise LogError(f"{path}: the fields of {what} come from several topics: {', '.join(fields)}")
         topic = parts[0][0]
-        stamp = "timestamp_sample" if "timestamp_sample" in topic.data else "timestamp"
-        if stamp not in topic.data:
-            raise LogError(f"{path}: topic {topic.name!r} has no time")
-        t = MICROSECOND * topic.data[stamp].astype(float)
-        columns = [topic.data[key].astype(float) for _, keys in parts for key in keys]
-        found[what] = Series(t, np.stack(columns, axis=1))
+        columns = [
+            sign_of(name) * topic.data[key].astype(float)
+            for name, (_, keys) in zip(fields, parts, strict=True)
+            for key in keys
+        ]
+        found[what] = Series(_times(path, topic, time), np.stack(columns, axis=1))
     return found, notes
+
+
+def _times(path: Path, topic: Any, time: Clock | None) -> np.ndarray:
+    """Return the times of the samples of a topic [s]."""
+    own = [] if time is None else [(time.field, time.scale)]
+    for stamp, scale in (*own, ("timestamp_sample", MICROSECOND), ("timestamp", MICROSECOND)):
+        if stamp in topic.data and np.any(topic.data[stamp]):
+            return np.asarray(scale * topic.data[stamp].astype(float))
+    raise LogError(f"{path}: topic {topic.name!r} has no time")
 
 
 def _parsed(path: Path) -> Any:

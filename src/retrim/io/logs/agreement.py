@@ -1,0 +1,106 @@
+"""How well the quantities of a log agree with each other.
+
+Positions move as velocities say; a vehicle accelerates along its thrust axis, and as its thrust says; it turns as it is
+told and as its gyroscope says. Wind, drag and lags leave something unexplained in every log.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from .log_map import LogMap
+from .on_one_clock import UP, Ticks, turning
+
+SMOOTH = 0.2  # [s] over which differences are taken
+MOVES, TILTS, TURNS, CLIMBS = 0.15, 0.03, 0.1, 0.5  # [m/s], [rad], [rad/s], [m/s^2]: nothing can be told below
+TURNS_AXIS = 0.3  # [rad/s] of one axis
+SHARE = 0.1  # of the motion of all axes that one axis has if it is looked at by itself
+LATE = 0.2  # [s] by which an acceleration may follow the thrust
+
+CLAIMS: Mapping[str, str] = {
+    "motion": "velocity explains {} % of the motion of the position",
+    "lift": "attitude explains {} % of the sideways acceleration",
+    "thrust": "the size of the thrust agrees with that of the acceleration to {} %",
+    "climb": "thrust explains {} % of the changes of the acceleration along its axis",
+    "turning": "commanded rates explain {} % of the turning",
+    "gyroscope": "measured rates explain {} % of the turning",
+}
+"""What each figure says."""
+
+
+def agreement(chosen: LogMap, ticks: Ticks, valid: np.ndarray) -> dict[str, float]:
+    """Return how well a log agrees with itself, 1 for entirely; what cannot be told is not in it."""
+    k = max(1, round(SMOOTH / ticks.dt))
+    both = np.convolve(valid, np.ones(k + 1), mode="valid") > k
+    if both.sum() < 2 * k:
+        return {}
+
+    def mean(x: np.ndarray) -> np.ndarray:
+        total = np.cumsum(np.concatenate([np.zeros((1, x.shape[1])), 0.5 * (x[1:] + x[:-1])]), axis=0)
+        return np.asarray(((total[k:] - total[:-k]) / k)[both])
+
+    scores = dict[str, float]()
+    moved, told = ((ticks.p[k:] - ticks.p[:-k]) / (k * ticks.dt))[both], mean(ticks.v)
+    independent = chosen.position is not None and chosen.velocity is not None
+    if independent and max(_rms(moved), _rms(told)) > MOVES:
+        scores["motion"] = _explained(moved, told)
+    felt, axis = mean(ticks.a + UP), mean(ticks.R[:, :, 2])
+    scores["lift"] = _lift(felt, axis)
+    along = np.sum(felt * axis, axis=1)
+    if (scale := chosen.thrust.scale) is not None:
+        given = scale * float(np.median(mean(ticks.thrust[:, None])))
+        scores["thrust"] = 1.0 - abs(np.log2(max(given, 1e-6) / max(float(np.median(np.abs(along))), 1e-6)))
+    if float(np.std(along)) > CLIMBS:
+        late = max(1, round(LATE / ticks.dt))
+        shifts = [np.concatenate([np.full(lag, ticks.thrust[0]), ticks.thrust])[: len(ticks.t)] for lag in range(late)]
+        scores["climb"] = max(_correlation(along, mean(each[:, None])[:, 0]) for each in shifts)
+    turned = mean(turning(ticks.R, ticks.dt))
+    for name, rates in (("turning", ticks.command), ("gyroscope", ticks.rates if ticks.gyroscope else None)):
+        if rates is not None and max(_rms(mean(rates)), _rms(turned)) > TURNS:
+            scores[name] = _turning(turned, mean(rates))
+    return scores
+
+
+def _lift(felt: np.ndarray, axis: np.ndarray) -> float:
+    """Return how far what is felt lies along the thrust axis, and how far it leans as the axis does."""
+    aligned = float(np.mean(np.sum(felt * axis, axis=1) / np.maximum(np.linalg.norm(felt, axis=1), 1e-9)))
+    sideways, tilt = (x[:, :2] - x[:, :2].mean(axis=0) for x in (felt, axis))
+    if _rms(tilt) <= TILTS:
+        return aligned
+    found = [float(np.sum(sideways * tilt) / max(np.linalg.norm(sideways) * np.linalg.norm(tilt), 1e-12))]
+    for x, y in zip(sideways.T, tilt.T, strict=True):
+        if np.std(y) > TILTS and np.sum(y**2) > SHARE * np.sum(tilt**2):
+            found.append(_correlation(x, y))
+    return min(aligned, *found)
+
+
+def _turning(turned: np.ndarray, rates: np.ndarray) -> float:
+    """Return how far rates are alike, all axes together and each that turns by itself."""
+    found = [_alike(turned, rates)]
+    for x, y in zip(turned.T, rates.T, strict=True):
+        energy = max(float(np.sum(x**2)), float(np.sum(y**2)))
+        if np.sqrt(energy / len(x)) > TURNS_AXIS and energy > SHARE * np.sum(turned**2):
+            found.append(_alike(x, y))
+    return min(found)
+
+
+def _rms(x: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.sum(x**2, axis=1))))
+
+
+def _explained(x: np.ndarray, by: np.ndarray) -> float:
+    """Return the share of the larger of both that they have in common."""
+    return 1.0 - float(np.sum((x - by) ** 2) / max(np.sum(x**2), np.sum(by**2), 1e-12))
+
+
+def _alike(x: np.ndarray, by: np.ndarray) -> float:
+    """Return the correlation, times the ratio of the sizes: a lag is no disagreement."""
+    small, large = sorted((float(np.linalg.norm(x)), float(np.linalg.norm(by))))
+    return float(np.sum(x * by)) / max(small * large, 1e-12) * float(np.sqrt(small / max(large, 1e-12)))
+
+
+def _correlation(x: np.ndarray, y: np.ndarray) -> float:
+    """Return the correlation; that with a constant is nothing."""
+    x, y = x - x.mean(), y - y.mean()
+    size = float(np.linalg.norm(x) * np.linalg.norm(y))
+    return 0.0 if np.std(y) < 1e-9 else float(np.sum(x * y)) / max(size, 1e-12)

@@ -1,0 +1,86 @@
+"""Which ticks of a log are flight, with everything known: what is left out, and why."""
+
+from pathlib import Path
+
+import numpy as np
+
+from ...errors import LogError
+from .ground import on_ground
+from .jumps import jumps_of
+from .marks import Marks
+from .on_one_clock import Ticks
+from .resampling import around, runs
+
+LEAST = 1.0  # [s] of flight
+JUMP = 15.0  # [m/s] beyond the speed of the vehicle: a position that moves faster has jumped
+ENDS = 2  # ticks at each end, and beside a jump, that have no derivative
+FROZEN = 0.3  # [s] for which the position of a vehicle in the air has not changed
+
+
+def flight_part(path: Path, ticks: Ticks, marks: Marks, *, measured_position: bool) -> tuple[np.ndarray, list[str]]:
+    """Return where the vehicle flies and everything is known, with notes on what is left out.
+
+    Args:
+        path: For messages.
+        ticks: The log on one clock.
+        marks: What its autopilot says.
+        measured_position: Whether the log has positions.
+
+    Raises:
+        LogError: Hardly anything is left.
+    """
+    notes, dt, valid = list[str](), ticks.dt, ticks.known.copy()
+    most, least = ticks.thrust[ticks.known].max(initial=-np.inf), ticks.thrust[ticks.known].min(initial=np.inf)
+    if most == least == 0.0:
+        raise LogError(f"{path}: thrust is 0 throughout; thrust.fields must name the command that is in use")
+    if most <= 0.0 and ticks.known.any():
+        raise LogError(f'{path}: thrust is never above zero; if it points downwards the map must say positive = "down"')
+    for name, holds in marks.holds.items():
+        if lost := float(np.sum(~holds) * dt):
+            notes.append(f"{name} was not valid for {lost:.1f} s, which are left out")
+        valid &= around(holds, ENDS)
+    ground = on_ground(ticks) if valid.any() else np.zeros(len(valid), dtype=bool)
+    ground |= marks.landed
+    if (stood := float(np.sum(ground) * dt)) > 0.5:
+        said = f" (its land detector says {np.sum(marks.landed) * dt:.1f} s)" if marks.landed.any() else ""
+        notes.append(f"{stood:.1f} s on the ground{said} are left out")
+    valid &= ~ground
+    for name in ("velocity", "attitude"):
+        told, seen = marks.resets.get(name, np.zeros(len(valid), dtype=bool)), jumps_of(ticks, name)
+        if (both := (told | seen) & valid).any():
+            notes.append(
+                f"{name} jumps {np.sum(both)} times ({np.sum(told & both)} resets by its counter); what is around is "
+                f"left out"
+            )
+        valid &= around(~(told | seen), ENDS)
+    if measured_position:
+        more, said_too = _moves(path, ticks, ~ground, marks)
+        valid &= more
+        notes += said_too
+    if np.sum(valid) * dt < LEAST:
+        why = f" ({'; '.join(notes)})" if notes else ""
+        raise LogError(f"{path}: {np.sum(valid) * dt:.2f} s of flight are left, at least {LEAST:g} s are needed{why}")
+    return valid, notes
+
+
+def _moves(path: Path, ticks: Ticks, airborne: np.ndarray, marks: Marks) -> tuple[np.ndarray, list[str]]:
+    """Return where positions neither jump nor freeze."""
+    notes, dt = list[str](), ticks.dt
+    moved = np.diff(ticks.p, axis=0) - 0.5 * dt * (ticks.v[1:] + ticks.v[:-1])
+    jumps = np.concatenate([[False], np.linalg.norm(moved, axis=1) > JUMP * dt + 0.05])
+    still = np.concatenate([[False], np.all(np.diff(ticks.p, axis=0) == 0.0, axis=1)])
+    frozen = runs(still, max(2, round(FROZEN / dt))) & airborne
+    if airborne.any() and np.mean(frozen[airborne]) > 0.5:
+        raise LogError(f"{path}: position does not change for {np.sum(frozen) * dt:.1f} s of the flight")
+    if frozen.any():
+        notes.append(f"position does not change for {np.sum(frozen) * dt:.2f} s in the air, which are left out")
+    if np.mean(jumps) > 0.2:
+        raise LogError(
+            f"{path}: position moves {np.median(np.linalg.norm(moved, axis=1)) / dt:.3g} m/s faster than velocity says "
+            f"in {100 * np.mean(jumps):.0f} % of the flight; are the units right?"
+        )
+    jumps |= marks.resets.get("position", np.zeros(len(jumps), dtype=bool))
+    if (seen := jumps[1:] & airborne[1:]).any():
+        far = np.linalg.norm(moved, axis=1)[seen].max()
+        notes.append(f"position jumps {np.sum(seen)} times, by up to {far:.2f} m; what is around it is left out")
+    return ~frozen & around(~jumps, ENDS), notes

@@ -1,0 +1,55 @@
+"""Where a vehicle stands on the ground: it does not move although its thrust is less than hover takes."""
+
+import numpy as np
+
+from ...physics.state import STANDARD_GRAVITY
+from .on_one_clock import UP, Ticks
+from .resampling import runs, smoothed
+
+FLIES = 0.3  # share of the largest thrusts below which a vehicle is not in the air
+AROUND, LASTS = 0.3, 0.5  # [s] of which means are taken, and that a contact lasts at least
+STILL, AT_REST = 0.2, 0.1  # [m/s]: a vehicle in contact, and one that has not yet left its place, are slower
+STEADY, TURNS = 1.0, 0.2  # [m/s^2], [rad/s]: a vehicle in contact accelerates and turns less
+CARRIES = 0.85  # share of the thrust of hover that carries no vehicle
+PLACE = 0.05  # [m] of height about that of the contact
+MOVES, HIGH = 0.3, 0.3  # [m/s], [m] above the lowest place: such a vehicle flies
+ENOUGH = 2.0  # [s] of flight that tell the thrust of hover
+
+
+def on_ground(ticks: Ticks) -> np.ndarray:
+    """Return where a vehicle is not in the air, (n,)."""
+    thrust = smoothed(ticks.thrust, max(1, round(1.0 / ticks.dt)))
+    idle = thrust <= FLIES * np.percentile(thrust[ticks.known], 95)
+    rows = max(1, round(AROUND / ticks.dt))
+    speed, push, turn = (
+        np.linalg.norm(np.stack([smoothed(column, rows) for column in x.T], axis=1), axis=1)
+        for x in (ticks.v, ticks.a, ticks.rates)
+    )
+    hover = _hover(ticks, ~idle & ticks.known, speed)
+    lift = smoothed(ticks.thrust * ticks.R[:, 2, 2], rows)
+    stands = (speed < STILL) & (push < STEADY) & (turn < TURNS)
+    z = ticks.p[:, 2]
+    contact = runs(stands & (lift < CARRIES * hover), max(1, round(LASTS / ticks.dt)))
+    for first, last in _spans(np.minimum(speed, np.linalg.norm(ticks.v, axis=1)) < AT_REST):
+        part = slice(first, last)
+        if contact[part].any():
+            height = float(np.median(z[part][contact[part]]))
+            contact[part] |= np.abs(z[part] - height) < PLACE
+    return np.asarray(idle | contact)
+
+
+def _hover(ticks: Ticks, candidates: np.ndarray, speed: np.ndarray) -> float:
+    """Return the thrust at hover, in the unit of the log, from where the vehicle surely flies."""
+    if not candidates.any():
+        return 0.0
+    z = ticks.p[:, 2]
+    flies = candidates & ((speed > MOVES) | (z > np.percentile(z[candidates], 5) + HIGH))
+    if np.sum(flies) * ticks.dt < ENOUGH:
+        flies = candidates
+    upwards = np.maximum((ticks.a + UP)[flies, 2], 0.3 * STANDARD_GRAVITY)  # wind pushes sideways
+    return float(np.median(ticks.thrust[flies] * ticks.R[flies, 2, 2] * STANDARD_GRAVITY / upwards))
+
+
+def _spans(flags: np.ndarray) -> list[tuple[int, int]]:
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(int), [0]])))
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))

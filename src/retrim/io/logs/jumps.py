@@ -1,0 +1,33 @@
+"""Ticks at which an estimate jumps though no vehicle moves so: resets of an estimator, swapped markers."""
+
+import numpy as np
+
+from .on_one_clock import Ticks
+
+LEAST = {"velocity": 4.0, "attitude": 4.0}  # [m/s^2], [rad/s] by which one tick must stand out from those around it
+BEYOND = 8.0  # times the noise
+BESIDE = 2  # ticks before and after with which one is compared: one sample in two ticks is spread over both
+
+
+def jumps_of(ticks: Ticks, name: str) -> np.ndarray:
+    """Return the ticks since whose one before a velocity or an attitude has jumped, (n,).
+
+    A step of an estimate is one tick of an acceleration, or of a rate, that is there neither before nor after.
+    """
+    from scipy.spatial.transform import Rotation  # here: it takes as long to import as all of retrim
+
+    if name == "velocity":
+        steps = np.diff(ticks.v, axis=0) / ticks.dt
+    else:
+        steps = Rotation.from_matrix(np.swapaxes(ticks.R[:-1], 1, 2) @ ticks.R[1:]).as_rotvec() / ticks.dt
+    if len(steps) < 4 * BESIDE:
+        return np.zeros(len(ticks.t), dtype=bool)
+    middle = steps[BESIDE:-BESIDE]
+    before, after = middle - steps[: -2 * BESIDE], middle - steps[2 * BESIDE :]
+    stands_out = np.where(before * after > 0.0, np.minimum(np.abs(before), np.abs(after)), 0.0)
+    known = (ticks.known[1:] & ticks.known[:-1])[BESIDE:-BESIDE]
+    bent = np.abs(0.5 * (before + after))[known] if known.any() else np.zeros((1, 3))
+    limit = np.maximum(LEAST[name], BEYOND * 1.4826 * np.median(bent, axis=0))
+    found = np.zeros(len(ticks.t), dtype=bool)
+    found[BESIDE + 1 : -BESIDE] = np.any(stands_out > limit, axis=1)
+    return found

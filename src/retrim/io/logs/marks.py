@@ -1,0 +1,60 @@
+"""What an autopilot says of its own estimates: where they hold, where they are reset, and whether it has landed."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from .log_map import LogMap
+from .series import Series
+
+QUANTITIES = ("position", "velocity", "attitude")
+
+
+@dataclass(frozen=True)
+class Marks:
+    """On the ticks of a grid."""
+
+    holds: Mapping[str, np.ndarray]
+    """Where a quantity holds, (n,); quantities without flags are not in it."""
+    resets: Mapping[str, np.ndarray]
+    """Where a quantity was reset since the tick before, (n,)."""
+    landed: np.ndarray
+    """Where the vehicle is on the ground, (n,); nowhere if the log does not say."""
+
+
+def marks_of(log_map: LogMap, series: Mapping[str, Series], t: np.ndarray) -> Marks:
+    """Return the marks of a log at the times of a grid."""
+    holds, resets = dict[str, np.ndarray](), dict[str, np.ndarray]()
+    for name in QUANTITIES:
+        spec = getattr(log_map, name)
+        for k, field in enumerate(getattr(spec, "valid", ())):
+            if (flag := series.get(f"{name} valid {k}")) is not None:
+                before, after = _around(flag, t)
+                good = _true(before, field) & _true(after, field)
+                holds[name] = holds.get(name, np.ones(len(t), dtype=bool)) & good
+        for k in range(len(getattr(spec, "resets", ()))):
+            if (counter := series.get(f"{name} resets {k}")) is not None:
+                count = _around(counter, t)[0]
+                changed = np.concatenate([[False], np.diff(count) != 0.0])
+                resets[name] = resets.get(name, np.zeros(len(t), dtype=bool)) | changed
+    landed = np.zeros(len(t), dtype=bool)
+    if log_map.landed is not None:
+        for k, field in enumerate(log_map.landed.fields):
+            if (flag := series.get(f"landed {k}")) is not None:
+                landed |= _true(_around(flag, t)[0], field)
+    return Marks(holds, resets, landed)
+
+
+def _around(series: Series, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the values of the samples before, or at, each time and after, or at, it."""
+    last = len(series.t) - 1
+    before = np.clip(np.searchsorted(series.t, t, side="right") - 1, 0, last)
+    after = np.clip(np.searchsorted(series.t, t, side="left"), 0, last)
+    return series.values[before, 0], series.values[after, 0]
+
+
+def _true(values: np.ndarray, field: str) -> np.ndarray:
+    """Return where a flag is set: not zero, or the number that its field is compared with, as ``state==1``."""
+    number = field.partition("==")[2]
+    return np.asarray(values == float(number) if number else values != 0.0)

@@ -1,0 +1,59 @@
+"""Times of the messages of a bag: their own stamps where they have some, all on one clock."""
+
+from collections.abc import Mapping
+from operator import attrgetter
+from typing import Any
+
+import numpy as np
+
+from .series import Clock
+
+MICROSECOND, NANOSECOND = 1e-6, 1e-9
+APART = 1.0  # [s] between clocks that are not the same
+EARLY = 5.0  # percentile of delays that counts as the delay of a message that is not held up
+
+
+def stamp_of(message: Any, time: Clock | None) -> float:
+    """Return the time of a message by itself [s]: of the map's field, of the header, of PX4; NaN if it has none."""
+    stamps = [] if time is None else [(time.field, time.scale)]
+    stamps += [("header.stamp", NANOSECOND), ("stamp", NANOSECOND)]
+    if str(getattr(message, "__msgtype__", "")).startswith("px4_msgs/"):
+        stamps += [("timestamp_sample", MICROSECOND), ("timestamp", MICROSECOND)]
+    for field, scale in stamps:
+        try:
+            value = attrgetter(field)(message)
+        except AttributeError:
+            continue
+        if hasattr(value, "sec"):
+            value, scale = value.sec * 10**9 + value.nanosec, NANOSECOND
+        if isinstance(value, (int, float, np.number)) and value != 0:
+            return scale * float(value)
+    return float("nan")
+
+
+def on_one_time(stamps: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Return the times of each topic on one clock, and notes.
+
+    A topic whose messages have no stamp has the times of reception. Where others are stamped by another clock, as that
+    of an autopilot since it started, they are brought to the clock of the recorder by the messages that came first.
+
+    Args:
+        stamps: Of each topic, stamp (NaN without one) and reception of each message [s], (n, 2).
+    """
+    times, notes, ahead = dict[str, np.ndarray](), list[str](), dict[str, float]()
+    for topic, both in stamps.items():
+        stamp, received = both.T
+        if np.mean(np.isnan(stamp)) > 0.5:
+            times[topic] = received
+            notes.append(f"{topic} has no stamps; its times are those of reception")
+        else:
+            times[topic] = stamp
+            ahead[topic] = float(np.nanpercentile(received - stamp, EARLY))
+    alike = not ahead or max(ahead.values()) - min(ahead.values()) < APART
+    if len(ahead) < len(times):
+        alike = alike and all(abs(shift) < APART for shift in ahead.values())
+    if not alike:
+        for topic, shift in ahead.items():
+            times[topic] = times[topic] + shift
+        notes.append("topics have clocks of their own, and are brought to that of the recorder")
+    return times, notes

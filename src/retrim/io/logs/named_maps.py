@@ -1,0 +1,38 @@
+"""Maps by name, TOML files beside this one: of what retrim and usual autopilots write."""
+
+import tomllib
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+
+from ...config.validation import read_toml, validated
+from .log_map import LogMap
+
+USUAL: dict[str, tuple[str, ...]] = {
+    ".npz": ("retrim-npz",),
+    ".csv": ("retrim-csv", "crazyflie", "crazyflie-quaternion", "crazyswarm", "crazyswarm-quaternion"),
+    ".ulg": ("px4", "px4-1.9"),
+    ".bag": ("mavros", "mavros-pose", "crazyswarm-ros"),
+    ".mcap": ("retrim-mcap", "px4-dds", "px4-dds-1.13", "mavros", "mavros-pose", "crazyswarm-ros"),
+}
+"""What a log is taken for without a map, by the end of its name: the first that it has the fields of."""
+USUAL |= {".ulog": USUAL[".ulg"], ".db3": USUAL[".mcap"], "": USUAL[".mcap"]}
+
+
+@cache
+def names() -> tuple[str, ...]:
+    """Return the names of all maps."""
+    folder = files(__package__) / "maps"
+    return tuple(sorted(each.name.removesuffix(".toml") for each in folder.iterdir() if each.name.endswith(".toml")))
+
+
+def read_map(source: str | Path) -> LogMap:
+    """Return a map by name, or from a TOML file.
+
+    Raises:
+        ConfigError: The file cannot be read, or a value is missing, unknown or impossible.
+    """
+    if str(source) in names():
+        text = (files(__package__) / "maps" / f"{source}.toml").read_text(encoding="utf-8")
+        return validated(LogMap, tomllib.loads(text), source=f"map {source}")
+    return validated(LogMap, read_toml(Path(source)), source=str(source))

@@ -1,0 +1,149 @@
+"""The quantities that a map names, as they are in the file: series in order, and which map that was."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...errors import LogError
+from .csv_file import read_csv
+from .log_map import METRES, SECONDS, LogMap
+from .named_maps import USUAL, names, read_map
+from .npz_file import read_npz
+from .ros_bag import read_bag
+from .series import Clock, LogReader, Series
+from .smoothing import slope_of
+from .times import in_order
+from .ulog_file import read_ulog
+
+READERS: dict[str, LogReader] = {
+    ".csv": read_csv, ".tsv": read_csv, ".txt": read_csv, ".npz": read_npz, ".ulg": read_ulog, ".ulog": read_ulog,
+    ".bag": read_bag, ".mcap": read_bag, ".db3": read_bag,
+}  # fmt: skip
+"""By the end of the name; a folder is a bag of ROS 2."""
+CONVERTERS = {
+    ".bbl": "blackbox_decode of blackbox-tools makes a CSV of it",
+    ".bfl": "blackbox_decode of blackbox-tools makes a CSV of it",
+    ".bin": "mavlogdump.py --format csv of pymavlink makes a CSV of a dataflash log of ArduPilot",
+    ".tlog": "mavlogdump.py --format csv of pymavlink makes a CSV of it",
+    ".px4log": "sdlog2_dump.py of PX4 makes a CSV of a log of before 1.4",
+    ".mat": "scipy.io.loadmat and numpy.savez make an NPZ of it",
+    ".h5": "h5py and numpy.savez make an NPZ of it",
+    ".parquet": "pandas makes a CSV of it",
+}
+QUANTITIES = ("position", "velocity", "attitude", "thrust", "rates", "measured_rates", "acceleration")
+FLAGS = ("valid", "resets")
+
+
+def read_quantities(path: Path, log_map: LogMap | None) -> tuple[dict[str, Series], LogMap, list[str]]:
+    """Return the series of a log, the map that it was read with, and notes.
+
+    Beside the quantities there are ``<quantity> valid <k>``, ``<quantity> resets <k>`` and ``landed <k>``, and a
+    velocity without one in the log.
+
+    Raises:
+        LogError: The file cannot be read, or a field is not there.
+    """
+    reader = _reader(path)
+    raw, chosen, notes = _read(path, reader, log_map)
+    age, clock = raw.pop("age", None), _clock(chosen)
+    if age is not None and clock is not None:  # as old as the log says, they were true earlier
+        for name in ("position", "velocity", "attitude"):
+            if name in raw:
+                raw[name] = Series(raw[name].t - clock.scale * age.values[:, 0], raw[name].values)
+    for name in ("rates", "measured_rates"):
+        if name in raw and not np.any(raw[name].values):
+            del raw[name]
+            notes.append(f"{name} are 0 throughout, and are not used")
+    series = dict[str, Series]()
+    for name, each in raw.items():
+        series[name], more = in_order(each, name, path)
+        notes += [note for note in more if name in QUANTITIES]
+    if "velocity" not in series:
+        series["velocity"], said = slope_of(
+            path, _valid(series, "position"), METRES[getattr(chosen.position, "unit", "m")]
+        )
+        notes.append(said)
+        for name in ("position", "attitude"):  # the ends have no velocity
+            there = np.isin(series[name].t, series["velocity"].t)
+            if np.sum(there) == len(series["velocity"].t):
+                series[name] = Series(series[name].t[there], series[name].values[there])
+    elif "position" not in series:
+        notes.append("positions are the integral of the velocities")
+    return series, chosen, notes
+
+
+def _read(path: Path, reader: LogReader, log_map: LogMap | None) -> tuple[dict[str, Series], LogMap, list[str]]:
+    first: LogError | None = None
+    for chosen in [log_map] if log_map is not None else map(read_map, _usual(path)):
+        wanted, optional = _wanted(chosen)
+        try:
+            raw, notes = reader(path, wanted, _clock(chosen), optional)
+        except LogError as error:
+            if log_map is not None or "no field" not in str(error):
+                raise
+            first = first or error
+        else:
+            return raw, chosen, notes
+    usual = " or ".join(repr(name) for name in _usual(path))
+    raise LogError(f"{first}; without a map it is read as {usual}: give --map map.toml") from first
+
+
+def _wanted(chosen: LogMap) -> tuple[dict[str, tuple[str, ...]], set[str]]:
+    """Return the fields of each quantity and mark, and which of these may be missing."""
+    wanted, optional = dict[str, tuple[str, ...]](), set[str]()
+    marks = dict[str, tuple[str, ...]]()
+    for name in QUANTITIES:
+        spec: Any = getattr(chosen, name)
+        if spec is None:
+            continue
+        wanted[name] = tuple(spec.fields)
+        optional |= {name} if getattr(spec, "optional", False) else set()
+        for flag in FLAGS:
+            marks[f"{name} {flag}"] = getattr(spec, flag, ())
+    marks["landed"] = () if chosen.landed is None else chosen.landed.fields
+    for name, fields in marks.items():
+        for k, field in enumerate(fields):
+            wanted[f"{name} {k}"] = (field.partition("==")[0],)
+            optional.add(f"{name} {k}")
+    if isinstance(chosen.thrust.hover, str):
+        wanted["hover"] = (chosen.thrust.hover,)
+    if chosen.time is not None and chosen.time.age is not None:
+        wanted["age"] = (chosen.time.age,)
+    return wanted, optional
+
+
+def _clock(chosen: LogMap) -> Clock | None:
+    return None if chosen.time is None else Clock(chosen.time.field, SECONDS[chosen.time.unit])
+
+
+def _valid(series: dict[str, Series], name: str) -> Series:
+    """Return the samples of a quantity that its flags at the same times do not call invalid."""
+    found = series[name]
+    keep = np.ones(len(found.t), dtype=bool)
+    for other, flag in series.items():
+        if other.startswith(f"{name} valid"):
+            keep &= flag.values[np.clip(np.searchsorted(flag.t, found.t, side="right") - 1, 0, None), 0] != 0.0
+    return Series(found.t[keep], found.values[keep])
+
+
+def _reader(path: Path) -> LogReader:
+    if not path.exists():
+        raise LogError(f"{path}: no such file")
+    if path.is_dir():
+        return read_bag
+    suffix = path.suffix.lower()
+    if suffix in CONVERTERS:
+        raise LogError(f"{path}: {suffix} is not read; {CONVERTERS[suffix]}, to be read with --map map.toml")
+    if suffix not in READERS:
+        raise LogError(f"{path}: no log that is known; there are {', '.join(READERS)}, and folders of ROS 2")
+    if path.stat().st_size == 0:
+        raise LogError(f"{path}: it is empty")
+    return READERS[suffix]
+
+
+def _usual(path: Path) -> tuple[str, ...]:
+    usual = USUAL.get("" if path.is_dir() else path.suffix.lower())
+    if usual is None:
+        raise LogError(f"{path}: say what is where in it, as --map map.toml; maps by name: {', '.join(names())}")
+    return usual

@@ -1,0 +1,35 @@
+"""From the thrust of a log to that of the model: mass-normalised, and what all of it gives."""
+
+from pathlib import Path
+
+import numpy as np
+
+from ...errors import LogError
+from ...physics.state import STANDARD_GRAVITY
+from .log_map import Thrust
+from .on_one_clock import UP, Ticks
+
+
+def mass_normalised(
+    path: Path, spec: Thrust, ticks: Ticks, valid: np.ndarray
+) -> tuple[np.ndarray, float | None, list[str]]:
+    """Return the thrust [m/s^2], what all of it gives if it was a share, and notes.
+
+    Raises:
+        LogError: The thrust at hover that the log tells is not positive.
+    """
+    if spec.scale is not None:
+        return spec.scale * ticks.thrust, None, []
+    if spec.hover is None:
+        felt = ticks.a[valid] + UP
+        along, share = np.sum(felt * ticks.R[valid, :, 2], axis=1), ticks.thrust[valid]
+        full = float(np.sum(share * along) / np.sum(share**2))
+        if full <= 0.0:
+            raise LogError(f"{path}: the more thrust, the less acceleration along its axis; is it the right field?")
+        hover = spec.full * STANDARD_GRAVITY / full
+        said = f"{hover:.3f}" if spec.full == 1.0 else f"{hover:.5g}"
+        return full * ticks.thrust, full, [f"thrust map found from the flight: hover at {said}"]
+    hovers = ticks.hover if ticks.hover is not None else np.full(len(ticks.t), float(spec.hover) / spec.full)
+    if not np.all(hovers[valid] > 0.01):
+        raise LogError(f"{path}: thrust at hover, {spec.hover!r}, is not positive all the time")
+    return STANDARD_GRAVITY * ticks.thrust / hovers, float(STANDARD_GRAVITY / np.median(hovers[valid])), []
