@@ -28,12 +28,12 @@ class Flown:
     omega: np.ndarray
 
 
-def flown(seconds=30.0, dt=0.02, wind=(0.0, 0.0, 0.0), gain=1.0, seed=0):
+def flown(seconds=30.0, dt=0.02, wind=(0.0, 0.0, 0.0), gain=1.0, seed=0, size=1.0):
     """A lively flight: sums of sines, thrust as flatness says, heading that turns; ``wind`` is a constant push."""
     rng = np.random.default_rng(seed)
     t = dt * np.arange(round(seconds / dt) + 1)
     waves = 2 * np.pi * rng.uniform(0.1, 0.45, size=(3, 4))
-    size = np.array([0.5, 0.5, 0.25])[:, None] * rng.uniform(0.5, 1.0, size=(3, 4))
+    size = size * np.array([0.5, 0.5, 0.25])[:, None] * rng.uniform(0.5, 1.0, size=(3, 4))
     phase = rng.uniform(0, 2 * np.pi, size=(3, 4))
     angle = waves[None] * t[:, None, None] + phase[None]
     p = np.sum(size * np.sin(angle), axis=2) + np.array([0.0, 0.0, 2.0])

@@ -288,7 +288,7 @@ DAMAGED_TABLES = {
     "rates against": (negated("wx", "wy", "wz"), "does not turn as it is told"),
     "thrust downwards": (negated("c"), 'thrust is never above zero.*positive = "down"'),
     "thrust in g": (scaled(1 / 9.80665, "c"), 'thrust.unit = "g" they would'),
-    "thrust of nothing": (scaled(0.0, "c"), "thrust is never above zero"),
+    "thrust of nothing": (scaled(0.0, "c"), "thrust is 0 throughout; thrust.fields must name"),
     "position does not change": (still, "position"),
     "positions of another time": (other_time, "position"),
 }
@@ -400,11 +400,20 @@ def test_what_is_no_log_is_named(tmp_path):
         with pytest.raises(LogError, match=said):
             read_flight_log(path, read_map(named))
     path = write_csv(tmp_path / "log.csv", columns(flown(2.0)))
-    with pytest.raises(LogError, match=r"no field 'x0'.*without a map it is read as 'retrim-csv': give --map"):
+    with pytest.raises(
+        LogError, match=r"no field 'x0'.*without a map it is read as 'retrim-csv' or 'crazyflie'.*: give --map"
+    ):
         read_flight_log(path)
     with pytest.raises(LogError, match="no such file"):
         read_flight_log(tmp_path / "nowhere.csv")
-    with pytest.raises(LogError, match="say what is where"):
+    (tmp_path / "log.txt").write_text("t\n1\n")
+    with pytest.raises(LogError, match=r"say what is where.* maps by name: crazyflie, "):
+        read_flight_log(tmp_path / "log.txt")
+    for name, said in (("a.bbl", "blackbox_decode"), ("a.BIN", "mavlogdump.py"), ("a.px4log", "sdlog2_dump.py")):
+        (tmp_path / name).write_bytes(b"1")
+        with pytest.raises(LogError, match=rf"is not read; {said} .* makes a CSV.*--map map.toml"):
+            read_flight_log(tmp_path / name)
+    with pytest.raises(LogError, match="cannot be read as a bag"):
         read_flight_log(tmp_path)
     with pytest.raises(LogError, match="cannot be read as a bag"):
         read_flight_log(tmp_path, read_map("retrim-mcap"))

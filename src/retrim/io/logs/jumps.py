@@ -22,12 +22,13 @@ def jumps_of(ticks: Ticks, name: str) -> np.ndarray:
         steps = Rotation.from_matrix(np.swapaxes(ticks.R[:-1], 1, 2) @ ticks.R[1:]).as_rotvec() / ticks.dt
     if len(steps) < 4 * BESIDE:
         return np.zeros(len(ticks.t), dtype=bool)
-    middle = steps[BESIDE:-BESIDE]
-    before, after = middle - steps[: -2 * BESIDE], middle - steps[2 * BESIDE :]
+    before, after = np.full_like(steps, np.nan), np.full_like(steps, np.nan)
+    before[BESIDE:] = steps[BESIDE:] - steps[:-BESIDE]
+    after[:-BESIDE] = steps[:-BESIDE] - steps[BESIDE:]
+    before, after = np.where(np.isnan(before), after, before), np.where(np.isnan(after), before, after)  # at the ends
     stands_out = np.where(before * after > 0.0, np.minimum(np.abs(before), np.abs(after)), 0.0)
-    known = (ticks.known[1:] & ticks.known[:-1])[BESIDE:-BESIDE]
+    known = ticks.known[1:] & ticks.known[:-1]
     bent = np.abs(0.5 * (before + after))[known] if known.any() else np.zeros((1, 3))
     limit = np.maximum(LEAST[name], BEYOND * 1.4826 * np.median(bent, axis=0))
-    found = np.zeros(len(ticks.t), dtype=bool)
-    found[BESIDE + 1 : -BESIDE] = np.any(stands_out > limit, axis=1)
+    found = np.concatenate([[False], np.any(stands_out > limit, axis=1)])
     return found

@@ -14,7 +14,11 @@ EARLY = 5.0  # percentile of delays that counts as the delay of a message that i
 
 
 def stamp_of(message: Any, time: Clock | None) -> float:
-    """Return the time of a message by itself [s]: of the map's field, of the header, of PX4; NaN if it has none."""
+    """Return the time of a message by itself [s]: of the map's field, of the header, of PX4.
+
+    Zero is a stamp that was not set, or the beginning of a simulation; NaN is that of a message without a stamp.
+    """
+    found = float("nan")
     stamps = [] if time is None else [(time.field, time.scale)]
     stamps += [("header.stamp", NANOSECOND), ("stamp", NANOSECOND)]
     if str(getattr(message, "__msgtype__", "")).startswith("px4_msgs/"):
@@ -26,9 +30,11 @@ def stamp_of(message: Any, time: Clock | None) -> float:
             continue
         if hasattr(value, "sec"):
             value, scale = value.sec * 10**9 + value.nanosec, NANOSECOND
-        if isinstance(value, (int, float, np.number)) and value != 0:
-            return scale * float(value)
-    return float("nan")
+        if isinstance(value, (int, float, np.number)):
+            found = scale * float(value)
+        if found > 0.0:
+            break
+    return found
 
 
 def on_one_time(stamps: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray], list[str]]:
@@ -43,7 +49,7 @@ def on_one_time(stamps: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray]
     times, notes, ahead = dict[str, np.ndarray](), list[str](), dict[str, float]()
     for topic, both in stamps.items():
         stamp, received = both.T
-        if np.mean(np.isnan(stamp)) > 0.5:
+        if np.mean(np.isnan(stamp) | (stamp == 0.0)) > 0.5:
             times[topic] = received
             notes.append(f"{topic} has no stamps; its times are those of reception")
         else:
