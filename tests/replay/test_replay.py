@@ -23,7 +23,7 @@ from retrim.io.trained import save_policy
 from retrim.replay import identification
 from retrim.replay.adaptation import Adapted, adapt_to
 from retrim.replay.foretelling import Protocol, foretell
-from retrim.replay.identification import Identified
+from retrim.replay.identification import Estimate, Identified
 from retrim.replay.predictors import learnt, mean_of, ridge, yardsticks
 from retrim.replay.replay import Replay, replay
 from retrim.replay.rows import rows_of
@@ -124,7 +124,7 @@ def test_a_slower_log_has_its_own_tick_and_no_policy_adapts_to_it(tmp_path):
     path = write_csv(tmp_path / "log.csv", columns(flown(6.0, dt=1 / 30, wind=PUSH)))
     asked = Replay(map=str(write_map(tmp_path / "map.toml")), buffer=100 / 30, horizon=50 / 30)
     document = replay(path, asked, Run("replay", tmp_path), Silent())
-    assert "a tick of 33.33 ms" in document.sections[0].about
+    assert "a tick of 33.33 ms" in document.sections[1].about
     save_policy(tmp_path / "p.safetensors", Setup.of(tiny_preset()).new_policy(jax.random.key(0)), tiny_preset())
     asked = dataclasses.replace(asked, adapt="full", policy=tmp_path / "p.safetensors")
     with pytest.raises(LogError, match=r"a sample every 33.3 ms, but the policy's tick is 20 ms"):
@@ -161,14 +161,45 @@ drag_area = [0.01, 0.02, 0.03]
 def test_what_a_log_does_not_tell_is_that_of_the_vehicle_file(files, tmp_path, monkeypatch):
     path, chosen = files
     (tmp_path / "heavy.toml").write_text(HEAVY)
-    found = Identified(*[None] * 9, (None, None, None), 0.1)
+    drag = Estimate(0.3, 0.2, 0.4)  # in a comment of the file
+    found = Identified(*[None] * 9, (drag, None, None), 0.1)
     monkeypatch.setattr(replays, "identify", lambda log, seed: found)
     monkeypatch.setattr(replays, "_foretold", lambda *asked: [])
     vehicle = str(tmp_path / "heavy.toml")
     asked = Replay(map=str(chosen), buffer=2.0, horizon=1.0, identify=True, vehicle=vehicle)
     replay(path, asked, Run("replay", tmp_path), Silent())
+    assert "0.3 1/s" in (tmp_path / "vehicle.toml").read_text()
     told, kept = read_vehicle(tmp_path / "vehicle.toml"), read_vehicle(tmp_path / "heavy.toml")
     assert told == dataclasses.replace(kept, name="heavy-identified")
+
+
+def test_no_vehicle_file_is_written_of_a_log_that_says_nothing(brief, files, tmp_path, monkeypatch):
+    monkeypatch.setattr(replays, "identify", lambda log, seed: Identified(*[None] * 9, (None, None, None), 0.1))
+    monkeypatch.setattr(replays, "_foretold", lambda *asked: [])
+    asked = Replay(map=str(files[1]), buffer=2.0, horizon=1.0, identify=True)
+    document = replay(brief, asked, Run("replay", tmp_path), Silent())
+    assert "no vehicle file is written" in document.sections[-1].about
+    assert not (tmp_path / "vehicle.toml").exists()
+
+
+def test_a_report_begins_with_what_is_doubtful_and_shows_every_figure(tmp_path, monkeypatch):
+    """A column that is not the thrust, as a battery's voltage; then the thrust."""
+    monkeypatch.setattr(replays, "_foretold", lambda *asked: [])
+    flight = flown(7.0, size=3.0)
+    chosen = write_map(tmp_path / "map.toml", thrust__unit='"share"')
+    said = []
+    for name, column in (("voltage", 4.1 - 0.01 * flight.t), ("thrust", 0.05 * flight.c)):
+        path = write_csv(tmp_path / f"{name}.csv", columns(flight) | {"c": column})
+        run = Run("replay", tmp_path / name)
+        document = replay(path, Replay(map=str(chosen), buffer=2.0, horizon=1.0), run, Silent())
+        said.append((tmp_path / name / "replay.md").read_text())
+        figures = {row[0]: row[1] for row in document.sections[0].rows}
+        assert figures["motion of the position, by the velocity"] == "100 %"
+        stored = json.loads((tmp_path / name / "replay.json").read_text())["agreement"]
+        assert set(stored) == {"motion", "lift", "climb", "turning"}
+    warning = "**Warning: this log agrees badly with itself, and no figure below can be relied on: thrust explains "
+    assert said[0].index(warning) < said[0].index("## ")
+    assert "Warning" not in said[1]
 
 
 def test_a_policy_learns_the_push_of_a_log(files, tmp_path):

@@ -62,6 +62,11 @@ class Identified:
     unexplained: float
     """Root mean square of the acceleration that is left, three axes [m/s^2]."""
 
+    @property
+    def known(self) -> bool:
+        """Whether the log says anything of the vehicle."""
+        return any(isinstance(value, Estimate) for value in (*vars(self).values(), *self.drag))
+
 
 def identify(log: FlightLog, *, seed: int = 0) -> Identified:
     """Identify a vehicle from a flight.

@@ -23,7 +23,7 @@ from .adaptation import adapt_to
 from .foretelling import Foretold, Protocol, foretell
 from .identification import identify
 from .predictors import learnt, yardsticks
-from .report import foretold_section, identified_section, picture, residual_section
+from .report import agreement_section, foretold_section, identified_section, picture, residual_section, warning_of
 from .rows import rows_of
 from .vehicle import vehicle_toml
 
@@ -109,8 +109,11 @@ def replay(path: Path, asked: Replay, run: Run, reporter: Reporter) -> Document:
     rows, protocol = rows_of(log, delay=asked.delay, lag=asked.lag), Protocol(asked.buffer, asked.horizon)
     late = f" Thrust acts {1000 * asked.delay:g} ms late, with a lag of {1000 * asked.lag:g} ms."
     intro = "Residual a - (c R e3 - g e3), world frame." + late * bool(asked.delay or asked.lag)
+    intro = f"{warning_of(log)}\n\n{intro}" if log.warnings else intro
     document = Document(run, "replay", f"Replay of {path.name}", intro,
                         [asked.seed], reporter)  # fmt: skip
+    document.more["agreement"] = dict(log.agreement)
+    document.add(agreement_section(log))
     document.add(residual_section(log, rows))
     found = _foretold(asked, protocol, setup, log, rows, reporter, run)
     if found:
@@ -124,7 +127,8 @@ def replay(path: Path, asked: Replay, run: Run, reporter: Reporter) -> Document:
             advance(1.0, "done")
         document.more["identified"] = tree.map(float, dataclasses.asdict(vehicle))
         document.add(identified_section(vehicle))
-        run.write_text("vehicle.toml", vehicle_toml(vehicle, setup, path.name))
+        if vehicle.known:
+            run.write_text("vehicle.toml", vehicle_toml(vehicle, setup, path.name))
     if policy is not None and not run.interrupted:
         document.add(_adapted(asked, setup, policy, log, rows, run, reporter))
     document.write()

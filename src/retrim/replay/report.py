@@ -7,11 +7,41 @@ import numpy as np
 
 from ..experiments.tables.document import TableSection
 from ..io.logs import FlightLog
+from ..io.logs.plausibility import DOUBTFUL
 from ..learn.residuals.targets import Targets
 from .foretelling import Foretold, Protocol
 from .identification import Estimate, Identified
 
 SMOOTH = 0.3  # [s] over which curves of the picture are averaged
+WORDS = {
+    "motion": "motion of the position, by the velocity",
+    "lift": "sideways acceleration, by the attitude",
+    "thrust": "size of the acceleration along the thrust axis, by the thrust",
+    "climb": "changes of the acceleration along the thrust axis, by the thrust",
+    "turning": "turning, by the commanded rates",
+    "gyroscope": "turning, by the measured rates",
+}
+
+
+def warning_of(log: FlightLog) -> str:
+    """Return what a report on a doubtful log begins with; nothing for one that agrees with itself."""
+    if not log.warnings:
+        return ""
+    said = "; ".join(log.warnings)
+    return f"**Warning: this log agrees badly with itself, and no figure below can be relied on: {said}.**"
+
+
+def agreement_section(log: FlightLog) -> TableSection:
+    """Return how well the quantities of a log agree with each other."""
+    lines = tuple(
+        (WORDS[name], f"{100 * score:.0f} %", f"{100 * DOUBTFUL[name]:.0f} %") for name, score in log.agreement.items()
+    )
+    about = warning_of(log) or (
+        "What one quantity says of another; wind, drag and lags leave something unexplained in every log."
+        if lines
+        else "The vehicle hardly moves: nothing can be told."
+    )
+    return TableSection(("", "agreement", "doubtful below"), lines, "How well the log agrees with itself", about)
 
 
 def residual_section(log: FlightLog, rows: Targets) -> TableSection:
@@ -25,7 +55,7 @@ def residual_section(log: FlightLog, rows: Targets) -> TableSection:
         f"{log.seconds:.1f} s of flight, a tick of {1000 * log.dt:.4g} ms; speed {slow.mean():.2f} m/s on average, "
         f"{slow.max():.2f} m/s at most."
     )
-    said = "".join(f" {note[0].upper()}{note[1:]}." for note in log.notes)
+    said = "".join(f" {note[0].upper()}{note[1:]}." for note in log.notes if note not in log.warnings)
     return TableSection(("residual [m/s^2]", "x", "y", "z", "all"), lines, "What the point mass missed", about + said)
 
 
@@ -68,6 +98,8 @@ def identified_section(found: Identified) -> TableSection:
         ("acceleration left unexplained", f"{found.unexplained:.2f} m/s^2"),
     )
     about = "Estimates with intervals of 90 %, of a bootstrap over blocks of 2 s of the log."
+    if not found.known:
+        about = "The log says nothing of the vehicle, and no vehicle file is written: fly circles and turn the nose."
     return TableSection(("", "estimate"), lines, "What the vehicle is", about)
 
 

@@ -10,11 +10,13 @@ import numpy as np
 
 from .log_map import LogMap
 from .on_one_clock import UP, Ticks, turning
+from .resampling import smoothed
 
 SMOOTH = 0.2  # [s] over which differences are taken
 MOVES, TILTS, TURNS, CLIMBS = 0.15, 0.03, 0.1, 0.5  # [m/s], [rad], [rad/s], [m/s^2]: nothing can be told below
 TURNS_AXIS = 0.3  # [rad/s] of one axis
 SHARE = 0.1  # of the motion of all axes that one axis has if it is looked at by itself
+SLOW = 3.0  # [s]: slower changes, as those of a battery, explain nothing
 LATE = 0.2  # [s] by which an acceleration may follow the thrust
 
 CLAIMS: Mapping[str, str] = {
@@ -50,10 +52,14 @@ def agreement(chosen: LogMap, ticks: Ticks, valid: np.ndarray) -> dict[str, floa
     if (scale := chosen.thrust.scale) is not None:
         given = scale * float(np.median(mean(ticks.thrust[:, None])))
         scores["thrust"] = 1.0 - abs(np.log2(max(given, 1e-6) / max(float(np.median(np.abs(along))), 1e-6)))
-    if float(np.std(along)) > CLIMBS:
+    rows = max(1, round(SLOW / ticks.dt))
+    changes = along - smoothed(along, rows)
+    if float(np.std(changes)) > CLIMBS:
         late = max(1, round(LATE / ticks.dt))
         shifts = [np.concatenate([np.full(lag, ticks.thrust[0]), ticks.thrust])[: len(ticks.t)] for lag in range(late)]
-        scores["climb"] = max(_correlation(along, mean(each[:, None])[:, 0]) for each in shifts)
+        thrusts = [mean(each[:, None])[:, 0] for each in shifts]
+        found = max(_correlation(changes, each - smoothed(each, rows)) for each in thrusts)
+        scores["climb"] = found * abs(found)
     turned = mean(turning(ticks.R, ticks.dt))
     for name, rates in (("turning", ticks.command), ("gyroscope", ticks.rates if ticks.gyroscope else None)):
         if rates is not None and max(_rms(mean(rates)), _rms(turned)) > TURNS:
@@ -103,4 +109,4 @@ def _correlation(x: np.ndarray, y: np.ndarray) -> float:
     """Return the correlation; that with a constant is nothing."""
     x, y = x - x.mean(), y - y.mean()
     size = float(np.linalg.norm(x) * np.linalg.norm(y))
-    return 0.0 if np.std(y) < 1e-9 else float(np.sum(x * y)) / max(size, 1e-12)
+    return 0.0 if np.std(y) < 1e-6 * max(1e-12, np.max(np.abs(y))) else float(np.sum(x * y)) / max(size, 1e-12)

@@ -20,7 +20,7 @@ SUSPECT = 0.05  # share that is not explained above which other maps are tried
 BETTER, AGREES = 5.0, 0.75  # one of them must leave so much less, and explain at least that
 REFUSED = {"motion": 0.0, "lift": 0.0, "thrust": 0.0, "turning": -0.3, "gyroscope": -0.3}
 """Below these a log is refused."""
-DOUBTFUL = {"motion": 0.75, "lift": 0.5, "thrust": 0.5, "climb": 0.4, "turning": 0.5, "gyroscope": 0.75}
+DOUBTFUL = {"motion": 0.75, "lift": 0.5, "thrust": 0.5, "climb": 0.25, "turning": 0.5, "gyroscope": 0.75}
 """Below these a report begins with a warning."""
 
 

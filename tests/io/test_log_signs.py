@@ -1,0 +1,176 @@
+"""Any sign and any axes can be said in a map; what is wrong is named by the statement that mends it."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from made_up_log import MAP, columns, flown, write_csv, write_map
+from retrim.errors import ConfigError, LogError
+from retrim.io.logs import read_flight_log, read_map
+from retrim.io.logs.axes import to_body, to_world
+from retrim.replay import rows_of
+
+PUSH = (0.4, -0.3, 0.1)
+FLIGHT = flown(16.0, wind=PUSH, size=1.5)
+ANGLES = dict(zip(("yaw", "pitch", "roll"), Rotation.from_matrix(FLIGHT.R).as_euler("ZYX").T, strict=True))
+GYRO = 0.5 * (FLIGHT.omega + np.concatenate([FLIGHT.omega[:1], FLIGHT.omega[:-1]]))
+TABLE = columns(FLIGHT) | ANGLES | {f"g{axis}": GYRO[:, i] for i, axis in enumerate("xyz")}
+
+
+def read(tmp_path, table, **changes):
+    path = write_csv(tmp_path / "log.csv", table)
+    return read_flight_log(path, read_map(write_map(tmp_path / "map.toml", MAP, **changes)))
+
+
+def is_the_flight(log):
+    np.testing.assert_allclose(log.R, FLIGHT.R, atol=1e-6)
+    np.testing.assert_allclose(log.v, FLIGHT.v, atol=1e-6)
+    np.testing.assert_allclose(log.p, FLIGHT.p, atol=1e-6)
+    np.testing.assert_allclose(log.command, FLIGHT.omega, atol=1e-6)
+    missed = np.asarray(rows_of(log).a_res)[log.valid]
+    np.testing.assert_allclose(missed, np.broadcast_to(PUSH, missed.shape), atol=5e-3)
+
+
+AXES = {
+    "attitude": {"attitude__form": '"roll pitch yaw"', "attitude__fields": '["roll", "pitch", "yaw"]'},
+    "measured_rates": {"measured_rates__fields": '["gx", "gy", "gz"]'},
+}
+FIELDS = {
+    "attitude": ["roll", "pitch", "yaw"],
+    "attitude_q": ["qx", "qy", "qz", "qw"],
+    "rates": ["wx", "wy", "wz"],
+    "measured_rates": ["gx", "gy", "gz"],
+    "velocity": ["vx", "vy", "vz"],
+    "position": ["px", "py", "pz"],
+}
+WRONG = [
+    ("attitude", ("roll",)),
+    ("attitude", ("pitch",)),
+    ("attitude", ("yaw",)),
+    ("attitude", ("pitch", "yaw")),
+    ("rates", ("wx",)),
+    ("rates", ("wy",)),
+    ("rates", ("wz",)),
+    ("rates", ("wy", "wz")),
+    ("measured_rates", ("gy",)),
+    ("measured_rates", ("gx", "gy", "gz")),
+    ("velocity", ("vx",)),
+    ("velocity", ("vy",)),
+    ("velocity", ("vz",)),
+    ("position", ("px",)),
+    ("position", ("py",)),
+    ("position", ("pz",)),
+    ("position", ("py", "pz")),
+    ("attitude_q", ("qx",)),
+    ("attitude_q", ("qy",)),
+    ("attitude_q", ("qz",)),
+    ("attitude_q", ("qy", "qz")),
+]
+
+
+@pytest.mark.parametrize(("table", "names"), WRONG, ids=lambda x: x if isinstance(x, str) else "-".join(x))
+def test_a_wrong_sign_is_named_and_the_map_can_say_it(table, names, tmp_path):
+    """As that of a Crazyflie, whose pitch is positive nose up, or of a compass."""
+    changes = AXES.get(table, {})
+    fields = FIELDS[table]
+    table = table.partition("_q")[0]
+    wrong = TABLE | {name: -TABLE[name] for name in names}
+    mended = "[" + ", ".join(f'"-{name}"' if name in names else f'"{name}"' for name in fields) + "]"
+    with pytest.raises(LogError) as caught:
+        read(tmp_path, wrong, **changes)
+    assert f"{table}.fields = {mended} they would" in str(caught.value)
+    is_the_flight(read(tmp_path, wrong, **changes | {f"{table}__fields": mended}))
+
+
+@pytest.mark.parametrize("names", [("pitch",), ("roll",)])
+def test_a_wrong_sign_is_named_without_rates(names, tmp_path):
+    """By the acceleration alone."""
+    wrong = TABLE | {name: -TABLE[name] for name in names}
+    text = MAP.partition("[rates]")[0]
+    path = write_csv(tmp_path / "log.csv", wrong)
+    with pytest.raises(LogError, match=rf'"-{names[0]}".*they would'):
+        read_flight_log(path, read_map(write_map(tmp_path / "map.toml", text, **AXES["attitude"])))
+
+
+@pytest.mark.parametrize(
+    ("world", "body"),
+    [("NED", "FRD"), ("NWU", "FLU"), ("EUS", "FLU"), ("ENU", "RFU"), ("WSU", "BRU"), ("NUE", "FRD"), ("NEU", "FRU"),
+     ("EUN", "RUF")],
+)  # fmt: skip
+def test_axes_of_any_kind(world, body, tmp_path):
+    """Right-handed and left-handed, as those of game engines; y upwards, as motion capture has it."""
+    W, B = to_world(world), to_body(body)
+    spin = np.linalg.det(B) * B
+    turned = dataclasses.replace(
+        FLIGHT, p=FLIGHT.p @ W, v=FLIGHT.v @ W, R=np.swapaxes(W[None], 1, 2) @ FLIGHT.R @ B, omega=FLIGHT.omega @ spin
+    )
+    is_the_flight(read(tmp_path, columns(turned), frames__world=f'"{world}"', frames__body=f'"{body}"'))
+
+
+def test_an_attitude_may_have_axes_of_its_own(tmp_path):
+    ned = np.swapaxes(to_world("NED")[None], 1, 2) @ FLIGHT.R @ to_body("FRD")
+    table = columns(dataclasses.replace(FLIGHT, R=ned))
+    with pytest.raises(LogError, match=r'attitude.world = "NED" and attitude.body = "FRD" they would'):
+        read(tmp_path, table)
+    is_the_flight(read(tmp_path, table, attitude__world='"NED"', attitude__body='"FRD"'))
+
+
+def test_rotation_vectors_and_parts_of_lists(tmp_path):
+    vectors = Rotation.from_matrix(FLIGHT.R).as_rotvec(degrees=True)
+    table = TABLE | {f"r{i}": vectors[:, i] for i in range(3)}
+    log = read(tmp_path, table, attitude__fields='["r0", "r1", "r2"]', attitude__form='"rotation vector"',
+               attitude__unit='"deg"')  # fmt: skip
+    is_the_flight(log)
+
+
+def test_alternatives_and_names_in_other_letters(tmp_path):
+    log = read(tmp_path, TABLE, velocity__fields='["speed_x|vx", "VY", "vz|wz"]', time__field='"T"')
+    is_the_flight(log)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"frames__world": '"ENN"'}, "no three axes"),
+        ({"frames__world": '"FLU"'}, "no three axes"),
+        ({"frames__body": '"ENU"'}, "no three axes"),
+        ({"frames__world": '"NEU"'}, "must both be right-handed, or both left"),
+        ({"attitude__body": '"FRU"'}, "must both be right-handed, or both left"),
+        ({"thrust__full": "65535.0"}, 'full goes with unit = "share"'),
+    ],
+)
+def test_axes_that_are_none_are_named(changes, said, tmp_path):
+    with pytest.raises(ConfigError, match=said):
+        read_map(write_map(tmp_path / "map.toml", **changes))
+
+
+def test_an_attitude_that_explains_little_is_read_with_a_warning(tmp_path):
+    """A tilt that wanders: no statement of the map mends it."""
+    off = 0.45 * np.sin(np.stack([2.3 * FLIGHT.t, 1.7 * FLIGHT.t + 1.0, 0.0 * FLIGHT.t], axis=1))
+    shaken = Rotation.from_matrix(FLIGHT.R) * Rotation.from_rotvec(off)
+    table = columns(dataclasses.replace(FLIGHT, R=shaken.as_matrix()))
+    text = MAP.partition("[rates]")[0]
+    log = read_flight_log(write_csv(tmp_path / "log.csv", table), read_map(write_map(tmp_path / "map.toml", text)))
+    assert 0.0 < log.agreement["lift"] < 0.5
+    assert any("attitude explains" in warning for warning in log.warnings)
+    assert log.notes[: len(log.warnings)] == log.warnings
+
+
+@pytest.mark.parametrize("kind", ["noise", "voltage", "constant", "sawtooth"])
+def test_a_column_that_is_not_the_thrust_is_read_with_a_warning(kind, tmp_path):
+    rng, t = np.random.default_rng(0), FLIGHT.t
+    column = {"noise": 0.5 + 0.1 * rng.random(len(t)), "voltage": 16.2 - 0.02 * t - 0.05 * (FLIGHT.c - FLIGHT.c.mean()),
+              "constant": np.full(len(t), 0.5), "sawtooth": 0.4 + 0.2 * np.mod(t / 1.7, 1.0)}[kind]  # fmt: skip
+    log = read(tmp_path, TABLE | {"c": column}, thrust__unit='"share"')
+    assert log.agreement["climb"] < 0.1
+    assert any(warning.startswith("thrust explains ") for warning in log.warnings)
+    assert ("thrust is 0.5 throughout" in log.notes) == (kind == "constant")
+
+
+def test_rates_that_are_not_commanded_are_not_used(tmp_path):
+    """As those of a message whose type mask says to ignore them."""
+    log = read(tmp_path, TABLE | {name: 0.0 * TABLE[name] for name in ("wx", "wy", "wz")})
+    assert log.command is None
+    assert "rates are 0 throughout, and are not used" in log.notes
