@@ -9,7 +9,7 @@ from .resampling import GAP
 from .series import Series
 
 FEWEST, WIDEST = 2, 0.15  # samples, and seconds, on each side of a sample that its cubic is fitted to
-QUIET = 0.03  # [m/s]: noise of the velocity up to which a window is wide enough
+QUIET = 0.3  # [m/s^2]: noise of the second derivative up to which a window is wide enough
 PROBES, CHUNK = 2000, 4096  # samples that choose the window, and that are fitted at once
 
 
@@ -17,7 +17,7 @@ def slope_of(path: Path, position: Series, metres: float) -> tuple[Series, str]:
     """Return the derivative of positions and a note on its window and noise.
 
     At each sample a cubic is fitted to those around it; the window is centred, so that the derivative is not late. It
-    is as short as the noise of the positions allows: the noise of the derivative is at most ``QUIET``, or the window
+    is as short as the noise of the positions allows: that of the second derivative is at most ``QUIET``, or the window
     reaches ``WIDEST`` to each side.
 
     Args:
@@ -35,8 +35,8 @@ def slope_of(path: Path, position: Series, metres: float) -> tuple[Series, str]:
     most = min(max(FEWEST, int(WIDEST / tick)), (len(t) - 1) // 2)
     for half in sorted({min(most, round(FEWEST * 1.4**k)) for k in range(20)}):
         probes = np.linspace(half, len(t) - 1 - half, min(PROBES, len(t) - 2 * half)).astype(int)
-        noise = metres * _cubics(t, p, probes, half, tick)[1]
-        if noise <= QUIET:
+        noise, shake = (metres * each for each in _cubics(t, p, probes, half, tick)[1:])
+        if shake <= QUIET:
             break
     v = np.full(p.shape, np.nan)
     for first in range(half, len(t) - half, CHUNK):
@@ -50,16 +50,18 @@ def slope_of(path: Path, position: Series, metres: float) -> tuple[Series, str]:
     return Series(t[found], v[found]), said
 
 
-def _cubics(t: np.ndarray, p: np.ndarray, rows: np.ndarray, half: int, tick: float) -> tuple[np.ndarray, float]:
-    """Return the slope at each of some samples, NaN beside gaps, and the noise of a slope."""
+def _cubics(t: np.ndarray, p: np.ndarray, rows: np.ndarray, half: int, tick: float) -> tuple[np.ndarray, float, float]:
+    """Return the slope at each of some samples, NaN beside gaps, and the noise of slopes and second derivatives."""
     k = rows[:, None] + np.arange(-half, half + 1)
     whole = np.all(np.diff(t[k], axis=1) < GAP * tick, axis=1)
     x = np.where(whole[:, None], (t[k] - t[rows][:, None]) / (half * tick), np.linspace(-1.0, 1.0, 2 * half + 1))
     X = np.stack([np.ones_like(x), x, x**2, x**3], axis=2)
     inverse = np.linalg.solve(np.swapaxes(X, 1, 2) @ X, np.swapaxes(X, 1, 2))
     theta = inverse @ p[k]
-    left = (p[k] - X @ theta)[whole]
-    share = (2 * half - 3) / (2 * half + 1)  # of the noise that a cubic does not follow
-    sigma = 1.4826 * float(np.median(np.abs(left))) / np.sqrt(share) if left.size else 0.0
-    spread = float(np.median(np.linalg.norm(inverse[:, 1], axis=1))) / (half * tick)
-    return np.where(whole[:, None], theta[:, 1] / (half * tick), np.nan), sigma * spread
+    squares = np.sum((p[k] - X @ theta)[whole] ** 2, axis=(1, 2))
+    freedom = (2 * half - 3) * p.shape[1]
+    middle = freedom * (1.0 - 2.0 / (9.0 * freedom)) ** 3  # the median of a sum of so many squares
+    sigma = float(np.sqrt(np.median(squares) / middle)) if squares.size else 0.0
+    slope, bend = (float(np.median(np.linalg.norm(inverse[:, order], axis=1))) for order in (1, 2))
+    noise, shake = sigma * slope / (half * tick), 2.0 * sigma * bend / (half * tick) ** 2
+    return np.where(whole[:, None], theta[:, 1] / (half * tick), np.nan), noise, shake
