@@ -158,3 +158,6 @@ def test_a_land_detector_is_believed(tmp_path):
     assert not log.valid[:99].any()
     assert not log.valid[701:].any()
     assert log.valid[110:690].all()
+    topics["vehicle_land_detected"] = {"landed": ("bool", np.array([0]))}
+    log = read_ulog(tmp_path, topics, slow | {"vehicle_land_detected": stamps[[300]]})
+    assert log.valid[3:-3].all()

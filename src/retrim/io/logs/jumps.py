@@ -5,7 +5,7 @@ import numpy as np
 from .on_one_clock import Ticks
 
 LEAST = {"velocity": 4.0, "attitude": 4.0}  # [m/s^2], [rad/s] by which one tick must stand out from those around it
-BEYOND = 8.0  # times the noise
+BEYOND = 5.0  # times the noise
 BESIDE = 2  # ticks before and after with which one is compared: one sample in two ticks is spread over both
 
 

@@ -57,8 +57,12 @@ def read_quantities(path: Path, log_map: LogMap | None) -> tuple[dict[str, Serie
             notes.append(f"{name} are 0 throughout, and are not used")
     series = dict[str, Series]()
     for name, each in raw.items():
+        if " " in name:  # a mark, which may have been told once
+            order = np.argsort(each.t, kind="stable")
+            series[name] = Series(each.t[order], each.values[order])
+            continue
         series[name], more = in_order(each, name, path)
-        notes += [note for note in more if name in QUANTITIES]
+        notes += more
     if "velocity" not in series:
         series["velocity"], said = slope_of(
             path, _valid(series, "position"), METRES[getattr(chosen.position, "unit", "m")]
