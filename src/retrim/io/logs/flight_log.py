@@ -1,7 +1,7 @@
 """A flight from a log: states and commands on one clock, in the frames and units of this package."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +9,8 @@ import numpy as np
 from .flight_part import ENDS, flight_part
 from .log_map import LogMap
 from .marks import marks_of
-from .on_one_clock import grid_of, on_one_clock
+from .on_one_clock import Ticks, grid_of, on_one_clock
+from .other_maps import Other
 from .plausibility import check_plausible
 from .quantities import read_quantities
 from .thrust_map import mass_normalised
@@ -74,9 +75,11 @@ def read_flight_log(path: Path, log_map: LogMap | None = None, *, dt: float = 0.
     marks = marks_of(chosen, series, grid.t)
     valid, more = flight_part(path, ticks, marks, measured_position=chosen.position is not None)
     notes += more
-    scores, warnings = check_plausible(
-        path, chosen, ticks, lambda other: on_one_clock(path, other.log_map, other.applied(series), grid), valid
-    )
+
+    def read(other: Other, part: slice) -> Ticks:
+        return on_one_clock(path, other.log_map, other.applied(series), replace(grid, t=grid.t[part]))
+
+    scores, warnings = check_plausible(path, chosen, ticks, read, valid)
     c, full, more = mass_normalised(path, chosen.thrust, ticks, valid)
     notes += more
     if gaps := int(np.sum(~ticks.known[ENDS:-ENDS])):

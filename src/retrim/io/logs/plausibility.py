@@ -18,6 +18,7 @@ from .other_maps import Other, others
 
 SUSPECT = 0.05  # share that is not explained above which other maps are tried
 BETTER, AGREES = 5.0, 0.75  # one of them must leave so much less, and explain at least that
+PART = 5000  # ticks of a long log with which other maps are tried
 REFUSED = {"motion": 0.0, "lift": 0.0, "thrust": 0.0, "turning": -0.3, "gyroscope": -0.3}
 """Below these a log is refused."""
 DOUBTFUL = {"motion": 0.75, "lift": 0.5, "thrust": 0.5, "climb": 0.25, "turning": 0.5, "gyroscope": 0.75}
@@ -25,7 +26,7 @@ DOUBTFUL = {"motion": 0.75, "lift": 0.5, "thrust": 0.5, "climb": 0.25, "turning"
 
 
 def check_plausible(
-    path: Path, chosen: LogMap, ticks: Ticks, read: Callable[[Other], Ticks], valid: np.ndarray
+    path: Path, chosen: LogMap, ticks: Ticks, read: Callable[[Other, slice], Ticks], valid: np.ndarray
 ) -> tuple[dict[str, float], tuple[str, ...]]:
     """Check that the quantities of a log agree with each other.
 
@@ -33,7 +34,7 @@ def check_plausible(
         path: For messages.
         chosen: The map.
         ticks: The log, read with it.
-        read: Reads the log with another map.
+        read: Reads a part of the log with another map.
         valid: Which ticks count.
 
     Returns:
@@ -44,20 +45,8 @@ def check_plausible(
     """
     scores = agreement(chosen, ticks, valid)
     wrong = {name: score for name, score in scores.items() if score < 1.0 - SUSPECT and name != "climb"}
-    if wrong:
-        best, found = 0.0, ""
-        for other in others(chosen):
-            try:
-                after = agreement(other.log_map, read(other), valid)
-            except LogError:
-                continue
-            mended = [name for name in wrong if 1.0 - after.get(name, -1.0) < (1.0 - wrong[name]) / BETTER]
-            kept = all(after.get(name, -1.0) > score - SUSPECT for name, score in scores.items() if name != "climb")
-            if mended and kept and (least := _least(after)) > max(best, AGREES):
-                name, best = min(mended, key=lambda each: wrong[each]), least
-                found = f"{EXPLAINED[name]} ({100 * wrong[name]:.0f} % agreement); with {other.words} they would"
-        if found:
-            raise LogError(f"{path}: {found}")
+    if wrong and (mended := _mended(chosen, read, valid)):
+        raise LogError(f"{path}: {mended}")
     for name, score in sorted(wrong.items(), key=lambda item: item[1]):
         if score < REFUSED[name]:
             raise LogError(
@@ -69,6 +58,34 @@ def check_plausible(
         for name, score in scores.items()
         if score < DOUBTFUL[name]
     )
+
+
+def _mended(chosen: LogMap, read: Callable[[Other, slice], Ticks], valid: np.ndarray) -> str:
+    """Return what is wrong and the statement of the map that mends it best; nothing if none does."""
+    part = _part(valid)
+    scores = agreement(chosen, read(Other("", chosen, {}), part), valid[part])
+    wrong = {name: score for name, score in scores.items() if score < 1.0 - SUSPECT and name != "climb"}
+    best, found = 0.0, ""
+    for other in others(chosen) if wrong else ():
+        try:
+            after = agreement(other.log_map, read(other, part), valid[part])
+        except LogError:
+            continue
+        mended = [name for name in wrong if 1.0 - after.get(name, -1.0) < (1.0 - wrong[name]) / BETTER]
+        kept = all(after.get(name, -1.0) > score - SUSPECT for name, score in scores.items() if name != "climb")
+        if mended and kept and (least := _least(after)) > max(best, AGREES):
+            name, best = min(mended, key=lambda each: wrong[each]), least
+            found = f"{EXPLAINED[name]} ({100 * wrong[name]:.0f} % agreement); with {other.words} they would"
+    return found
+
+
+def _part(valid: np.ndarray) -> slice:
+    """Return the part of a long log with the most flight: it tells as much of a map as all of it."""
+    if len(valid) <= PART:
+        return slice(0, len(valid))
+    flight = np.concatenate([[0], np.cumsum(valid)])
+    first = int(np.argmax(flight[PART:] - flight[:-PART]))
+    return slice(first, first + PART)
 
 
 def _least(scores: dict[str, float]) -> float:
