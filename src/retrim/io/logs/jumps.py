@@ -6,6 +6,8 @@ from .on_one_clock import Ticks
 
 LEAST = {"velocity": 4.0, "attitude": 4.0}  # [m/s^2], [rad/s] by which one tick must stand out from those around it
 BEYOND = 5.0  # times the noise
+ENDS = 3.0  # times as far must a step at an end of the log stand out
+CALM = 0.25  # share of a step at an end of the log by which those beside it may differ
 BESIDE = 2  # ticks before and after with which one is compared: one sample in two ticks is spread over both
 
 
@@ -22,13 +24,17 @@ def jumps_of(ticks: Ticks, name: str) -> np.ndarray:
         steps = Rotation.from_matrix(np.swapaxes(ticks.R[:-1], 1, 2) @ ticks.R[1:]).as_rotvec() / ticks.dt
     if len(steps) < 4 * BESIDE:
         return np.zeros(len(ticks.t), dtype=bool)
-    before, after = np.full_like(steps, np.nan), np.full_like(steps, np.nan)
+    before, after = np.zeros_like(steps), np.zeros_like(steps)
     before[BESIDE:] = steps[BESIDE:] - steps[:-BESIDE]
     after[:-BESIDE] = steps[:-BESIDE] - steps[BESIDE:]
-    before, after = np.where(np.isnan(before), after, before), np.where(np.isnan(after), before, after)  # at the ends
+    before[:BESIDE] = np.where(np.abs(after[BESIDE : 2 * BESIDE]) < CALM * np.abs(after[:BESIDE]), after[:BESIDE], 0.0)
+    late = np.abs(before[-2 * BESIDE : -BESIDE]) < CALM * np.abs(before[-BESIDE:])
+    after[-BESIDE:] = np.where(late, before[-BESIDE:], 0.0)
     stands_out = np.where(before * after > 0.0, np.minimum(np.abs(before), np.abs(after)), 0.0)
     known = ticks.known[1:] & ticks.known[:-1]
     bent = np.abs(0.5 * (before + after))[known] if known.any() else np.zeros((1, 3))
     limit = np.maximum(LEAST[name], BEYOND * 1.4826 * np.median(bent, axis=0))
+    stands_out[:BESIDE] /= ENDS  # a vehicle that starts, or stops, is no jump
+    stands_out[-BESIDE:] /= ENDS
     found = np.concatenate([[False], np.any(stands_out > limit, axis=1)])
     return found
