@@ -161,3 +161,16 @@ def test_a_land_detector_is_believed(tmp_path):
     topics["vehicle_land_detected"] = {"landed": ("bool", np.array([0]))}
     log = read_ulog(tmp_path, topics, slow | {"vehicle_land_detected": stamps[[300]]})
     assert log.valid[3:-3].all()
+
+
+def test_a_position_that_is_never_valid_is_not_used(tmp_path):
+    """As that of a flight without GPS, whose velocity holds: no residual needs it."""
+    topics, stamps = px4_topics(FLIGHT)
+    place = topics["vehicle_local_position"]
+    place |= {"xy_valid": ("bool", np.zeros(len(stamps))), "v_xy_valid": ("bool", np.ones(len(stamps)))}
+    for name in "xyz":
+        place[name] = ("float", np.zeros(len(stamps)))
+    log = read_ulog(tmp_path, topics, stamps)
+    assert "position is never valid, and is not used" in log.notes
+    assert missed(log)[1] < 0.03
+    assert log.valid[3:-3].all()

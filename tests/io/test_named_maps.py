@@ -11,6 +11,7 @@ from made_up_log import G, flown, write_csv
 from retrim.errors import LogError
 from retrim.io.logs import read_flight_log, read_map
 from retrim.io.logs.log_map import Time
+from retrim.io.logs.message_times import evenly
 from retrim.io.logs.named_maps import USUAL, names
 from retrim.replay import rows_of
 
@@ -241,3 +242,67 @@ def test_four_motors_are_no_thrust(tmp_path):
     """)
     with pytest.raises(LogError, match="thrust needs 1 number, its fields hold 4; add the motors' thrusts up"):
         read_flight_log(write_csv(tmp_path / "log.csv", table), read_map(chosen))
+
+
+@pytest.mark.parametrize(("period", "jitter"), [(0.02, 0.006), (0.004, 0.003)])
+def test_messages_of_an_even_rate_are_not_as_late_as_they_are_received(period, jitter):
+    rng = np.random.default_rng(0)
+    sent = 1.7e9 + period * np.arange(1200)
+    received = np.maximum.accumulate(sent + 0.003 + np.abs(rng.normal(0.0, jitter, 1200)))
+    found, even = evenly(received)
+    assert even
+    assert np.all(np.diff(found) > 0.0)
+    np.testing.assert_allclose(found, sent + 0.003, atol=5e-4)
+
+
+@pytest.mark.parametrize("kind", ["uneven", "lost", "few"])
+def test_messages_of_no_even_rate_have_the_time_of_reception(kind):
+    rng = np.random.default_rng(0)
+    received = {
+        "uneven": np.cumsum(rng.uniform(0.0, 0.04, 1000)),
+        "lost": np.delete(0.02 * np.arange(1000), 500),
+        "few": 0.02 * np.arange(20),
+    }[kind]
+    found, even = evenly(received)
+    assert not even
+    np.testing.assert_array_equal(found, received)
+
+
+def test_thrust_without_a_header_beside_odometry_with_one(tmp_path):
+    """A number of std_msgs, received late by up to 20 ms."""
+    pytest.importorskip("rosbags")
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    make, rng, last = store.types, np.random.default_rng(0), 0
+    vector = make["geometry_msgs/msg/Vector3"]
+    flight = flown(12.0, size=2.0)
+    q = Rotation.from_matrix(flight.R).as_quat()
+
+    def messages():
+        nonlocal last
+        for k, t in enumerate(flight.t):
+            now = round(1e9 * (t + 1.7e9))
+            stamp = make["builtin_interfaces/msg/Time"](*divmod(now, 10**9))
+            place = make["geometry_msgs/msg/Pose"](
+                make["geometry_msgs/msg/Point"](*flight.p[k]), make["geometry_msgs/msg/Quaternion"](*q[k])
+            )
+            twist = make["geometry_msgs/msg/Twist"](vector(*flight.v[k]), vector(*flight.omega[k]))
+            odometry = make["nav_msgs/msg/Odometry"](
+                make["std_msgs/msg/Header"](stamp, "map"), "base",
+                make["geometry_msgs/msg/PoseWithCovariance"](place, np.zeros(36)),
+                make["geometry_msgs/msg/TwistWithCovariance"](twist, np.zeros(36)))  # fmt: skip
+            yield "/odom", "nav_msgs/msg/Odometry", now, odometry
+            last = max(now + int(6e6 * abs(rng.normal())), last + 1000)
+            yield "/thrust", "std_msgs/msg/Float64", last, make["std_msgs/msg/Float64"](flight.c[k])
+
+    path = bag2(tmp_path / "bag", {}, messages(), store)
+    (tmp_path / "map.toml").write_text("""
+    position.fields = ["/odom.pose.pose.position"]
+    velocity.fields = ["/odom.twist.twist.linear"]
+    attitude = { fields = ["/odom.pose.pose.orientation"], form = "xyzw" }
+    thrust = { fields = ["/thrust.data"], unit = "m/s^2" }
+    """)
+    log = read_flight_log(path, read_map(tmp_path / "map.toml"))
+    assert any("/thrust has no stamps; its times are those of reception, less what held" in note for note in log.notes)
+    assert np.abs(np.asarray(rows_of(log).a_res)[log.valid]).max() < 0.1

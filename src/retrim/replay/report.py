@@ -34,7 +34,8 @@ def warning_of(log: FlightLog) -> str:
 def agreement_section(log: FlightLog) -> TableSection:
     """Return how well the quantities of a log agree with each other."""
     lines = tuple(
-        (WORDS[name], f"{100 * score:.0f} %", f"{100 * DOUBTFUL[name]:.0f} %") for name, score in log.agreement.items()
+        (WORDS[name], f"{round(100 * score)} %", f"{round(100 * DOUBTFUL[name])} %")
+        for name, score in log.agreement.items()
     )
     about = warning_of(log) or (
         "What one quantity says of another; wind, drag and lags leave something unexplained in every log."

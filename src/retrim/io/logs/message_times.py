@@ -10,6 +10,11 @@ from .series import Clock
 
 MICROSECOND, NANOSECOND = 1e-6, 1e-9
 APART = 1.0  # [s] between clocks that are not the same
+FEWEST, AROUND = 50, 0.5  # messages, and [s] around each, that tell how late it was
+EVEN, LOST = (
+    3.0,
+    0.5,
+)  # turns by which messages of an even rate are late at most, and the promptest ones if none is lost
 EARLY = 5.0  # percentile of delays that counts as the delay of a message that is not held up
 
 
@@ -50,8 +55,9 @@ def on_one_time(stamps: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray]
     for topic, both in stamps.items():
         stamp, received = both.T
         if np.mean(np.isnan(stamp) | (stamp == 0.0)) > 0.5:
-            times[topic] = received
-            notes.append(f"{topic} has no stamps; its times are those of reception")
+            times[topic], even = evenly(received)
+            said = ", less what held single messages up" if even else ""
+            notes.append(f"{topic} has no stamps; its times are those of reception{said}")
         else:
             times[topic] = stamp
             ahead[topic] = float(np.nanpercentile(received - stamp, EARLY))
@@ -63,3 +69,27 @@ def on_one_time(stamps: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray]
             times[topic] = times[topic] + shift
         notes.append("topics have clocks of their own, and are brought to that of the recorder")
     return times, notes
+
+
+def evenly(received: np.ndarray) -> tuple[np.ndarray, bool]:
+    """Return when messages of an even rate were sent, but for the shortest delay, and whether their rate is even.
+
+    A message is held up, but never early: of those around it, the one that came first for its turn tells when each was
+    sent. Where the rate is not even, or messages are lost, the times of reception are returned.
+    """
+    n = len(received)
+    if n < FEWEST:
+        return received, False
+    turn = np.arange(n)
+    slope, start = np.polyfit(turn, received - received[0], 1)
+    late = received - received[0] - start - slope * turn
+    reach = max(1, round(AROUND / slope)) if slope > 0.0 else n
+    if reach >= n or np.ptp(late) > EVEN * slope:
+        return received, False
+    from scipy.ndimage import minimum_filter1d, uniform_filter1d  # here: they take as long to import as all of retrim
+
+    least = minimum_filter1d(late, 2 * reach + 1, mode="nearest")
+    if np.ptp(least) > LOST * slope:
+        return received, False
+    least = uniform_filter1d(least, 2 * reach + 1, mode="nearest")
+    return received - late + np.minimum(least, late), True

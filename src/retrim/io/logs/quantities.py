@@ -1,5 +1,6 @@
 """The quantities that a map names, as they are in the file: series in order, and which map that was."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -63,6 +64,10 @@ def read_quantities(path: Path, log_map: LogMap | None) -> tuple[dict[str, Serie
             continue
         series[name], more = in_order(each, name, path)
         notes += more
+    if "position" in series and "velocity" in series and not len(_valid(series, "position").t):
+        del series["position"]
+        chosen = replace(chosen, position=None)
+        notes.append("position is never valid, and is not used")
     if "velocity" not in series:
         series["velocity"], said = slope_of(
             path, _valid(series, "position"), METRES[getattr(chosen.position, "unit", "m")]

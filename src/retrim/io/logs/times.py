@@ -11,7 +11,8 @@ from ...errors import LogError
 from .series import Series
 
 LATE_S = 0.5  # [s] by which a sample may be older than the one before; more is of another flight
-RARE = 0.01  # share of samples whose time may be impossible
+RARE = 0.05  # share of samples whose time may be impossible
+FAR_S, FAR = 60.0, 3.0  # [s], and lengths of the log, by which such a time is before or after all others at least
 FEWEST = 50  # samples, at least, of which one may be
 
 
@@ -56,8 +57,8 @@ def impossible(t: np.ndarray) -> np.ndarray:
     none, most = np.zeros(len(t), dtype=bool), math.ceil(RARE * len(t))
     if len(t) < FEWEST:
         return none
-    first, last = np.quantile(t, [0.02, 0.98])
-    reach = max(LATE_S, last - first)
+    first, last = np.quantile(t, [RARE, 1.0 - RARE])
+    reach = max(FAR_S, FAR * (last - first))
     earliest = np.min(t, where=t > 0.0, initial=np.inf)
     out = (t < first - reach) | (t > last + reach) | ((t == 0.0) & (earliest > LATE_S))
     inside = t[~out]
