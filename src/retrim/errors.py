@@ -1,8 +1,46 @@
-"""Every error that retrim raises on purpose, under one root."""
+"""Every error that retrim raises on purpose, under one root. Each is one line of limited length."""
+
+LONGEST = 480
+"""Characters of a message: what was given may be megabytes."""
+CUT = " ... "
 
 
 class RetrimError(Exception):
     """Root of all errors of this package. The message names what was wrong and what would be right."""
+
+    def __init__(self, message: str = "") -> None:
+        """Build one; ``message`` becomes a printable line of limited length."""
+        super().__init__(one_line(message))
+
+
+def one_line(text: str, most: int = LONGEST) -> str:
+    """Return a text as one printable line: control characters escaped, the middle of a long one left out.
+
+    Args:
+        text: Any; it may hold what a stranger wrote.
+        most: Characters that are left.
+    """
+    if len(text) > 4 * most:  # escaping megabytes is slow
+        text = text[: 2 * most] + CUT + text[-most:]
+    words = " ".join(text.split())
+    line = "".join(sign if sign.isprintable() else ascii(sign)[1:-1] for sign in words)
+    if len(line) <= most:
+        return line
+    tail = most // 3
+    return line[: most - tail - len(CUT)] + CUT + line[-tail:]
+
+
+def excerpt(value: object, most: int = 60, *, quotes: bool = True) -> str:
+    """Return a value of a file as a message may show it: in quotation marks, escaped, and not long.
+
+    Args:
+        value: Any.
+        most: Characters that are left.
+        quotes: Whether a text has quotation marks.
+    """
+    text = value[: 4 * most] if isinstance(value, str) else value
+    shown = repr(text) if quotes or not isinstance(text, str) else text
+    return one_line(shown, most)
 
 
 class ConfigError(RetrimError, ValueError):

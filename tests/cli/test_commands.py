@@ -186,7 +186,11 @@ def test_a_user_s_own_task_is_pretrained_and_flown_by_its_file(folder, monkeypat
     words = "--config", "small.toml", "--updates", "10", "--out", "own"
     out = retrim("pretrain", "follow_task:entry", *words, cwd=folder)
     assert "follow_task:entry error in its own model" in out
-    retrim("fly", "--policy", "own", "--seconds", "1", "--adapt", "none", "--out", "ownf", cwd=folder)
+    fly = "fly", "--policy", "own", "--seconds", "1", "--adapt", "none", "--out", "ownf"
+    refusal = retrim(*fly, cwd=folder, code=1)
+    assert "names Python code, 'follow_task:entry'" in refusal
+    assert "pass --trust follow_task:entry" in refusal
+    retrim(*fly, "--trust", "mine:other", "--trust", "follow_task:entry", cwd=folder)
     assert (folder / "ownf" / "follow_task_entry_large.png").exists()
 
 

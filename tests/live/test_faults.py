@@ -11,7 +11,8 @@ import pytest
 
 from live_helpers import holding, plan
 from live_processes import DT, HOME, DrillPlan, level
-from retrim.config import Scenario
+from retrim.config import PRESETS, Scenario
+from retrim.config.loading import dump
 from retrim.live.events import LiveEvents
 from retrim.live.spec import MAINS, LiveSpec
 from retrim.live.supervisor import Supervisor
@@ -19,6 +20,7 @@ from retrim.onboard.guard import Mode
 from retrim.onboard.launch import launch
 from retrim.onboard.messages import COMMAND, Setpoint
 from retrim.onboard.recorder import read_log
+from retrim.transport.message import pack_arrays
 
 DRILL = {"plant": "live_processes:plant", "residual": "live_processes:learner", "policy": "live_processes:learner"}
 SECONDS = 1.5
@@ -51,7 +53,7 @@ def controller():
 
 def spec_in(folder, controller, **changes):
     start = folder / "start.safetensors"
-    start.write_bytes(b"")
+    start.write_bytes(pack_arrays({}, kind="learnt", about={"preset": dump(PRESETS["hover/retrim"])}))
     made = plan(controller)
     return replace(
         LiveSpec(

@@ -10,6 +10,8 @@ import pytest
 
 from live.test_faults import Drill, controller, spec_in, whole_log  # noqa: F401
 from live_processes import HOME, DrillPlan, level
+from retrim.config import PRESETS, changed
+from retrim.config.loading import dump
 from retrim.errors import ConfigError, MessageError, PlantError
 from retrim.experiments.latency import free_port as unused_port
 from retrim.live import ground, remote_learners
@@ -24,6 +26,7 @@ from retrim.onboard.messages import last_note, pack_note
 from retrim.onboard.topics import INTO, OUT
 from retrim.transport.bridge import EVERY, Bridge
 from retrim.transport.in_process import InProcessBus
+from retrim.transport.message import pack_arrays
 from retrim.transport.remote import Address
 from retrim.transport.session import FOREIGN, MISSING, UNSIGNED
 from retrim.transport.shared_key import SharedKey
@@ -152,11 +155,14 @@ def test_addresses_that_cannot_be_learnt_for_together_are_named(addresses, why):
         learn_for([Address.of(each) for each in addresses], threading.Event())
 
 
-def mission_in(folder, base, number=1):
-    start = folder / "start"
-    start.write_bytes(b"start")
+def learnt_by(preset):
+    return pack_arrays({}, kind="learnt", about={"preset": dump(preset)})
+
+
+def mission_in(folder, base, number=1, start=None, reference=None):
+    (folder / "start").write_bytes(start or learnt_by(PRESETS["hover/retrim"]))
     capacities = dict.fromkeys((*OUT, *INTO), 10_000)
-    return Mission.of(number, None, 0, base, ("residual", "policy"), 0, capacities, start).pack()
+    return Mission.of(number, reference, 0, base, ("residual", "policy"), 0, capacities, folder / "start").pack()
 
 
 def test_a_new_flight_has_new_learners_and_an_old_one_none(tmp_path, monkeypatch):
@@ -197,8 +203,40 @@ def joined(tmp_path, monkeypatch):
         def _start(self, layer):
             self.processes[layer] = launch("live_processes:nothing", None, tmp_path / "log")
 
-    with Idle(Address("zenoh", "127.0.0.1", 1)) as ground:
+    with Idle(Address("zenoh", "127.0.0.1", 1), trust=("mine:trusted",)) as ground:
         yield network, ground
+
+
+@pytest.mark.parametrize(
+    ("changes", "reference", "why"),
+    [
+        ({"task": "os:abort"}, None, "names Python code, 'os:abort', which is not imported"),
+        ({"vehicle": "os:abort"}, None, "pass --trust os:abort"),
+        ({"adapt": {"residual": "os:abort"}}, None, "pass --trust os:abort"),
+        ({"task": "track", "track": {"reference": "circle+os:abort"}}, None, "pass --trust os:abort"),
+        ({}, "circle=3+os:abort", "pass --trust os:abort"),
+        ({}, "/etc/passwd.csv", "names a file of this machine"),
+        ({"vehicle": "quad.toml"}, None, "names a file of this machine"),
+    ],
+)
+def test_a_flight_that_names_code_or_files_of_the_ground_is_refused_and_told(joined, tmp_path, changes, reference, why):
+    network, ground = joined
+    start = learnt_by(changed(PRESETS["hover/retrim"], **changes))
+    network.publish("mission", mission_in(tmp_path, "first", start=start, reference=reference))
+    assert why in next(ground.wait())
+    assert not ground.processes
+    said = last_note(network, "ground")
+    assert said["base"] == "first"
+    assert why in said["failed"]
+    network.publish("mission", mission_in(tmp_path, "second", start=learnt_by(PRESETS["hover/retrim"])))
+    assert list(ground.wait()) == []
+
+
+def test_a_name_that_the_ground_trusts_is_learnt_for(joined, tmp_path):
+    network, ground = joined
+    start = learnt_by(changed(PRESETS["hover/retrim"], adapt={"residual": "mine:trusted"}))
+    network.publish("mission", mission_in(tmp_path, "first", start=start))
+    assert list(ground.wait()) == []
 
 
 def test_a_new_flight_gets_nothing_of_the_one_before_and_all_that_is_its_own(joined, tmp_path):

@@ -4,6 +4,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
+import tyro
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -14,6 +15,7 @@ from ..experiments.run import Run
 from ..experiments.tables.document import TableSection
 
 console = Console(highlight=False)
+Trust = tyro.conf.UseAppendAction[tuple[str, ...]]  # `--trust a:b --trust c:d`
 LINE_EVERY = 10.0  # [s], where the output is no terminal
 
 

@@ -7,11 +7,15 @@ from pathlib import Path
 import tyro
 
 from ..export.export import export as exported
-from .console import RichReporter, show_paths
+from .console import RichReporter, Trust, show_paths
 
 
 def export(
-    policy: tyro.conf.Positional[Path], to: str = "npz", delta: Path | None = None, out: Path | None = None
+    policy: tyro.conf.Positional[Path],
+    to: str = "npz",
+    delta: Path | None = None,
+    trust: Trust = (),
+    out: Path | None = None,
 ) -> Callable[[threading.Event], int]:
     """Write a policy for a computer without JAX, run it there, and compare it with JAX on 10,000 observations.
 
@@ -20,11 +24,12 @@ def export(
         to: npz: arrays, with a runner that needs NumPy only; onnx; c: one header of C99, without allocation; delta: a
             low-rank delta alone, for the runner.
         delta: A low-rank delta.safetensors, to put on the policy.
+        trust: Python name that a file may hold, as mine:task; its code is run. Once for each name.
         out: The file; by default policy.npz, policy.onnx, policy.h or delta.npz in the current folder.
     """
 
     def ordered(stop: threading.Event) -> int:
-        show_paths(exported(policy, to, out, delta, RichReporter()))
+        show_paths(exported(policy, to, out, delta, RichReporter(), trust=trust))
         return 0
 
     return ordered

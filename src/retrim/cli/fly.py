@@ -19,7 +19,7 @@ from ..experiments.metrics import cell, notes, rows
 from ..experiments.outputs import write_flights
 from ..experiments.run import INTERRUPTED, Run
 from ..experiments.tables.document import TableSection
-from .console import RichReporter, console, show_paths, show_table, started
+from .console import RichReporter, Trust, console, show_paths, show_table, started
 
 
 def fly(
@@ -34,6 +34,7 @@ def fly(
     seconds: float | None = None,
     starts: int = 1,
     seed: int = 0,
+    trust: Trust = (),
     out: Path | None = None,
 ) -> Callable[[threading.Event], int]:
     """Fly a policy on a plant, as it is and, with --adapt full or lora, adapting as it flies.
@@ -53,6 +54,7 @@ def fly(
         seconds: Length of a flight; 30 s for hover, 60 s for tracking by default.
         starts: Number of flights, each from another start.
         seed: Seed of the starts, of the learners and of what is random in the scenario, 0 to 4294967295.
+        trust: Python name that a file may hold, as mine:task; its code is run. Once for each name.
         out: Folder for results.json, events.jsonl, logs/, what was learnt and the picture; a new one under runs/ by
             default.
     """
@@ -64,11 +66,19 @@ def fly(
             from .live import live  # here: other flights need nothing of it
 
             return live(
-                policy, resume, where=where, adapt=adapt, residual=residual, seconds=seconds or 30.0, seed=seed, out=out
+                policy,
+                resume,
+                where=where,
+                adapt=adapt,
+                residual=residual,
+                seconds=seconds or 30.0,
+                seed=seed,
+                trust=trust,
+                out=out,
             )(stop)
-        weights, preset, state = loaded(policy, resume, delta)
+        weights, preset, state = loaded(policy, resume, delta, trust=trust)
         if config is not None:
-            preset = same_policy(preset, overlaid(preset, config), config)
+            preset = same_policy(preset, overlaid(preset, config, trust=trust), config)
         preset = with_residual(preset, residual, state)
         scenario = where.scenario(preset)
         methods: tuple[str, ...] = ("base",) if adapt in ("none", "base") else ("base", adapt)

@@ -8,11 +8,11 @@ from pathlib import Path
 import tyro
 
 from ..live.ground import flights_at, learn_for
-from .console import RichReporter, console
+from .console import RichReporter, Trust, console
 
 
 def learn(
-    addresses: tyro.conf.Positional[tuple[str, ...]], key: Path | None = None
+    addresses: tyro.conf.Positional[tuple[str, ...]], key: Path | None = None, trust: Trust = ()
 ) -> Callable[[threading.Event], int]:
     """Learn for flights on other machines: `retrim live --learners ADDRESS` flies one.
 
@@ -23,13 +23,14 @@ def learn(
         addresses: Where the flights are: zenoh:HOST:PORT of a machine that flies, or ros:HOST:PORT of a rosmaster;
             several vehicles at one rosmaster have a name each, as in ros:HOST:PORT/quad1.
         key: File with the key that the flights have, too, or RETRIM_KEY; needed where they are on other machines.
+        trust: Python name that a flight may name, as mine:task; its code is run here. Once for each name.
     """
 
     def ordered(stop: threading.Event) -> int:
         signal.signal(signal.SIGTERM, lambda *_: stop.set())
         found = flights_at(addresses, key)
         with RichReporter().progress(", ".join(addresses)) as advance:
-            last = learn_for(found, stop, lambda text: advance(0.5, text))
+            last = learn_for(found, stop, lambda text: advance(0.5, text), trust)
         console.print(last, markup=False, soft_wrap=True)
         return 0
 

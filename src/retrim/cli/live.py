@@ -29,7 +29,7 @@ from ..live.session import LONGEST, LiveRequest, check_limits, learners_at
 from ..live.status import Status
 from ..runtime.events import Event
 from ..transport.remote import LOOPBACK
-from .console import RichReporter, console, show_paths, show_table, started
+from .console import RichReporter, Trust, console, show_paths, show_table, started
 
 LINE_EVERY = 5.0  # [s], where the output is no terminal
 
@@ -52,6 +52,7 @@ def live(
     page_host: str = LOOPBACK[0],
     page_port: int = 8080,
     record: Path | None = None,
+    trust: Trust = (),
     out: Path | None = None,
 ) -> Callable[[threading.Event], int]:
     """Fly against the clock, and learn at the same time: a process for control, for each learner, and for the plant.
@@ -77,6 +78,7 @@ def live(
         page_host: Address that the page listens on; its printed address has a token, without which nothing is answered.
         page_port: Port of the page, or the next one that is free.
         record: FILE.mcap for Foxglove and PlotJuggler, by default flight.mcap in the folder; or FILE.rrd for rerun.
+        trust: Python name that a file may hold, as mine:task; its code is run. Once for each name.
         out: Folder of what the flight leaves; a new one under runs/ by default.
     """
 
@@ -89,7 +91,7 @@ def live(
         check_limits(fence, seconds, policy_age)
         state, weights, chosen = None, None, load_for(preset.partition("/")[0], preset)
         if policy is not None or resume is not None:
-            weights, chosen, state = loaded(policy, resume)
+            weights, chosen, state = loaded(policy, resume, trust=trust)
         chosen = with_residual(chosen, residual, state)
         scenario = where.scenario(chosen)
         wanted = page or (seconds is None and not no_page)

@@ -3,13 +3,10 @@
 Modules of commands are imported when they are needed, so that help is quick.
 """
 
-import contextlib
 import os
-import signal
 import sys
 import threading
-from collections.abc import Iterator, Sequence
-from types import FrameType
+from collections.abc import Sequence
 
 PACKAGE = __name__.rpartition(".")[0]
 COMMANDS = {
@@ -73,7 +70,9 @@ def _run(words: list[str]) -> int:
         return 2
     stop = threading.Event()
     try:
-        with _stop_on_interrupt(stop):
+        from ..experiments.interrupts import stop_on_interrupt
+
+        with stop_on_interrupt(stop):
             return _command(words[0], words[1:], stop)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
@@ -122,28 +121,3 @@ def _command(name: str, words: list[str], stop: threading.Event) -> int:
         console.print("interrupted; what was done is kept, if anything was")
         return code or 130
     return code
-
-
-@contextlib.contextmanager
-def _stop_on_interrupt(stop: threading.Event) -> Iterator[None]:
-    """Let Ctrl-C and SIGTERM set the stop token and raise: a KeyboardInterrupt that JAX swallows is not lost."""
-
-    def handle(number: int, frame: FrameType | None) -> None:
-        stop.set()
-        raise KeyboardInterrupt
-
-    def swallowed(error: "sys.UnraisableHookArgs") -> None:
-        if not isinstance(error.exc_value, KeyboardInterrupt):
-            sys.__unraisablehook__(error)
-
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
-    hook, sys.unraisablehook = sys.unraisablehook, swallowed
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-        sys.unraisablehook = hook

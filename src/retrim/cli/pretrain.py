@@ -14,7 +14,7 @@ from ..experiments.limits import check_seeds
 from ..experiments.outputs import write_trained
 from ..experiments.run import INTERRUPTED, Run
 from ..experiments.training import nominal_error, train
-from .console import RichReporter, console, show_paths, started
+from .console import RichReporter, Trust, console, show_paths, started
 
 
 def pretrain(
@@ -27,6 +27,7 @@ def pretrain(
     updates: int | None = None,
     envs: int | None = None,
     seed: int = 0,
+    trust: Trust = (),
     out: Path | None = None,
 ) -> Callable[[threading.Event], int]:
     """Train a policy from scratch in the nominal model and save it.
@@ -41,6 +42,7 @@ def pretrain(
         updates: Optimiser steps, instead of the preset's.
         envs: Starts per step, instead of the preset's.
         seed: Seed of the initial weights and of the starts, 0 to 4294967295.
+        trust: Python name that a file may hold, as mine:task; its code is run. Once for each name.
         out: Folder for policy.safetensors and results.json; a new one under runs/ by default.
     """
 
@@ -48,7 +50,7 @@ def pretrain(
         check_seeds([seed])
         chosen = asked_preset(
             task, preset, config=config, vehicle=vehicle, reference=reference, residual=residual,
-            num_updates=updates, num_envs=envs,
+            num_updates=updates, num_envs=envs, trust=trust,
         )  # fmt: skip
         return _pretrain(chosen, seed, out, stop)
 

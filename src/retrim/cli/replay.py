@@ -16,7 +16,7 @@ LEFT = ("replay.md", "replay.png", "vehicle.toml", "adapted.safetensors", "delta
 
 def replay(
     log: tyro.conf.Positional[Path],
-    asked: tyro.conf.OmitArgPrefixes[Replay] = Replay(),  # noqa: B008
+    asked: tyro.conf.OmitArgPrefixes[tyro.conf.UseAppendAction[Replay]] = Replay(),  # noqa: B008
     out: Path | None = None,
 ) -> Callable[[threading.Event], int]:
     """Read a flight log: what the nominal model missed, and how well that is foretold; identify, adapt.

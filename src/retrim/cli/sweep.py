@@ -9,11 +9,11 @@ import tyro
 from ..experiments.cluster import joined
 from ..experiments.run import Run
 from ..experiments.sweep import read_sweep, run_sweep
-from .console import RichReporter, show_paths
+from .console import RichReporter, Trust, show_paths
 
 
 def sweep(
-    file: tyro.conf.Positional[Path], out: Path | None = None, on: str | None = None
+    file: tyro.conf.Positional[Path], out: Path | None = None, on: str | None = None, trust: Trust = ()
 ) -> Callable[[threading.Event], int]:
     """Fly every combination of a sweep file: presets x scenarios x methods x seeds.
 
@@ -24,11 +24,12 @@ def sweep(
         file: TOML file with any of: presets, seeds, methods, disturbances, plants, vehicles, sensors, references,
             starts, seconds, and a table [overlay] with values on top of the presets.
         on: tcp://HOST:PORT or tls://HOST:PORT of a Dask scheduler, whose workers train and fly.
+        trust: Python name that a file may hold, as mine:task; its code is run. Once for each name.
         out: Folder for sweep.md, sweep.json and sweep.png; by default runs/ and the file's name.
     """
 
     def ordered(stop: threading.Event) -> int:
-        content, reporter = read_sweep(file), RichReporter()
+        content, reporter = read_sweep(file, trust), RichReporter()
         with joined(on, reporter) as executor:
             run = Run("sweep", out or Path("runs") / f"sweep-{file.stem}", stop=stop, executor=executor)
             run_sweep(content, run, reporter)

@@ -1,6 +1,7 @@
 """Presets from names, TOML files, flags and JSON; every mistake is one clear line."""
 
 import dataclasses
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -9,24 +10,26 @@ from pydantic import TypeAdapter
 from ..errors import ConfigError
 from .named_presets import PRESETS
 from .presets import BUILT_IN_TASKS, Preset
+from .trust import check_trust
 from .validation import read_toml, suggestion, validated
 from .vehicle_file import VehicleSpec, read_vehicle
 from .vehicles import vehicle_from
 
 
-def load(name: str, overlay: Path | None = None) -> Preset:
+def load(name: str, overlay: Path | None = None, *, trust: Collection[str] = ()) -> Preset:
     """Return a preset.
 
     Args:
         name: As ``hover/fast``; ``PRESETS`` has all of them.
         overlay: A TOML file with values on top.
+        trust: Python names that the file may hold, as ``mine:task``.
 
     Raises:
         ConfigError: There is no such preset, or the file cannot be used.
     """
     if name not in PRESETS:
         raise ConfigError(f"no preset {name!r}; {suggestion(name, PRESETS)}")
-    return PRESETS[name] if overlay is None else overlaid(PRESETS[name], overlay)
+    return PRESETS[name] if overlay is None else overlaid(PRESETS[name], overlay, trust=trust)
 
 
 def load_for(task: str, name: str) -> Preset:
@@ -43,17 +46,21 @@ def load_for(task: str, name: str) -> Preset:
     return changed(preset, task=task, name=f"{task} on {preset.name}")
 
 
-def overlaid(preset: Preset, overlay: Path) -> Preset:
+def overlaid(preset: Preset, overlay: Path, *, trust: Collection[str] = ()) -> Preset:
     """Return a preset with the values of a TOML file on top.
 
     Args:
         preset: What lies below.
         overlay: The file; a relative vehicle file in it is looked up beside it.
+        trust: Python names that the file may hold, as ``mine:task``.
 
     Raises:
-        ConfigError: The file cannot be read, is not TOML, or has a key or value that does not fit.
+        ConfigError: The file cannot be read, is not TOML, has a key or value that does not fit, or a Python name.
     """
-    return validated(Preset, merged(values(preset), beside(read_toml(overlay), overlay.parent)), source=str(overlay))
+    above = beside(read_toml(overlay), overlay.parent)
+    whole = validated(Preset, merged(values(preset), above), source=str(overlay))
+    check_trust(above, trust, source=str(overlay))
+    return whole
 
 
 def beside(above: dict[str, Any], folder: Path) -> dict[str, Any]:
@@ -89,6 +96,8 @@ def values(preset: Preset) -> dict[str, Any]:
 
 def parse(text: str | bytes, *, source: str) -> Preset:
     """Return a preset from JSON, the inverse of :func:`dump`.
+
+    Whoever has it from a file or a message checks its names (:func:`retrim.config.trust.check_trust`).
 
     Raises:
         ConfigError: It is not a preset.

@@ -1,7 +1,7 @@
 """Names: one registry for each kind of thing that an experiment is made of.
 
 A name is looked up among what was registered, then among the entry points of installed packages; ``module:name`` is
-imported from the Python path or the current folder.
+imported from the Python path or the current folder. Names of files and messages pass :mod:`.trust` before.
 """
 
 import importlib
@@ -13,7 +13,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Generic, TypeVar
 
-from ..errors import ConfigError
+from ..errors import ConfigError, excerpt
 from .validation import suggestion
 
 T = TypeVar("T")
@@ -62,6 +62,8 @@ class Registry(Mapping[str, T], Generic[T]):
 
     def _imported(self, name: str) -> T:
         module, _, attribute = name.partition(":")
+        if not (all(part.isidentifier() for part in module.split(".")) and attribute.isidentifier()):
+            raise ConfigError(f"no {self._kind} {excerpt(name)}; a Python name is as module:name")
         here = str(Path.cwd())
         if here not in sys.path:
             sys.path.append(here)

@@ -1,6 +1,7 @@
 """What a command is asked for: weights, preset and reference, from files and names, checked against each other."""
 
 import dataclasses
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from ..io.trained import load_learnt, load_policy
 
 
 def loaded(
-    policy: Path | None, resume: Path | None, delta: Path | None = None
+    policy: Path | None, resume: Path | None, delta: Path | None = None, *, trust: Collection[str] = ()
 ) -> tuple[Policy, Preset, LearnerState | None]:
     """Return weights, preset, and what an earlier flight learnt.
 
@@ -26,6 +27,7 @@ def loaded(
         policy: A policy, or the folder that holds one.
         resume: Instead of a policy: what an earlier flight learnt.
         delta: A low-rank delta to put on the policy.
+        trust: Python names that a file may hold, as ``mine:task``.
 
     Raises:
         ConfigError: There are both or neither, or a delta beside what was learnt.
@@ -36,10 +38,10 @@ def loaded(
     if resume is not None:
         if delta is not None:
             raise ConfigError("--delta goes with --policy; --resume holds its own")
-        state, preset = load_learnt(resume)
+        state, preset = load_learnt(resume, trust=trust)
         return state.policy.policy.merged(), preset, state
     assert policy is not None
-    weights, preset = load_policy(policy)
+    weights, preset = load_policy(policy, trust=trust)
     return (load_delta(delta, weights).merged() if delta is not None else weights), preset, None
 
 
@@ -162,6 +164,7 @@ def asked_preset(
     vehicle: str | None = None,
     reference: str | None = None,
     residual: str | None = None,
+    trust: Collection[str] = (),
     **pretrain: int | None,
 ) -> Preset:
     """Return the preset to train with.
@@ -173,6 +176,7 @@ def asked_preset(
         vehicle: Vehicle to train for, on top of both.
         reference: What to track, on top of both.
         residual: Residual model of later adaptation, on top of both.
+        trust: Python names that the file may hold, as ``mine:task``.
         **pretrain: Values of the table ``pretrain``, on top of both; None for those that stay.
 
     Raises:
@@ -181,7 +185,7 @@ def asked_preset(
     entry = find_task(task)
     chosen = load_for(task, preset or entry.default_preset)
     if config is not None:
-        chosen = overlaid(chosen, config)
+        chosen = overlaid(chosen, config, trust=trust)
     if reference is not None:
         if not entry.has_reference:
             raise ConfigError(f"--reference {reference}: a {task} policy follows none")

@@ -2,7 +2,7 @@
 
 import dataclasses
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from ..config.loading import beside, changed, dump, load
 from ..config.presets import Preset
 from ..config.scenario import Scenario
 from ..config.setup import Setup
+from ..config.trust import check_trust
 from ..config.validation import read_toml, validated
 from ..config.vehicle_file import VehicleSpec
 from ..control.policy import Policy
@@ -69,18 +70,24 @@ class Sweep:
         ]
 
 
-def read_sweep(path: Path) -> Sweep:
+def read_sweep(path: Path, trust: Collection[str] = ()) -> Sweep:
     """Read a sweep file.
 
+    Args:
+        path: The file.
+        trust: Python names that it may hold, as ``mine:task``.
+
     Raises:
-        ConfigError: It cannot be read, or a key or value does not fit.
+        ConfigError: It cannot be read, a key or value does not fit, or it names Python code that is not trusted.
     """
     tables = read_toml(path)
     if isinstance(overlay := tables.get("overlay"), dict):
         tables["overlay"] = beside(overlay, path.parent)
     if isinstance(names := tables.get("vehicles"), list):
         tables["vehicles"] = [beside({"vehicle": name}, path.parent)["vehicle"] for name in names]
-    return validated(Sweep, tables, source=str(path))
+    sweep = validated(Sweep, tables, source=str(path))
+    check_trust(tables, trust, source=str(path))
+    return sweep
 
 
 def run_sweep(sweep: Sweep, run: Run, reporter: Reporter) -> Rows:

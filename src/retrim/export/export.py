@@ -1,6 +1,6 @@
 """`retrim export`: a policy in another format, run there and compared with JAX."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -37,7 +37,9 @@ FORMATS = {
 }
 
 
-def export(policy: Path, to: str, out: Path | None, delta: Path | None, reporter: Reporter) -> list[Path]:
+def export(
+    policy: Path, to: str, out: Path | None, delta: Path | None, reporter: Reporter, *, trust: Collection[str] = ()
+) -> list[Path]:
     """Write a policy in another format, and say how well it computes there.
 
     Args:
@@ -46,6 +48,7 @@ def export(policy: Path, to: str, out: Path | None, delta: Path | None, reporter
         out: The file; by default ``policy`` or ``delta`` and the suffix of the format, in the current folder.
         delta: A low-rank delta to put on the policy.
         reporter: Receives what is found.
+        trust: Python names that the policy may hold, as ``mine:task``.
 
     Returns:
         The files.
@@ -62,7 +65,7 @@ def export(policy: Path, to: str, out: Path | None, delta: Path | None, reporter
     path = out or Path(f"{'delta' if to == 'delta' else 'policy'}{suffix}")
     if path.suffix != suffix:
         raise ConfigError(f"--out {path}: the name must end with {suffix}")
-    weights, preset = load_policy(policy)
+    weights, preset = load_policy(policy, trust=trust)
     if to == "delta":
         assert delta is not None
         return write_delta(path, load_delta(delta, weights))

@@ -1,5 +1,6 @@
 """Policies with the preset that says how to fly them, and what a flight has learnt, as files."""
 
+from collections.abc import Collection
 from pathlib import Path
 
 import jax
@@ -9,6 +10,7 @@ from ..adapt.learner import LearnerState
 from ..config.loading import dump, parse
 from ..config.presets import Preset
 from ..config.setup import Setup
+from ..config.trust import check_trust
 from ..control.lora import LoraPolicy
 from ..control.policy import Policy
 from ..errors import CheckpointError, ConfigError, MessageError
@@ -31,15 +33,19 @@ def save_policy(path: str | Path, policy: Policy, preset: Preset) -> None:
     write_policy(path, policy, {"preset": dump(preset), "task": preset.task})
 
 
-def load_policy(path: str | Path) -> tuple[Policy, Preset]:
+def load_policy(path: str | Path, *, trust: Collection[str] = ()) -> tuple[Policy, Preset]:
     """Read a policy and its preset from a file, or from a folder that holds ``policy.safetensors``.
+
+    Args:
+        path: The file.
+        trust: Python names that its preset may hold, as ``mine:task``; they are imported.
 
     Raises:
         CheckpointError: The file is missing, truncated, damaged or of another kind, its weights are not finite, or
-            its preset cannot be used or does not fit the weights.
+            its preset cannot be used, does not fit the weights, or names Python code that is not trusted.
     """
     policy, header = read_policy(path)
-    return policy, _preset(header, architecture(policy), str(path))
+    return policy, _preset(header, architecture(policy), str(path), trust)
 
 
 def save_learnt(path: str | Path, state: LearnerState, preset: Preset) -> None:
@@ -59,18 +65,22 @@ def save_learnt(path: str | Path, state: LearnerState, preset: Preset) -> None:
     write_whole(Path(path), wire.pack(state, kind="learnt", about=about))
 
 
-def load_learnt(path: str | Path) -> tuple[LearnerState, Preset]:
+def load_learnt(path: str | Path, *, trust: Collection[str] = ()) -> tuple[LearnerState, Preset]:
     """Read what a flight has learnt, to go on from it.
 
+    Args:
+        path: The file.
+        trust: Python names that its preset may hold, as ``mine:task``; they are imported.
+
     Raises:
-        CheckpointError: The file is missing, truncated, damaged or of another kind, or its preset cannot be used or
-            does not fit what was learnt.
+        CheckpointError: The file is missing, truncated, damaged or of another kind, or its preset cannot be used, does
+            not fit what was learnt, or names Python code that is not trusted.
     """
     path = Path(path)
     data = read_bounded(path, "`retrim fly --out DIR` makes a learnt.safetensors")
     try:
         header = wire.describe(data, kind="learnt", source=str(path))
-        preset = _preset(header, header.get("architecture", ""), str(path))
+        preset = _preset(header, header.get("architecture", ""), str(path), trust)
         base = policy_like(header.get("architecture", ""), source=str(path))
         policy: Policy | LoraPolicy = lora_like(base, header, source=str(path)) if "ranks" in header else base
         learner = Setup.of(preset).learner
@@ -80,10 +90,11 @@ def load_learnt(path: str | Path) -> tuple[LearnerState, Preset]:
         raise CheckpointError(str(error)) from error
 
 
-def _preset(header: dict[str, str], sizes: str, source: str) -> Preset:
+def _preset(header: dict[str, str], sizes: str, source: str, trust: Collection[str]) -> Preset:
     """The preset of a header, checked against the architecture of the weights."""
     try:
         preset = parse(header.get("preset", ""), source=f"{source}, header, preset")
+        check_trust(preset, trust, source=source)
         wanted = Setup.of(preset).env.task.observation.size
     except ConfigError as error:
         raise CheckpointError(str(error)) from error

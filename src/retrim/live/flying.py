@@ -83,7 +83,8 @@ def fly_live(
                 status = watched(supervisor, request.seconds, events, show, run.stop, wishes)
             if request.until_stopped and status.ended == "landed":
                 run.stop.clear()  # it ended as it was meant to
-            learnt = learnt_in(supervisor.bus, status, supervisor.start) if request.method in LEARNING else None
+            start, trust = supervisor.start, supervisor.spec.trust
+            learnt = learnt_in(supervisor.bus, status, start, trust) if request.method in LEARNING else None
         if len(pieces := wishes.following.pieces) > 1:  # errors and pictures are of all that was followed
             request = replace(request, setup=request.setup.on(spliced(pieces)))
         done = _written(request, run, status, events, learnt, supervisor.refused)

@@ -11,7 +11,7 @@ from pathlib import Path
 from subprocess import Popen
 from typing import Any
 
-from ..errors import ConfigError, MessageError
+from ..errors import ConfigError, MessageError, RetrimError
 from ..onboard.launch import last_words, launch
 from ..onboard.messages import last_note, pack_note
 from ..onboard.topics import INTO, MOST, OUT
@@ -34,12 +34,13 @@ ATTEMPTS = 5  # to bring a learner back
 class Ground:
     """The learners of one flight, which is elsewhere. Leaving it as a context ends them."""
 
-    def __init__(self, address: Address, fleet: FleetProcess | None = None) -> None:
+    def __init__(self, address: Address, fleet: FleetProcess | None = None, trust: tuple[str, ...] = ()) -> None:
         """Join the bus.
 
         Args:
             address: Where the flight is.
             fleet: The process that learns for all of several flights; None: processes of this one alone.
+            trust: Python names that the flight may name, as ``mine:task``; they are imported here.
 
         Raises:
             ConfigError: It cannot be joined.
@@ -47,7 +48,7 @@ class Ground:
         self._network = address.join(dict.fromkeys((*OUT, *INTO), MOST), listen=False, writes=INTO)
         self._place = tempfile.TemporaryDirectory(prefix="retrim-ground-")
         self.folder = Path(self._place.name)
-        self.address, self._fleet = address, fleet
+        self.address, self._fleet, self._trust = address, fleet, trust
         self.processes: dict[str, Popen[bytes] | Seat] = {}
         self.restarts: dict[str, int] = {}
         self._mission: Mission | None = None
@@ -71,8 +72,8 @@ class Ground:
             self._network.close()
             self._place.cleanup()
 
-    def wait(self) -> Iterator[None]:
-        """Yield until there is a flight to learn for.
+    def wait(self) -> Iterator[str]:
+        """Yield how it stands until there is a flight to learn for.
 
         Raises:
             ConfigError: Somebody is there, and has another key or none.
@@ -82,7 +83,7 @@ class Ground:
                 self._distrust = time.monotonic()
             if fault and self._distrust is not None and time.monotonic() > self._distrust + DISTRUST:
                 raise ConfigError(f"{self.address}: {fault}")
-            yield
+            yield self._standing
 
     def learn(self) -> Iterator[str]:
         """Learn until the flight is over; yield how it stands, after each step.
@@ -113,6 +114,13 @@ class Ground:
         try:
             mission = Mission.unpack(message.data)
         except MessageError:
+            return self._mission is not None
+        try:
+            mission.check(self._trust)
+        except RetrimError as error:
+            self._standing = f"a flight was refused: {error}"
+            note = pack_note("ground", base=mission.base, alive={}, failed=f"the ground refused: {error}", over=False)
+            self._network.publish("ground", note)
             return self._mission is not None
         (self.folder / f"start-{mission.number}.safetensors").write_bytes(mission.start)
         before = self._mission
@@ -154,7 +162,9 @@ class Ground:
         assert m is not None
         assert self._bus is not None
         start = self.folder / f"start-{m.number}.safetensors"
-        plan = LearnerPlan(self._bus.folder, layer, start, m.reference, m.seed, m.base, os.getpid(), m.floor)
+        plan = LearnerPlan(
+            self._bus.folder, layer, start, m.reference, m.seed, m.base, os.getpid(), m.floor, self._trust
+        )
         if (old := self.processes.get(layer)) is not None:
             old.kill()  # a seat in the process of a fleet outlives that process
         complaints = self.folder / f"{layer}.log"
@@ -220,7 +230,10 @@ def flights_at(texts: Sequence[str], key: Path | None) -> list[Address]:
 
 
 def learn_for(
-    addresses: Sequence[Address], stop: threading.Event, told: Callable[[str], None] = lambda text: None
+    addresses: Sequence[Address],
+    stop: threading.Event,
+    told: Callable[[str], None] = lambda text: None,
+    trust: tuple[str, ...] = (),
 ) -> str:
     """Learn for flights elsewhere until all of them are over.
 
@@ -230,6 +243,7 @@ def learn_for(
         addresses: Where the flights are.
         stop: Ends it early; the flights go on with their last policies.
         told: Receives how they stand, very often.
+        trust: Python names that a flight may name, as ``mine:task``; they are imported here.
 
     Returns:
         How they ended.
@@ -250,7 +264,7 @@ def learn_for(
         if len(addresses) > 1:
             fleet = FleetProcess(Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="retrim-fleet-"))))
             stack.callback(fleet.close)
-        grounds = [stack.enter_context(Ground(address, fleet)) for address in addresses]
+        grounds = [stack.enter_context(Ground(address, fleet, trust)) for address in addresses]
         stands = dict.fromkeys(grounds, "waiting for a flight")
         # A thread for each: a network that is slow to one vehicle keeps no other waiting.
         pool = stack.enter_context(ThreadPoolExecutor(len(grounds)))
@@ -271,7 +285,8 @@ def learn_for(
 
 def _serve(ground: Ground, stands: dict[Ground, str], stop: threading.Event) -> None:
     """Learn for one flight until it is over, and note how it stands."""
-    for _ in ground.wait():
+    for words in ground.wait():
+        stands[ground] = words
         if stop.wait(SELDOM):
             return
     for words in ground.learn():

@@ -55,6 +55,8 @@ class LearnerPlan:
     parent: int
     floor: int = 0
     """Version of the policy up to which updates on the bus are older than ``start``."""
+    trust: tuple[str, ...] = ()
+    """Python names that ``start`` may hold, since the user named them to the process that wrote this plan."""
 
 
 class LearnerLoop:
@@ -75,7 +77,7 @@ class LearnerLoop:
             clock: The time [s].
             setup_of: Returns the set-up of a preset and a reference; loops of several vehicles may share one.
         """
-        state, preset = load_learnt(plan.start)
+        state, preset = load_learnt(plan.start, trust=plan.trust)
         self.plan, self.bus, self.state, self._clock = plan, bus, state, clock
         self.setup = setup_of(preset, plan.reference)
         self.every = preset.adapt.fit_every if plan.layer == "residual" else preset.adapt.update_every

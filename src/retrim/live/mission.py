@@ -1,7 +1,8 @@
 """What learners on another machine have to know."""
 
 import json
-from collections.abc import Mapping
+import re
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
@@ -9,9 +10,13 @@ from typing import cast
 import numpy as np
 
 from ..adapt.updates import Layer
-from ..errors import MessageError
+from ..config.loading import parse
+from ..config.trust import check_trust
+from ..errors import MessageError, excerpt
 from ..onboard.topics import INTO, LAYERS, MOST, OUT
 from ..transport.message import describe, pack_arrays, unpack_arrays
+
+LOCAL = re.compile(r"\.(csv|toml)(:|\+|$)", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -38,6 +43,23 @@ class Mission:
         """Return the mission of a flight whose learners start from a file."""
         carried = {topic: size for topic, size in capacities.items() if topic in (*OUT, *INTO)}
         return cls(number, reference, seed, base, layers, floor, carried, start.read_bytes())
+
+    def check(self, trust: Collection[str]) -> None:
+        """Check that what is to be built names no Python code but what the user of this machine named.
+
+        Args:
+            trust: Python names, as ``mine:task``.
+
+        Raises:
+            MessageError: The file holds no learner's state, or a file of this machine is named.
+            ConfigError: The preset cannot be used, or a Python name is not trusted.
+        """
+        header = describe(self.start, kind="learnt", source="mission")
+        preset = parse(header.get("preset", ""), source="mission, preset")
+        check_trust((preset, self.reference), trust, source="mission")
+        followed = (self.reference or "", "" if preset.track is None else preset.track.reference)
+        if files := [name for name in (*followed, str(preset.vehicle)) if LOCAL.search(name)]:
+            raise MessageError(f"mission: names a file of this machine, {excerpt(files[0])}; built-in names only")
 
     def pack(self) -> bytes:
         """Return the bytes; the inverse of :meth:`unpack`."""

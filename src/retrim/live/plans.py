@@ -47,4 +47,4 @@ def plan_of(role: str, spec: LiveSpec, start: Path, floor: int, bus: Path, cores
         assert s.learners is not None
         return BridgePlan(bus, s.learners, parent)
     layer: Layer = "residual" if role == "residual" else "policy"
-    return LearnerPlan(bus, layer, start, s.reference, s.seed, s.controller.base, parent, floor)
+    return LearnerPlan(bus, layer, start, s.reference, s.seed, s.controller.base, parent, floor, s.trust)

@@ -1,6 +1,6 @@
 """What a live flight leaves: a log in the form of all others, errors, and the accounts of its deadlines."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -135,15 +135,16 @@ def _finite(value: Any) -> Any:
     return None if value is None or not np.isfinite(value) else value
 
 
-def learnt_in(bus: Bus, status: Status, start: Path) -> LearnerState | None:
+def learnt_in(bus: Bus, status: Status, start: Path, trust: Collection[str] = ()) -> LearnerState | None:
     """Return what was learnt and flown last; None if nothing was.
 
     Args:
         bus: Of the flight.
         status: How it stands.
         start: File with what the learners went on from.
+        trust: Python names that it may hold.
     """
-    state = load_learnt(start)[0]
+    state = load_learnt(start, trust=trust)[0]
     fit, policy = (flown_update(bus, state, layer, status.control) for layer in LAYERS)
     if fit is not None and isinstance(fit[1], ResidualUpdate):
         state = LearnerState(state.policy, fit[1].state)

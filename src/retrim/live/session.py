@@ -17,6 +17,7 @@ from ..adapt.updates import Layer
 from ..config.methods import find_method
 from ..config.scenario import Scenario
 from ..config.setup import Setup
+from ..config.trust import python_names
 from ..control.policy import Policy
 from ..errors import ConfigError
 from ..experiments.flights import FlightSpec
@@ -152,6 +153,7 @@ def live_spec(request: LiveRequest) -> LiveSpec:
         folder=request.folder,
         page=_page(request) if request.page is not None else None,
         learners=request.learners if request.method in LEARNING else None,
+        trust=python_names(preset),
         mains=MAINS | {"plant": VEHICLE} if vehicle else MAINS,
     )
 

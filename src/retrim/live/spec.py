@@ -81,5 +81,7 @@ class LiveSpec:
     page: PageSpec | None = None
     learners: Address | None = None
     """Where learners on another machine are reached; None: they are processes of this one."""
+    trust: tuple[str, ...] = ()
+    """Python names that ``start`` may hold: the user named them to this process."""
     mains: Mapping[str, str] = field(default_factory=lambda: MAINS)
     """What runs as each process; another link to a vehicle is another main function of the plant."""

@@ -69,8 +69,8 @@ class Wishes:
 
     def _start_of(self, method: str, status: Status) -> Path:
         """Write down what flies, in the form in which ``method`` learns."""
-        found = learnt_in(self._supervisor.bus, status, self._supervisor.start)
-        state = found or load_learnt(self._supervisor.start)[0]
+        start, trust = self._supervisor.start, self._supervisor.spec.trust
+        state = learnt_in(self._supervisor.bus, status, start, trust) or load_learnt(start, trust=trust)[0]
         self._starts += 1
         path = self._request.folder / f"start-{self._starts}.safetensors"
         merged = state.policy.policy.merged()

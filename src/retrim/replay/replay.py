@@ -62,6 +62,8 @@ class Replay:
     default that of the policy."""
     policy: Path | None = None
     """A policy to adapt, or the folder that holds one."""
+    trust: tuple[str, ...] = ()
+    """Python names that the policy may hold, as mine:task; they are imported."""
     adapt: str = "none"
     """full, lora: re-train the policy in the model that the log corrects, all weights or a few; none."""
     updates: int = 60
@@ -95,7 +97,7 @@ def replay(path: Path, asked: Replay, run: Run, reporter: Reporter) -> Document:
         LogError: The log cannot be used.
         ConfigError: A name does not exist, or does not fit.
     """
-    policy, preset = load_policy(asked.policy) if asked.policy else (None, load(DEFAULT))
+    policy, preset = load_policy(asked.policy, trust=asked.trust) if asked.policy else (None, load(DEFAULT))
     if asked.vehicle is not None:
         preset = with_vehicle(preset, asked.vehicle)
     setup = Setup.of(preset if asked.residual is None else changed(preset, adapt={"residual": asked.residual}))

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from ...config.loading import dump
 from ...config.presets import Preset
 from ...config.setup import Setup
+from ...config.trust import python_names
 from ...control.policy import Policy
 from ...errors import CheckpointError
 from ...io.trained import load_policy, save_policy
@@ -42,7 +43,7 @@ def trained_policies(preset: Preset, seeds: Sequence[int], run: Run, reporter: R
     for seed, path in paths.items():
         if path.is_file():
             try:
-                found[seed] = load_policy(path)[0]
+                found[seed] = load_policy(path, trust=python_names(preset))[0]
             except CheckpointError as error:
                 reporter.say(f"{error}; trained again")
 

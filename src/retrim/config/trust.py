@@ -1,0 +1,66 @@
+"""The trust boundary: which Python names may come from a file or a message.
+
+A name that is registered is always allowed. ``module:name`` imports a module and calls what it holds. It is accepted
+from who types it, on the command line and in Python. In a file and in a message it is data, and refused, unless the
+user names it as well: ``--trust mine:task``, or ``trust=("mine:task",)``.
+
+Whoever reads a policy, a learner's state, a preset, a sweep or a network message calls :func:`check_trust` before
+anything of it is built. Whoever starts a process of its own hands on :func:`python_names` of what the user named.
+"""
+
+import dataclasses
+import re
+from collections.abc import Collection, Iterator, Mapping
+from typing import Any
+
+from ..errors import ConfigError, excerpt
+
+CSV_FILE = re.compile(r"[^:]*\.csv(:(laps|once))?", re.IGNORECASE)
+"""A trajectory, which is no Python name: its colon says how it is flown."""
+FREE = "options"
+"""The table of a task of one's own: this package looks up nothing in it."""
+
+
+def python_names(values: Any) -> tuple[str, ...]:
+    """Return the Python names that building of ``values`` would import.
+
+    Args:
+        values: A preset, a scenario, a name, or tables and lists of them.
+    """
+    return tuple(dict.fromkeys(_names(values)))
+
+
+def check_trust(values: Any, trust: Collection[str], *, source: str) -> None:
+    """Refuse the Python names of a file or message, but for those that the user named.
+
+    Args:
+        values: What was read, before anything of it is built.
+        trust: Names as ``mine:task``.
+        source: Where it comes from; the message begins with it.
+
+    Raises:
+        ConfigError: There is a name that the user did not name.
+    """
+    for name in python_names(values):
+        if name not in trust:
+            raise ConfigError(
+                f"{source}: names Python code, {excerpt(name)}, which is not imported from a file or message; if you "
+                f"trust it, pass --trust {excerpt(name, quotes=False)}, or trust=({excerpt(name)},) in Python"
+            )
+
+
+def _names(values: Any) -> Iterator[str]:
+    if isinstance(values, str):
+        parts = (part.partition("=")[0] for part in values.split("+"))
+        yield from (part for part in parts if ":" in part and not CSV_FILE.fullmatch(part))
+    elif isinstance(values, Mapping):
+        for key, value in values.items():
+            if key != FREE:
+                yield from _names(value)
+    elif isinstance(values, list | tuple):
+        for value in values:
+            yield from _names(value)
+    elif dataclasses.is_dataclass(values) and not isinstance(values, type):
+        for field in dataclasses.fields(values):
+            if field.name != FREE:
+                yield from _names(getattr(values, field.name))

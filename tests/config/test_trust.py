@@ -1,0 +1,122 @@
+"""The trust boundary: Python names of files are data until the user names them, too."""
+
+import os
+import sys
+
+import pytest
+from jax import random
+
+from helpers import tiny_preset
+from retrim import CheckpointError, ConfigError, Setup, load_learnt, load_policy, save_learnt, save_policy
+from retrim.config import changed, load, overlaid
+from retrim.config.trust import check_trust, python_names
+from retrim.experiments.sweep import read_sweep
+from retrim.io.logs import read_map
+
+
+@pytest.fixture
+def mine(tmp_path, monkeypatch):
+    """A module of the current folder that leaves a mark when it is imported."""
+    name = f"mine_{os.getpid()}_{tmp_path.name}"
+    (tmp_path / f"{name}.py").write_text(
+        f"from pathlib import Path\nPath({str(tmp_path / 'mark')!r}).touch()\n"
+        "from retrim.config.tasks import find_task\nfrom retrim.physics import small\n"
+        "task, vehicle = find_task('hover'), small\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", sys.path[:])
+    yield name
+    sys.modules.pop(name, None)
+
+
+@pytest.mark.parametrize(
+    ("values", "names"),
+    [
+        ("circle+star", ()),
+        ("my.csv:once+circle=8", ()),
+        ("a:b+c:d=3", ("a:b", "c:d")),
+        ("my.csv:os:abort", ("my.csv:os:abort",)),
+        ("my.csv:twice", ("my.csv:twice",)),
+        ({"track": {"reference": "a:b"}, "options": {"url": "http://x"}}, ("a:b",)),
+        ([("a:b",), {"x": ["c:d"]}], ("a:b", "c:d")),
+    ],
+)
+def test_a_name_with_a_colon_is_python_unless_it_says_how_a_file_is_flown(values, names):
+    assert python_names(values) == names
+
+
+def test_names_of_a_preset_are_those_that_it_would_import():
+    preset = changed(load("track/retrim"), vehicle="a:b", adapt={"residual": "c:d"}, track={"reference": "circle+e:f"})
+    assert set(python_names(preset)) == {"a:b", "c:d", "e:f"}
+    assert python_names(changed(load("hover/retrim"), task="g:h", options={"i": "j:k"})) == ("g:h",)
+
+
+def test_a_refusal_is_one_short_line_with_the_way_out():
+    with pytest.raises(ConfigError, match=r"^f: names Python code, 'os:abort', .*pass --trust os:abort, or trust="):
+        check_trust("os:abort", (), source="f")
+    with pytest.raises(ConfigError) as caught:
+        check_trust("os:\n\x1b[2J" + 10**6 * "x", (), source="f")
+    assert str(caught.value).isprintable()
+    assert len(str(caught.value)) < 500
+    check_trust("os:abort", ("os:abort",), source="f")
+
+
+@pytest.mark.parametrize("key", ["task", "vehicle"])
+def test_a_policy_file_imports_what_is_trusted_and_nothing_else(mine, tmp_path, key):
+    name, preset = f"{mine}:{key}", tiny_preset()
+    setup = Setup.of(preset)
+    policy = setup.new_policy(random.key(0))
+    state = setup.learner.init(policy, random.key(1))
+    save_policy(tmp_path / "p.safetensors", policy, changed(preset, **{key: name}))
+    save_learnt(tmp_path / "l.safetensors", state, changed(preset, **{key: name}))
+    for read, file in ((load_policy, "p.safetensors"), (load_learnt, "l.safetensors")):
+        for trust in ((), (f"{mine}:other",)):
+            with pytest.raises(CheckpointError, match=f"names Python code, '{name}'"):
+                read(tmp_path / file, trust=trust)
+    assert not (tmp_path / "mark").exists()
+    assert mine not in sys.modules
+    for read, file in ((load_policy, "p.safetensors"), (load_learnt, "l.safetensors")):
+        assert getattr(read(tmp_path / file, trust=(name,))[1], key) == name
+    assert (tmp_path / "mark").exists()
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "vehicle = '{name}'",
+        "task = '{name}'",
+        "[adapt]\nresidual = '{name}'",
+    ],
+)
+def test_a_file_over_a_preset_needs_trust_and_the_preset_below_does_not(mine, tmp_path, text):
+    (tmp_path / "over.toml").write_text(text.format(name=f"{mine}:vehicle"))
+    below = load("hover/retrim")
+    with pytest.raises(ConfigError, match="names Python code"):
+        overlaid(below, tmp_path / "over.toml")
+    with pytest.raises(ConfigError, match="names Python code"):
+        load("hover/retrim", tmp_path / "over.toml")
+    assert overlaid(below, tmp_path / "over.toml", trust=(f"{mine}:vehicle",)) != below
+    (tmp_path / "other.toml").write_text("dt = 0.01")
+    typed = changed(below, vehicle=f"{mine}:vehicle")
+    assert overlaid(typed, tmp_path / "other.toml").vehicle == f"{mine}:vehicle"
+
+
+@pytest.mark.parametrize("key", ["methods", "disturbances", "plants", "vehicles", "sensors", "references"])
+def test_a_sweep_file_needs_trust(mine, tmp_path, key):
+    (tmp_path / "s.toml").write_text(f"{key} = ['{mine}:vehicle']")
+    with pytest.raises(ConfigError, match=f"names Python code, '{mine}:vehicle'"):
+        read_sweep(tmp_path / "s.toml")
+    assert getattr(read_sweep(tmp_path / "s.toml", (f"{mine}:vehicle",)), key) == (f"{mine}:vehicle",)
+    (tmp_path / "s.toml").write_text(f"[overlay]\nvehicle = '{mine}:vehicle'")
+    with pytest.raises(ConfigError, match="names Python code"):
+        read_sweep(tmp_path / "s.toml")
+    assert mine not in sys.modules
+
+
+def test_fields_of_a_log_map_are_looked_up_in_the_log_only(mine, tmp_path):
+    (tmp_path / "m.toml").write_text(
+        f"[time]\nfield = '{mine}:t'\n[position]\nfields = ['{mine}:p']\n[velocity]\nfields = ['{mine}:v']\n"
+        f"[attitude]\nfields = ['{mine}:q']\nform = 'xyzw'\n[thrust]\nfields = ['{mine}:c']\nunit = 'm/s^2'\n"
+    )
+    assert read_map(tmp_path / "m.toml").position.fields == (f"{mine}:p",)
+    assert mine not in sys.modules
