@@ -9,6 +9,7 @@ from pydantic import TypeAdapter
 
 from ..errors import ConfigError
 from .named_presets import PRESETS
+from .names import plain_from
 from .presets import BUILT_IN_TASKS, Preset
 from .trust import check_trust
 from .validation import read_toml, suggestion, validated
@@ -43,7 +44,7 @@ def load_for(task: str, name: str) -> Preset:
         return preset
     if task in BUILT_IN_TASKS or preset.task != "hover":
         raise ConfigError(f"preset {preset.name!r} is for {preset.task}, not for {task}")
-    return changed(preset, task=task, name=f"{task} on {preset.name}")
+    return changed(preset, task=task, name=plain_from(f"{task} on {preset.name}"))
 
 
 def overlaid(preset: Preset, overlay: Path, *, trust: Collection[str] = ()) -> Preset:

@@ -7,9 +7,10 @@ impossible value is an error that gives its path.
 import math
 from typing import Annotated, Any, Literal
 
-from pydantic import ConfigDict, Field, FiniteFloat, Strict, model_validator
+from pydantic import ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
+from .names import Plain, Printable, TaskName
 from .vehicle_file import VehicleSpec
 
 STRICT = ConfigDict(extra="forbid")
@@ -18,7 +19,7 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
 Count = Annotated[int, Field(ge=1, le=1_000_000, strict=True)]
 LearningRate = Annotated[float, Field(gt=0, le=10.0, strict=True)]
 Seconds = Annotated[float, Field(ge=1e-3, le=3600.0, strict=True)]
-Coordinate = Annotated[FiniteFloat, Strict()]
+Coordinate = Annotated[float, Field(ge=-1000.0, le=1000.0, allow_inf_nan=False, strict=True)]
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -49,7 +50,7 @@ class Adapt:
 
     window: int = Field(default=100, ge=12, le=100_000, strict=True)
     """Ticks of flight that are remembered."""
-    residual: str = "ensemble"
+    residual: Printable = "ensemble"
     """Residual model: ensemble (the paper's), regression (ten physical numbers), layered (an ensemble on what the
     regression leaves), linear (19 features, carried along the flight), or module:name."""
     memory: Seconds = 0.5
@@ -97,7 +98,7 @@ class Adapt:
 class Track:
     """What only tracking has."""
 
-    reference: str = "circle"
+    reference: Printable = "circle"
     """Reference of training: circle, figure8, star, a CSV file, module:name, or several of these joined by +."""
     observation: Literal["state", "preview", "flat"] = "state"
     """state: o = [p, R, v]; preview: the reference relative to the vehicle, now and soon; flat: its acceleration and
@@ -133,13 +134,13 @@ class Vision:
 class Preset:
     """An experiment."""
 
-    name: str = "hover/paper"
-    task: str = "hover"
+    name: Plain = "hover/paper"
+    task: TaskName = "hover"
     """hover, track, vision, or module:name."""
     reward: Literal["paper", "l2", "sharp", "view"] = "paper"
     """paper: as printed; l2: ours, with a tip at the goal in hover; sharp: l2 with a tip at the reference, too;
     view: l2 that keeps keypoints in the image."""
-    vehicle: str | VehicleSpec = "small"
+    vehicle: Printable | VehicleSpec = "small"
     """Vehicle of training: small, large, kingfisher, module:name, or a vehicle file."""
     dt: float = Field(default=0.02, ge=0.002, le=0.1, strict=True)
     """Control period [s]: 50 Hz in the paper (Sec. III-E). A whole number of milliseconds."""

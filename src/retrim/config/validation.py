@@ -14,6 +14,7 @@ from ..errors import ConfigError
 
 T = TypeVar("T")
 
+NO_NAME = "Input should be a valid string"
 MAX_TOML_BYTES = 1_000_000
 
 
@@ -70,7 +71,8 @@ def _explained(kind: type[Any], error: ValidationError) -> str:
             message = f"unknown key; {suggestion(path[-1], _keys(kind, path[:-1]))}"
         elif each["type"] in ("missing", "missing_argument"):
             message = "is missing"
-        found.setdefault(where, message)
+        if found.get(where) in (None, NO_NAME):  # a table where a name may be, too: what is wrong with it
+            found[where] = message
     return "; ".join(f"{where}: {message}" if where else message for where, message in found.items())
 
 

@@ -13,6 +13,7 @@ from ..errors import ConfigError
 from ..physics.state import STANDARD_GRAVITY
 from ..physics.step_response import step_responses
 from ..physics.vehicle import Vehicle, kingfisher, small
+from .names import Plain, plain_from
 from .units import Positive, Three, at_most, likely
 from .validation import read_toml, validated
 
@@ -33,7 +34,7 @@ ENOUGH = (1.6, 20.0)
 class VehicleSpec:
     """A quadrotor in X configuration."""
 
-    name: str
+    name: Plain
     mass: Annotated[float, Field(gt=0.005, strict=True), AfterValidator(at_most(50.0, "kg", ("g", 1e-3)))]
     """All-up mass [kg]."""
     inertia: Three
@@ -192,7 +193,7 @@ def read_vehicle(path: Path) -> VehicleSpec:
             vehicle.
     """
     tables = read_toml(path)
-    tables.setdefault("name", path.stem)
+    tables.setdefault("name", plain_from(path.stem))
     spec = validated(VehicleSpec, tables, source=str(path))
     try:
         check_flyable(spec.build())

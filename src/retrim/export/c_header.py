@@ -26,15 +26,20 @@ def write_c(path: Path, policy: Portable) -> list[Path]:
 
 def name_of(path: Path) -> str:
     """Return what all names in the header of a file begin with."""
-    name = re.sub(r"\W", "_", path.stem)
+    name = re.sub(r"\W", "_", path.stem, flags=re.ASCII)
     return f"_{name}" if name[0].isdigit() else name
+
+
+def remark(text: object) -> str:
+    """Return a text as a comment may hold it: nothing in it ends the comment, continues a line or begins another."""
+    return re.sub(r"[^\w./+ -]|/(?![\w.])", "_", str(text)[:64], flags=re.ASCII)
 
 
 def _header(name: str, policy: Portable) -> str:
     sizes, guard = policy.sizes, f"{name.upper()}_H"
     shape = "-".join(map(str, sizes))
     lines = [
-        f"/* Policy {shape}, preset {policy.about['preset']}, a command every {policy.about['dt']:g} s.",
+        f"/* Policy {shape}, preset {remark(policy.about['preset'])}, a command every {policy.about['dt']:g} s.",
         "   World ENU, body forward-left-up. Command: collective thrust, mass-normalised [m/s^2], body rates [rad/s].",
         f"   {name}_check() computes the test vectors below; fly only if it returns less than 1e-5. */",
         f"#ifndef {guard}",

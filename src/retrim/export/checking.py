@@ -88,9 +88,8 @@ def check_c(path: Path, policy: Portable, rows: np.ndarray, wanted: np.ndarray) 
         return None
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
-        header = place / path.name
-        shutil.copy(path, header)
-        text = MAIN.format(header=header.name, rows=len(rows), size=rows.shape[1], name=name_of(path))
+        shutil.copy(path, place / "policy.h")
+        text = MAIN.format(header="policy.h", rows=len(rows), size=rows.shape[1], name=name_of(path))
         (place / "main.c").write_text("#define _POSIX_C_SOURCE 199309L\n" + text)
         words = [compiler, *FLAGS, "main.c", "-o", "main", "-lm"]
         built = subprocess.run(words, cwd=place, capture_output=True, text=True, timeout=LONGEST)

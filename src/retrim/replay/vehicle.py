@@ -2,12 +2,15 @@
 
 import tomllib
 
+from ..config.names import MOST as LONGEST_NAME
+from ..config.names import plain_from
 from ..config.setup import Setup
 from ..config.vehicle_file import VehicleSpec
 from ..config.vehicles import name_of
 from .identification import Estimate, Identified
 
 SHORTEST, LONGEST = 0.002, 0.5  # [s] that a lag of a vehicle file may have
+SUFFIX = "-identified"
 MOST = 0.2  # [s] that a delay may have
 
 
@@ -23,10 +26,11 @@ def vehicle_toml(found: Identified, setup: Setup, log: str) -> str:
     keep = spec if isinstance(spec, VehicleSpec) else None
     mass = float(base.mass)
     lines = [
-        f"# Identified from {log}; what no line says so of is that of {name_of(spec)!r}. Intervals hold 90 %.",
+        f"# Identified from {plain_from(log)}; what no line says so of is that of {plain_from(name_of(spec))!r}.",
+        "# Intervals hold 90 %.",
         *([] if found.thrust_gain is None else [f"# Thrust per commanded thrust: {found.thrust_gain.text('')}."]),
         *(f"# Linear drag along body {a}: {d.text('1/s')}." for a, d in zip("xyz", found.drag, strict=True) if d),
-        f'name = "{name_of(spec)}-identified"',
+        f'name = "{plain_from(name_of(spec))[: LONGEST_NAME - len(SUFFIX)]}{SUFFIX}"',
         f"mass = {mass:.6g}  # [kg]",
         f"inertia = {_row(base.inertia.tolist())}  # [kg m^2]",
         f"arm = {_row(base.arm.tolist())}  # [m]",

@@ -60,6 +60,8 @@ def panel_figure(title: str, panels: Sequence[Panel], *, across: int = 3) -> "ma
             axes.set(xlabel=panel.x, ylabel=panel.y)
             if panel.log:
                 axes.set(xscale="log", yscale="log")
+                for label in (*axes.get_xticklabels(which="both"), *axes.get_yticklabels(which="both")):
+                    label.set_parse_math(True)  # powers of ten; names of others are text
             axes.set_title(panel.title, fontsize=11, color=INK)
             axes.grid(alpha=0.25)
             axes.legend(fontsize=8, frameon=False, ncols=panel.columns)

@@ -1,13 +1,17 @@
 """One renderer for all tables: sections of text cells, written as Markdown and JSON after each section."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from ...errors import one_line
 from ..provenance import describe_code, describe_hardware
 from ..reporter import Reporter
 from ..run import Run
+
+MOST = 2000  # characters of a cell
 
 
 @dataclass(frozen=True)
@@ -24,14 +28,27 @@ class TableSection:
 
     def markdown(self) -> list[str]:
         """Return the section as lines of Markdown."""
-        lines = [f"## {self.title}", ""] if self.title else []
-        lines += [self.about, ""] if self.about else []
+        lines = [f"## {as_text(self.title)}", ""] if self.title else []
+        lines += [_escaped(self.about), ""] if self.about else []
         if self.rows:
-            lines += ["| " + " | ".join(self.columns) + " |", "|---" * len(self.columns) + "|"]
-            lines += ["| " + " | ".join(row) + " |" for row in self.rows] + [""]
+            lines += ["| " + " | ".join(map(_cell, self.columns)) + " |", "|---" * len(self.columns) + "|"]
+            lines += ["| " + " | ".join(map(_cell, row)) + " |" for row in self.rows] + [""]
         if self.picture is not None:
-            lines += [f"![{self.title or self.picture.stem}]({self.picture.name})", ""]
+            lines += [f"![{as_text(self.title or self.picture.stem)}]({self.picture.name})", ""]
         return lines
+
+
+def as_text(text: str) -> str:
+    """Return a text on one line in which Markdown finds no link and no HTML, whoever wrote it."""
+    return _escaped(one_line(text, MOST))
+
+
+def _escaped(text: str) -> str:
+    return re.sub(r"<(?=[A-Za-z/!?])", "&lt;", text).replace("](", "]\\(")
+
+
+def _cell(text: str) -> str:
+    return re.sub(r"(?<!\\)\|", r"\\|", as_text(text))
 
 
 @dataclass
@@ -63,7 +80,7 @@ class Document:
         """Write both files; return the path of the Markdown."""
         seeds = ", ".join(map(str, self.seeds))
         remark = [self.run.remark, ""] if self.run.remark else []
-        head = [f"# {self.title}", "", self.intro, "", *remark]
+        head = [f"# {as_text(self.title)}", "", self.intro, "", *remark]
         trained = f"; training seeds {seeds}" if seeds else ""
         head += [f"{describe_code()}; {describe_hardware()}{trained}.", ""]
         body = [line for section in self.sections for line in section.markdown()]
