@@ -12,6 +12,7 @@ import pytest
 from importlinter import cli as importlinter
 
 import retrim
+from retrim.onboard.launch import PYTHON
 
 ROOT = Path(__file__).parent.parent
 HOUSE = ROOT / "src" / "retrim"
@@ -95,6 +96,12 @@ def test_what_is_stated_once_stays_as_it_is():
 def test_only_viz_imports_matplotlib():
     importers = {p for p in SOURCES if re.search(r"^\s*(import|from) matplotlib", p.read_text(), re.M)}
     assert {p.parent.name for p in importers} == {"viz"}
+
+
+def test_processes_of_ours_take_no_module_from_the_current_folder():
+    for path in SOURCES:
+        assert path.stem == "launch" or '"-m"' not in path.read_text(), path
+    assert PYTHON[1:] == ("-P", "-m")
 
 
 def test_pins_hold_names_and_versions_only():

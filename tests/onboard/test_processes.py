@@ -16,6 +16,7 @@ from live_processes import DT, HOME, level, moved
 from retrim.onboard.accounts import accounted, summary
 from retrim.onboard.control_process import PATIENCE, Schedule
 from retrim.onboard.guard import G, Limits, Mode
+from retrim.onboard.launch import launch
 from retrim.onboard.messages import ACCOUNTS, COLUMNS, COMMAND, FlightRows, Sample, Setpoint, Stamp, pack_note
 from retrim.onboard.realtime import Lifeline, cores_of
 from retrim.onboard.recorder import Recorder, RecorderPlan, read_log, record
@@ -298,3 +299,34 @@ def test_the_accounts_are_those_of_the_durations():
     assert sum(found["histogram"]) == 100
     assert found["histogram"][-1] == 1
     assert summary(np.array([]))["p99"] is None
+
+
+# ---- modules
+
+
+OWN = """
+import calendar, numpy, pathlib
+from retrim.cli import main
+
+def write(place):
+    pathlib.Path(place).write_text("\\n".join(module.__file__ for module in (calendar, numpy)))
+"""
+
+
+@pytest.mark.parametrize("appended", [False, True])
+def test_a_process_takes_no_module_from_the_current_folder_but_one_that_is_only_there(tmp_path, monkeypatch, appended):
+    name = f"own_{os.getpid()}"
+    (tmp_path / f"{name}.py").write_text(OWN)
+    for shadow in ("calendar", "numpy", "json", "pickle", "retrim", "jax"):
+        (tmp_path / f"{shadow}.py").write_text(f"open({str(tmp_path / 'mark')!r}, 'w')")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", ["", str(tmp_path), *sys.path] if appended else sys.path)
+    launched = launch(f"{name}:write", str(tmp_path / "done"), tmp_path / "log")
+    assert (launched.wait(60) == 0) == appended
+    assert not (tmp_path / "mark").exists()
+    if appended:
+        found = (tmp_path / "done").read_text().splitlines()
+        assert len(found) == 2
+        assert not any(str(tmp_path) in each for each in found)
+    else:
+        assert f"No module named '{name}'" in (tmp_path / "log").read_text()

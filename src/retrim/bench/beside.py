@@ -14,6 +14,7 @@ from jax import random
 from ..config.loading import load
 from ..config.scenario import Scenario
 from ..config.setup import Setup
+from ..onboard.launch import PYTHON
 from .flown import learner_in_flight
 from .machine import on_core
 from .timing import timed
@@ -28,7 +29,7 @@ def policies() -> dict[str, Any]:
     Raises:
         OSError: The flight did not begin or go on, or the system does not let a process choose its core.
     """
-    command = [sys.executable, "-m", "retrim.bench.beside"]
+    command = [*PYTHON, "retrim.bench.beside"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as flight:
         on_core(-1)  # the flight has begun with a choice of all
         learner, state, window = learner_in_flight(PRESET)

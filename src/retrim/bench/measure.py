@@ -3,7 +3,6 @@
 import json
 import os
 import subprocess
-import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,6 +12,7 @@ from ..errors import ConfigError
 from ..experiments.reporter import Reporter
 from ..experiments.run import Run
 from ..experiments.tables.document import Document, TableSection
+from ..onboard.launch import PYTHON
 from .machine import UNIT_FLOP
 from .works import WORKS
 
@@ -104,7 +104,7 @@ def _process(name: str, cores: str, environment: dict[str, str]) -> dict[str, An
     inherited = {key: value for key, value in os.environ.items() if key != "JAX_COMPILATION_CACHE_DIR"}
     inherited |= {"JAX_PLATFORMS": "cpu"} if cores == "one" else {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
     ran = subprocess.run(
-        [sys.executable, "-m", "retrim.bench.works", name, cores],
+        [*PYTHON, "retrim.bench.works", name, cores],
         env=inherited | environment,
         capture_output=True,
         text=True,

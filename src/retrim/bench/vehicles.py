@@ -26,6 +26,7 @@ from ..live.spec import LiveSpec
 from ..live.topics import topics
 from ..onboard.control import ControlLoop
 from ..onboard.guard import Mode
+from ..onboard.launch import PYTHON
 from ..onboard.messages import Sample, last_note
 from ..onboard.realtime import sleep_until
 from ..physics.state import Command, State
@@ -44,9 +45,7 @@ def live_fleet(n: int) -> dict[str, Any]:
     Raises:
         OSError: The vehicles did not fly to the end.
     """
-    ran = subprocess.run(
-        [sys.executable, "-m", "retrim.bench.vehicles", str(n)], stdout=subprocess.PIPE, text=True, check=False
-    )
+    ran = subprocess.run([*PYTHON, "retrim.bench.vehicles", str(n)], stdout=subprocess.PIPE, text=True, check=False)
     if ran.returncode != 0 or not ran.stdout:
         raise OSError(f"the {n} vehicles did not fly to the end")
     found: dict[str, Any] = json.loads(ran.stdout.splitlines()[-1])

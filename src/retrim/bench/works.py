@@ -17,6 +17,7 @@ from ..config.scenario import Scenario
 from ..config.setup import Setup
 from ..experiments.fleet import Fleet
 from ..experiments.stopwatch import Stopwatch
+from ..onboard.launch import PYTHON
 from ..physics.state import Command
 from ..runtime.flight import fly
 from .beside import policies
@@ -89,9 +90,7 @@ def _bem_tick() -> dict[str, Any]:
 def _demo() -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         began = time.perf_counter()
-        subprocess.run(
-            [sys.executable, "-m", "retrim.cli", "demo", "--out", folder], check=True, stdout=subprocess.DEVNULL
-        )
+        subprocess.run([*PYTHON, "retrim.cli", "demo", "--out", folder], check=True, stdout=subprocess.DEVNULL)
         total = time.perf_counter() - began
         with open(f"{folder}/results.json") as file:
             compile_s = json.load(file)["compile_s"]

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from ..onboard.launch import PYTHON
 from ..transport.bus import Bus
 from ..transport.remote import Address
 from ..transport.shared_memory import SharedMemoryBus
@@ -120,7 +121,7 @@ def two_machines() -> Iterator[tuple[str, Sequence[str]] | None]:
 
 def other_process(where: str) -> list[str]:
     """Return the command of the other process, but for the size; ``where`` is a folder or an address."""
-    return [sys.executable, "-m", "retrim.experiments.latency", where]
+    return [*PYTHON, "retrim.experiments.latency", where]
 
 
 def main() -> None:

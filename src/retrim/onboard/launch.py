@@ -9,6 +9,19 @@ import sys
 from pathlib import Path
 from typing import Any
 
+PYTHON = (sys.executable, "-P", "-m")
+"""Runs a module of this package: what lies in the current folder has no part in it."""
+
+
+def module_path() -> str:
+    """Return where a process of this one finds modules: as this one does, but the current folder comes last.
+
+    A module of the user's own may lie there. A ``numpy.py`` beside it is not taken for NumPy.
+    """
+    here, places = os.path.realpath(os.curdir), [place for place in sys.path if place]
+    last = [place for place in places if os.path.realpath(place) == here]
+    return os.pathsep.join([*(place for place in places if place not in last), *last[:1]])
+
 
 def launch(main: str, plan: Any, complaints: Path, cores: set[int] | None = None) -> "subprocess.Popen[bytes]":
     """Start a process of this machine.
@@ -26,12 +39,12 @@ def launch(main: str, plan: Any, complaints: Path, cores: set[int] | None = None
     quiet = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
     with complaints.open("ab") as file:
         process = subprocess.Popen(
-            [sys.executable, "-m", "retrim.onboard.launch", main],
+            [*PYTHON, "retrim.onboard.launch", main],
             stdin=subprocess.PIPE,
             stdout=file,
             stderr=file,
             start_new_session=True,
-            env=os.environ | quiet | {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p)},
+            env=os.environ | quiet | {"PYTHONPATH": module_path()},
         )
     if cores is not None and hasattr(os, "sched_setaffinity"):
         with contextlib.suppress(OSError):
