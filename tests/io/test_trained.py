@@ -2,6 +2,7 @@
 
 import json
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,7 +15,7 @@ from retrim.config import PRESETS, Setup, changed, load
 from retrim.config.loading import dump
 from retrim.control import Policy
 from retrim.io import read_policy, write_policy
-from retrim.io.checkpoint import architecture, lora_header
+from retrim.io.checkpoint import architecture, load_delta, lora_header, save_delta
 from retrim.physics import small
 from retrim.transport import wire
 
@@ -35,7 +36,17 @@ def states(setup):
 
     with jax.numpy_dtype_promotion("standard"):
         each = {"full": policy, "lora": setup.low_rank(policy, random.key(5))}
-        return {k: jax.tree.map(filled, setup.learner.init(p, random.key(6))) for k, p in each.items()}
+        made = {k: setup.learner.init(p, random.key(6)) for k, p in each.items()}
+        return {k: with_limits(policy, jax.tree.map(filled, state)) for k, state in made.items()}
+
+
+def with_limits(policy, tree):
+    """A tree whose policies have the command limits of ``policy``."""
+
+    def limited(part):
+        return policy.with_params(part.layers) if isinstance(part, Policy) else part
+
+    return jax.tree.map(limited, tree, is_leaf=lambda part: isinstance(part, Policy))
 
 
 def preset_with(preset, **values):
@@ -178,3 +189,54 @@ def test_a_policy_is_not_what_was_learnt(tmp_path, setup, states):
         load_policy(path)
     with pytest.raises(CheckpointError, match=r"nothing: no such file; `retrim fly --out DIR`"):
         load_learnt(tmp_path / "nothing")
+
+
+# ---- numbers that are finite and cannot be flown
+
+
+def with_leaf(tree, where, value):
+    return eqx.tree_at(where, tree, replace_fn=lambda leaf: jnp.full_like(leaf, value))
+
+
+@pytest.mark.parametrize(
+    ("where", "value", "message"),
+    [
+        (lambda p: p.layers[0].weight, 3e38, r"0\.weight holds 3e\+38; at most 100000 can be flown"),
+        (lambda p: p.layers[1].bias, -1e9, r"1\.bias holds 1e\+09"),
+        (lambda p: p.u_max.c, 3e38, r"command limits .* to \[3e\+38, .*must be within \+-1000 m/s\^2"),
+        (lambda p: p.u_min.omega, -1e5, r"must be within .* \+-1000 rad/s"),
+        (lambda p: p.u_max.c, 0.0, "do not enclose hover"),
+    ],
+)
+def test_a_policy_whose_numbers_cannot_be_flown_is_refused(tmp_path, setup, states, where, value, message):
+    policy = setup.new_policy(random.key(4))
+    save_policy(tmp_path / "p.safetensors", with_leaf(policy, where, value), setup.preset)
+    with pytest.raises(CheckpointError, match=message):
+        load_policy(tmp_path / "p.safetensors")
+    state = eqx.tree_at(lambda s: s.policy.policy, states["full"], with_leaf(policy, where, value))
+    save_learnt(tmp_path / "l.safetensors", state, setup.preset)
+    with pytest.raises(CheckpointError, match="holds|limits"):
+        load_learnt(tmp_path / "l.safetensors")
+
+
+def test_a_delta_is_judged_by_what_it_makes_of_its_base(tmp_path, setup, states):
+    lora = states["lora"].policy.policy
+    for value, path in ((1e39, tmp_path / "a"), (1e9, tmp_path / "b")):
+        save_delta(path, eqx.tree_at(lambda p: p.scale, lora, value))
+        with pytest.raises(CheckpointError, match=r"merged: 0\.weight holds .* at most 100000 can be flown"):
+            load_delta(path, lora.base)
+    state = eqx.tree_at(lambda s: s.policy.policy.scale, states["lora"], jnp.asarray(1e9))
+    rewritten(tmp_path / "l", setup, state, dump(setup.preset))
+    with pytest.raises(CheckpointError, match=r"holds .* at most 100000 can be flown"):
+        load_learnt(tmp_path / "l")
+
+
+def test_a_residual_that_makes_the_command_useless_is_refused(tmp_path):
+    setup = Setup.of(tiny_preset(adapt={"residual": "regression", "frame": "gravity"}))
+    state = setup.learner.init(setup.new_policy(random.key(0)), random.key(1))
+    save_learnt(tmp_path / "l.safetensors", state, setup.preset)
+    load_learnt(tmp_path / "l.safetensors")
+    wild = jax.tree.map(lambda leaf: jnp.full_like(leaf, 1e30), state.residual)
+    save_learnt(tmp_path / "l.safetensors", eqx.tree_at(lambda s: s.residual, state, wild), setup.preset)
+    with pytest.raises(CheckpointError, match=r"residual\..* holds 1e\+30; at most 1e\+12 can be flown"):
+        load_learnt(tmp_path / "l.safetensors")

@@ -15,6 +15,7 @@ from ..errors import CheckpointError, MessageError
 from ..physics.vehicle import small
 from ..transport import wire
 from .files import read_bounded, write_whole
+from .sanity import check_policy
 
 MAX_WIDTH, MAX_LAYERS = 16_384, 16
 
@@ -38,8 +39,8 @@ def read_policy(path: str | Path) -> tuple[Policy, dict[str, str]]:
         The policy, and the header of its file.
 
     Raises:
-        CheckpointError: The file is missing, truncated, damaged or of another kind, its weights are not finite, or
-            its limits do not enclose hover.
+        CheckpointError: The file is missing, truncated, damaged or of another kind, its weights or
+            commands are not finite or too large, or its limits do not enclose hover.
     """
     path = Path(path)
     file = path / "policy.safetensors" if path.is_dir() else path
@@ -52,9 +53,7 @@ def read_policy(path: str | Path) -> tuple[Policy, dict[str, str]]:
         policy = wire.unpack(data, like, kind="policy", source=str(file))
     except MessageError as error:
         raise CheckpointError(str(error)) from error
-    low, hover, high = (np.asarray(u.vector()) for u in (policy.u_min, policy.u_hover, policy.u_max))
-    if not (np.all(low < hover) and np.all(hover < high)):
-        raise CheckpointError(f"{file}: command limits {low} to {high} do not enclose hover, {hover}")
+    check_policy(policy, source=str(file))
     return policy, header
 
 
@@ -110,7 +109,8 @@ def load_delta(path: str | Path, base: Policy) -> LoraPolicy:
         base: The policy that the delta was made for.
 
     Raises:
-        CheckpointError: The file is missing, damaged or of another kind, or made for another base.
+        CheckpointError: The file is missing, damaged or of another kind, made for another base, or the merged policy
+            cannot be flown.
     """
     path = Path(path)
     data = read_bounded(path, "`retrim fly --adapt lora --out DIR` makes a delta.safetensors")
@@ -125,7 +125,9 @@ def load_delta(path: str | Path, base: Policy) -> LoraPolicy:
         delta, shift = wire.unpack(data, (like.delta, like.shift), kind="delta", source=str(path))
     except MessageError as error:
         raise CheckpointError(str(error)) from error
-    return LoraPolicy(base, delta, jnp.asarray(float(header["scale"]), dtype=base.layers[0].weight.dtype), shift)
+    policy = LoraPolicy(base, delta, jnp.asarray(float(header["scale"]), dtype=base.layers[0].weight.dtype), shift)
+    check_policy(policy.merged(), source=f"{path}, merged")
+    return policy
 
 
 def lora_header(policy: LoraPolicy) -> dict[str, str]:

@@ -2,21 +2,32 @@
 
 from collections.abc import Collection
 from pathlib import Path
+from typing import Any
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
+import numpy as np
 from jax import random
+from jaxtyping import Array, Float
 
 from ..adapt.learner import LearnerState
 from ..config.loading import dump, parse
 from ..config.presets import Preset
 from ..config.setup import Setup
 from ..config.trust import check_trust
+from ..control.controller import AbstractController
 from ..control.lora import LoraPolicy
 from ..control.policy import Policy
 from ..errors import CheckpointError, ConfigError, MessageError
+from ..physics.state import State
+from ..tasks.observation import AbstractObservation
 from ..transport import wire
 from .checkpoint import architecture, lora_header, lora_like, policy_like, read_policy, write_policy
 from .files import read_bounded, write_whole
+from .sanity import check_policy, check_size
+
+MOST = 1e12  # of a number that a learner goes on with
 
 
 def save_policy(path: str | Path, policy: Policy, preset: Preset) -> None:
@@ -45,7 +56,9 @@ def load_policy(path: str | Path, *, trust: Collection[str] = ()) -> tuple[Polic
             its preset cannot be used, does not fit the weights, or names Python code that is not trusted.
     """
     policy, header = read_policy(path)
-    return policy, _preset(header, architecture(policy), str(path), trust)
+    setup = _setup(header, architecture(policy), str(path), trust)
+    check_policy(policy, source=str(path), observation=np.asarray(_seen_at_rest(setup)))
+    return policy, setup.preset
 
 
 def save_learnt(path: str | Path, state: LearnerState, preset: Preset) -> None:
@@ -80,25 +93,47 @@ def load_learnt(path: str | Path, *, trust: Collection[str] = ()) -> tuple[Learn
     data = read_bounded(path, "`retrim fly --out DIR` makes a learnt.safetensors")
     try:
         header = wire.describe(data, kind="learnt", source=str(path))
-        preset = _preset(header, header.get("architecture", ""), str(path), trust)
+        setup = _setup(header, header.get("architecture", ""), str(path), trust)
         base = policy_like(header.get("architecture", ""), source=str(path))
         policy: Policy | LoraPolicy = lora_like(base, header, source=str(path)) if "ranks" in header else base
-        learner = Setup.of(preset).learner
-        like = jax.eval_shape(lambda policy: learner.init(policy, random.key(0)), policy)
-        return wire.unpack(data, like, kind="learnt", source=str(path)), preset
+        like = jax.eval_shape(lambda policy: setup.learner.init(policy, random.key(0)), policy)
+        state = wire.unpack(data, like, kind="learnt", source=str(path))
     except (MessageError, ConfigError) as error:
         raise CheckpointError(str(error)) from error
+    check_size(state, source=str(path), largest=MOST)
+    check_policy(state.policy.policy.merged(), source=str(path), observation=np.asarray(_seen_at_rest(setup)))
+    if not np.isfinite(np.asarray(_command_at_rest(setup.controller(state), setup.flown.home()))).all():
+        raise CheckpointError(f"{path}: its command at hover is not finite; what was learnt cannot be flown")
+    return state, setup.preset
 
 
-def _preset(header: dict[str, str], sizes: str, source: str, trust: Collection[str]) -> Preset:
-    """The preset of a header, checked against the architecture of the weights."""
+def _setup(header: dict[str, str], sizes: str, source: str, trust: Collection[str]) -> Setup:
+    """The set-up of a header's preset, checked against the architecture of the weights."""
     try:
         preset = parse(header.get("preset", ""), source=f"{source}, header, preset")
         check_trust(preset, trust, source=source)
-        wanted = Setup.of(preset).env.task.observation.size
+        setup = Setup.of(preset)
     except ConfigError as error:
         raise CheckpointError(str(error)) from error
-    expected = "-".join(map(str, (wanted, *preset.pretrain.hidden_sizes, 4)))
+    expected = "-".join(map(str, (setup.env.task.observation.size, *preset.pretrain.hidden_sizes, 4)))
     if sizes != expected:
         raise CheckpointError(f"{source}: architecture {sizes}, but its preset {preset.name!r} needs {expected}")
-    return preset
+    return setup
+
+
+def _seen_at_rest(setup: Setup) -> Float[Array, " o"]:
+    """What a policy sees of a vehicle that has rested at home."""
+    seen: Float[Array, " o"] = _observed(setup.env.task.observation, setup.env.task.home())
+    return seen
+
+
+@eqx.filter_jit
+def _observed(observation: AbstractObservation[Any], home: Float[Array, "3"]) -> Float[Array, " o"]:
+    return observation.at_rest(State.at(home))
+
+
+@eqx.filter_jit
+def _command_at_rest(controller: AbstractController[Any], home: Float[Array, "3"]) -> Float[Array, "4"]:
+    x = State.at(home)
+    u, _ = controller(controller.init(x), jnp.zeros_like(home[0]), x)
+    return u.vector()

@@ -21,12 +21,14 @@ def sheet(size: tuple[float, float], font_size: float, *, boxed: bool = False) -
     import matplotlib
     from matplotlib.figure import Figure
 
-    style = {
-        "font.size": font_size,
-        "axes.spines.top": boxed,
-        "axes.spines.right": boxed,
-        "svg.fonttype": "none",
-        "text.parse_math": False,  # a name with dollar signs is a name
-    }
-    with matplotlib.rc_context(style):
+    with matplotlib.rc_context(
+        {
+            "font.size": font_size,
+            "axes.spines.top": boxed,
+            "axes.spines.right": boxed,
+            "svg.fonttype": "none",
+            "text.parse_math": False,  # a name with dollar signs is a name
+            "text.usetex": False,
+        }
+    ):
         yield Figure(figsize=size, layout="constrained", facecolor="white")

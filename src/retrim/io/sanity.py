@@ -1,0 +1,83 @@
+"""Is a policy fit to fly at all? A checksum proves that a file is whole; its numbers may be unusable."""
+
+from typing import Any
+
+import jax
+import numpy as np
+
+from ..control.policy import Policy
+from ..errors import CheckpointError, excerpt
+
+LARGEST = 1e5
+"""Of a weight; trained ones are below 100. Larger ones overflow within a few layers of single precision."""
+THRUST, RATES = 1000.0, 1000.0
+"""Largest limits of commands: [m/s^2], [rad/s]; a racing quadrotor has 150 and 40."""
+TRIALS = 8
+
+
+def check_policy(policy: Policy, *, source: str, observation: np.ndarray | None = None) -> None:
+    """Check weights, limits, and the commands at hover and around it.
+
+    Args:
+        policy: What would fly; a low-rank one, merged.
+        source: Where it comes from; the message begins with it.
+        observation: What the policy sees at hover; by default zeros.
+
+    Raises:
+        CheckpointError: A weight or limit is not finite or too large, limits do not enclose hover, or a command is not
+            finite.
+    """
+    low, hover, high = (_double(u.vector()) for u in (policy.u_min, policy.u_hover, policy.u_max))
+    most = np.array([THRUST, RATES, RATES, RATES])
+    if not all(np.all(np.abs(u) <= most) for u in (low, hover, high)):
+        raise CheckpointError(
+            f"{source}: command limits {_shown(low)} to {_shown(high)} must be within +-{THRUST:g} m/s^2 and "
+            f"+-{RATES:g} rad/s"
+        )
+    if not (np.all(low < hover) and np.all(hover < high)):
+        raise CheckpointError(
+            f"{source}: command limits {_shown(low)} to {_shown(high)} do not enclose hover, {_shown(hover)}"
+        )
+    check_size(policy.layers, source=source)
+    size = policy.layers[0].weight.shape[1]
+    rows = np.random.default_rng(0).normal(size=(TRIALS, size))
+    rows[0] = 0.0 if observation is None else observation
+    with np.errstate(all="ignore"):
+        h = rows.astype(np.float32)
+        for i, layer in enumerate(policy.layers):
+            h = h @ np.asarray(layer.weight, np.float32).T + np.asarray(layer.bias, np.float32)
+            h = h if i == len(policy.layers) - 1 else np.maximum(h, 0.0)
+        y0 = np.log((hover - low) / (high - hover))
+        commands = low + (high - low) / (1.0 + np.exp(-(h + y0)))
+    if not (np.isfinite(h).all() and np.isfinite(commands).all()):
+        raise CheckpointError(f"{source}: its command at hover is not finite; the weights cannot be flown")
+
+
+def check_size(tree: Any, *, source: str, largest: float = LARGEST) -> None:
+    """Check that all real numbers of a tree are finite and not larger than weights can be.
+
+    Args:
+        tree: A pytree of arrays.
+        source: Where it comes from; the message begins with it.
+        largest: Of their absolute values.
+
+    Raises:
+        CheckpointError: One is larger.
+    """
+    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+        if np.asarray(leaf).dtype.kind != "f" or not np.size(leaf):
+            continue
+        found = float(np.max(np.abs(np.asarray(leaf))))
+        if not found <= largest:
+            name = jax.tree_util.keystr(path, simple=True, separator=".")
+            raise CheckpointError(
+                f"{source}: {excerpt(name, quotes=False)} holds {found:.3g}; at most {largest:g} can be flown"
+            )
+
+
+def _double(vector: Any) -> np.ndarray:
+    return np.asarray(vector, dtype=float)
+
+
+def _shown(vector: np.ndarray) -> str:
+    return "[" + ", ".join(f"{x:.4g}" for x in vector) + "]"
