@@ -25,6 +25,7 @@ UNITS = {
     **dict.fromkeys("xyz", ("m", "meter", "meters", "metre", "metres")),
     "yaw": ("rad", "radian", "radians"),
 }
+MAX_BYTES = 32 * 2**20
 FARTHEST = 1000.0  # [m]
 LARGEST_YAW = 2.0 * math.pi + 0.1  # [rad]: what is beyond looks like degrees
 LONGEST = 600.0  # [s]
@@ -52,6 +53,10 @@ def read_table(file: Path) -> np.ndarray:
         ConfigError: The file cannot be read as that, with the line; times do not rise; or values are not plausible.
         OSError: The file cannot be opened.
     """
+    if file.exists() and not file.is_file():
+        raise ConfigError(f"{file} is not a regular file")
+    if file.exists() and (size := file.stat().st_size) > MAX_BYTES:
+        raise ConfigError(f"{file}: {size} bytes, more than the {MAX_BYTES} that are accepted")
     try:
         text = file.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:

@@ -17,6 +17,7 @@ from ..errors import MessageError
 
 FORMAT = "retrim/1"
 MAX_BYTES = 256 * 2**20
+MAX_HEADER = 4 * 2**20
 UNNAMED = "nothing"
 
 
@@ -116,11 +117,12 @@ def _header(data: bytes, source: str) -> dict[str, str]:
     """Return the header of a whole message."""
     if len(data) > MAX_BYTES:
         raise MessageError(f"{source}: {len(data)} bytes, more than the {MAX_BYTES} that are accepted")
+    if MAX_HEADER < (size := int.from_bytes(data[:8], "little")) <= len(data):
+        raise MessageError(f"{source}: a header of {size} bytes, more than the {MAX_HEADER} that are accepted")
     try:
         deserialize(data)
     except SafetensorError as error:
         raise MessageError(f"{source}: not a whole safetensors file; truncated or of another kind ({error})") from error
-    size = int.from_bytes(data[:8], "little")
     header = dict(json.loads(data[8 : 8 + size]).get("__metadata__") or {})
     if header.get("format") != FORMAT:
         raise MessageError(f"{source}: format {header.get('format', 'none')!r}, expected {FORMAT!r}")

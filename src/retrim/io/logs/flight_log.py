@@ -55,6 +55,7 @@ class FlightLog:
         return float(np.sum(self.valid) * self.dt)
 
 
+@np.errstate(all="ignore")  # numbers that overflow are no part of a flight, and left out as such
 def read_flight_log(path: Path, log_map: LogMap | None = None, *, dt: float = 0.02) -> FlightLog:
     """Read a flight.
 

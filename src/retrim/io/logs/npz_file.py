@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import LogError
+from .npz_members import NpzMembers
 from .series import Clock, Series, first_of, missing_field, sign_of
 
 
@@ -15,11 +16,7 @@ def read_npz(
     """Read the arrays of an NPZ file; ``u[1:4]`` are columns of one. See :class:`~retrim.io.logs.series.LogReader`."""
     if time is None:
         raise LogError(f'{path}: an NPZ file needs a table [time] in the map, as field = "t" and unit = "s"')
-    try:
-        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
-            arrays = {name: np.asarray(file[name]) for name in file.files}
-    except Exception as error:  # whatever its parsers meet in bytes that are no NPZ
-        raise LogError(f"{path}: not a whole NPZ file ({error})") from error
+    arrays = NpzMembers(path)
     t = _flat(path, time.field, arrays)[:, 0] * time.scale
     found = dict[str, Series]()
     for what, fields in wanted.items():
@@ -36,7 +33,7 @@ def read_npz(
     return found, []
 
 
-def _flat(path: Path, name: str, arrays: Mapping[str, np.ndarray]) -> np.ndarray:
+def _flat(path: Path, name: str, arrays: NpzMembers) -> np.ndarray:
     """Return an array as samples x columns."""
     base, _, part = name.partition("[")
     if base not in arrays:

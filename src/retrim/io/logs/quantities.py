@@ -22,6 +22,8 @@ READERS: dict[str, LogReader] = {
     ".bag": read_bag, ".mcap": read_bag, ".db3": read_bag,
 }  # fmt: skip
 """By the end of the name; a folder is a bag of ROS 2."""
+MOST_BYTES = 2 * 2**30, 256 * 2**20
+"""Of a log, and of one that is text."""
 CONVERTERS = {
     ".bbl": "blackbox_decode of blackbox-tools makes a CSV of it",
     ".bfl": "blackbox_decode of blackbox-tools makes a CSV of it",
@@ -146,8 +148,12 @@ def _reader(path: Path) -> LogReader:
         raise LogError(f"{path}: {suffix} is not read; {CONVERTERS[suffix]}, to be read with --map map.toml")
     if suffix not in READERS:
         raise LogError(f"{path}: no log that is known; there are {', '.join(READERS)}, and folders of ROS 2")
-    if path.stat().st_size == 0:
+    if not path.is_file():
+        raise LogError(f"{path}: not a regular file")
+    if (size := path.stat().st_size) == 0:
         raise LogError(f"{path}: it is empty")
+    if size > (most := MOST_BYTES[suffix == ".csv"]):
+        raise LogError(f"{path}: {size} bytes, more than the {most} that are accepted; cut out a part of the flight")
     return READERS[suffix]
 
 
