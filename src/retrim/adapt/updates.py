@@ -113,7 +113,7 @@ def unpack_update(data: bytes, like: LearnerState, *, source: str) -> Update:
     try:
         plain = _checked(json.loads(wire.describe(data, kind=kind, source=source)["update"]), types[kind])
         update: Update = types[kind](**plain, **({"state": state} if kind in ("residual", "policy") else {}))
-    except (KeyError, TypeError, ValueError, RecursionError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         raise MessageError(f"{source}: not the fields of a {kind!r} update ({error})") from error
     return update
 
@@ -131,10 +131,11 @@ def _field(name: str, value: Any, wanted: Any) -> Any:
         # A policy may replace one whose cost was not finite.
         if type(value) not in (int, float) or not (math.isfinite(value) or name == "incumbent_cost"):
             raise ValueError(f"{name} = {value!r} is no finite number")
-    elif wanted is Counts:
+        return float(value)
+    if wanted is Counts:
         if type(value) is not list or len(value) != len(REASONS) or any(type(n) is not int or n < 0 for n in value):
             raise ValueError(f"{name} must be {len(REASONS)} whole numbers of at least 0")
         return tuple(value)
-    elif not isinstance(value, str) or (wanted is Layer and value not in get_args(Layer)):
+    if not isinstance(value, str) or (wanted is Layer and value not in get_args(Layer)):
         raise ValueError(f"{name} = {value!r}")
     return value

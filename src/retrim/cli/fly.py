@@ -13,6 +13,7 @@ from ..errors import ConfigError
 from ..experiments.asked import Where, loaded, same_policy, with_residual
 from ..experiments.figures import picture
 from ..experiments.fleet import Fleet
+from ..experiments.flights import Flight
 from ..experiments.gathering import told_by
 from ..experiments.interrupts import interrupts_only_set
 from ..experiments.metrics import cell, notes, rows
@@ -94,6 +95,7 @@ def fly(
 
 
 def _fly(fleet: Fleet, setup: Setup, scenario: Scenario, run: Run) -> int:
+    flights = list[Flight]()  # a Ctrl-C may come before there are any
     with run.interruptible(), RichReporter().progress("flying") as advance:
         advance(0.0, "compiling the programs of a flight (kept in a cache for the next time)")
         flights = fleet.run(stop=run.stop, progress=told_by(advance)).flown

@@ -15,7 +15,7 @@ from .vehicle_file import VehicleSpec
 
 STRICT = ConfigDict(extra="forbid")
 BUILT_IN_TASKS = ("hover", "track", "vision")
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
+Positive = Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False, strict=True)]
 Count = Annotated[int, Field(ge=1, le=1_000_000, strict=True)]
 LearningRate = Annotated[float, Field(gt=0, le=10.0, strict=True)]
 Seconds = Annotated[float, Field(ge=1e-3, le=3600.0, strict=True)]
@@ -63,7 +63,7 @@ class Adapt:
     """Optimiser steps of one fit."""
     fit_learning_rate: LearningRate = 1e-2
     """Adam's rate of the fit."""
-    spectral_weight: float = Field(default=1e-3, ge=0, allow_inf_nan=False, strict=True)
+    spectral_weight: float = Field(default=1e-3, ge=0, le=1e6, allow_inf_nan=False, strict=True)
     """Weight of the spectral penalty; the paper gives none."""
     update_every: Seconds = 5.0
     """Time between policy updates [s]."""
@@ -156,7 +156,7 @@ class Preset:
     """Declared command delay of the plant [ticks], to pair accelerations with commands."""
     actuator_tau: Positive | None = None
     """Time constant of the model's actuators [s]; none by default."""
-    jump_cost: float = Field(default=0.0, ge=0.0, allow_inf_nan=False)
+    jump_cost: float = Field(default=0.0, ge=0.0, le=1e6, allow_inf_nan=False, strict=True)
     """Cost of the squared change of the command from tick to tick, c in m/s^2 and rates in rad/s."""
     track: Track | None = None
     vision: Vision | None = None

@@ -10,10 +10,13 @@ from typing import Any, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 
-from ..errors import ConfigError
+from ..errors import ConfigError, excerpt
 
 T = TypeVar("T")
 
+CHECKED, TOLD = 100, 8
+"""Mistakes of one file that are looked at, and that are named."""
+UNKNOWN = "unknown key"
 NO_NAME = "Input should be a valid string"
 MAX_TOML_BYTES = 1_000_000
 
@@ -30,7 +33,7 @@ def read_toml(path: Path) -> dict[str, Any]:
         if path.stat().st_size > MAX_TOML_BYTES:
             raise ConfigError(f"{path}: larger than the {MAX_TOML_BYTES} bytes that are accepted")
         return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:  # a ValueError, too: an integer of 5,000 digits
         raise ConfigError(f"{path}: not TOML ({error})") from error
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read ({error.strerror})") from error
@@ -56,24 +59,27 @@ def validated(kind: type[T], tables: dict[str, Any] | str | bytes, *, source: st
 
 def suggestion(name: str, known: Iterable[str]) -> str:
     """Return the nearest known name, and all of them."""
-    near = difflib.get_close_matches(name, known := list(known), n=1)
+    near = difflib.get_close_matches(name[:100], known := list(known), n=1)
     return (f"did you mean {near[0]!r}? " if near else "") + f"there are {', '.join(known)}"
 
 
 def _explained(kind: type[Any], error: ValidationError) -> str:
-    """Each mistake with its path and, for an unknown key, the keys that there are."""
-    found = dict[str, str]()
-    for each in error.errors(include_url=False):
-        path = [str(part) for part in each["loc"] if not str(part).startswith("function-")]
+    """The first mistakes, each with its path and, for an unknown key, the keys that there are."""
+    found, mistakes = dict[str, str](), error.errors(include_url=False, include_context=False, include_input=False)
+    for each in mistakes[:CHECKED]:
+        path = [excerpt(str(part), quotes=False) for part in each["loc"] if not str(part).startswith("function-")]
         where = ".".join(path)
         message = each["msg"].removeprefix("Value error, ")
         if each["type"] == "unexpected_keyword_argument":
-            message = f"unknown key; {suggestion(path[-1], _keys(kind, path[:-1]))}"
+            message = f"{UNKNOWN}; {suggestion(path[-1], _keys(kind, path[:-1]))}"
         elif each["type"] in ("missing", "missing_argument"):
             message = "is missing"
         if found.get(where) in (None, NO_NAME):  # a table where a name may be, too: what is wrong with it
             found[where] = message
-    return "; ".join(f"{where}: {message}" if where else message for where, message in found.items())
+    ordered = sorted(found.items(), key=lambda each: not each[1].startswith(UNKNOWN))  # a slip explains what is missing
+    told = [f"{where}: {message}" if where else message for where, message in ordered][:TOLD]
+    more = len(found) - len(told) + max(len(mistakes) - CHECKED, 0)
+    return "; ".join(told) + (f"; and {more} more" if more else "")
 
 
 def _keys(kind: type[Any], path: Sequence[str]) -> list[str]:

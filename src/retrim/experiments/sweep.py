@@ -4,10 +4,10 @@ import dataclasses
 import json
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from jax import random
-from pydantic import ConfigDict, Field
+from pydantic import ConfigDict, Field, Strict
 from pydantic.dataclasses import dataclass
 
 from ..config.loading import beside, changed, dump, load
@@ -25,7 +25,7 @@ from .fleet import Fleet
 from .flights import Flight, FlightSpec
 from .gathering import told_by
 from .limits import check_seeds
-from .metrics import Rows, cell, failed_record, metres, record, summary
+from .metrics import EFFORT, Rows, cell, failed_record, metres, record, summary
 from .provenance import section_key
 from .reporter import Reporter
 from .run import Run
@@ -34,6 +34,8 @@ from .tables.kept import files_behind, named_by, named_in
 from .tables.kept_policies import trained_policies
 
 STRICT = ConfigDict(extra="forbid")
+GROUP = ("preset", "plant", "vehicle", "sensors", "reference", "disturbance", "method")
+FIGURES = ("error", "peak_after_5s", "settle_s", "cross_track_m", "behind_s", "unshifted_m", *EFFORT)
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -42,7 +44,7 @@ class Sweep:
 
     presets: tuple[str, ...] = Field(default=("hover/retrim",), min_length=1)
     """Presets to train a policy with, for each seed."""
-    seeds: tuple[int, ...] = Field(default=(0,), min_length=1)
+    seeds: tuple[Annotated[int, Strict()], ...] = Field(default=(0,), min_length=1)
     """Training seeds; each also seeds starts, disturbances and learners of its flights."""
     methods: tuple[str, ...] = Field(default=("base", "full"), min_length=1)
     disturbances: tuple[str, ...] = Field(default=("none",), min_length=1)
@@ -52,8 +54,8 @@ class Sweep:
     sensors: tuple[str, ...] = Field(default=("ideal",), min_length=1)
     references: tuple[str, ...] = ()
     """What tracking policies follow."""
-    starts: int = Field(default=1, ge=1, le=100_000)
-    seconds: float | None = Field(default=None, ge=1.0, le=36_000.0)
+    starts: int = Field(default=1, ge=1, le=100_000, strict=True)
+    seconds: float | None = Field(default=None, ge=1.0, le=36_000.0, strict=True)
     """Length of a flight; the task's own by default."""
     overlay: dict[str, Any] = Field(default_factory=dict)
     """Values on top of every preset, as in a preset's own TOML file: a vehicle file is looked up beside the sweep's."""
@@ -162,13 +164,13 @@ class _Kept:
 
     def __init__(self, path: Path) -> None:
         self._path, self.rows = path, dict[str, dict[str, Any]]()
-        for line in path.read_text().splitlines() if path.is_file() else ():
+        for line in path.read_text(errors="replace").splitlines() if path.is_file() else ():
             try:
                 row = json.loads(line)
-                if row.get("failed") is None:
-                    self.rows[row["key"]] = row
-            except (json.JSONDecodeError, KeyError, TypeError):
+            except (ValueError, RecursionError):
                 continue
+            if _is_record(row) and row.get("failed") is None:
+                self.rows[row["key"]] = row
         self.earlier = frozenset(self.rows)
 
     def add(self, rows: Mapping[str, Mapping[str, Any]]) -> None:
@@ -177,12 +179,17 @@ class _Kept:
         write_whole(self._path, "".join(json.dumps(each) + "\n" for each in self.rows.values()))
 
 
+def _is_record(row: Any) -> bool:
+    """Whether a line holds what is summed up of a flight."""
+    if not (isinstance(row, dict) and isinstance(row.get("key"), str) and row.keys() >= {*GROUP, *FIGURES, "metric"}):
+        return False
+    texts = all(row[name] is None or isinstance(row[name], str) for name in (*GROUP, "metric"))
+    return texts and all(row[name] is None or type(row[name]) in (int, float) for name in FIGURES)
+
+
 def _key(preset: Preset, spec: FlightSpec, seconds: float) -> str:
     files = files_behind(spec.method, *named_in(preset), *named_by(spec.scenario))
     return section_key(preset=dump(preset), spec=repr(spec), seconds=seconds, files=files)
-
-
-GROUP = ("preset", "plant", "vehicle", "sensors", "reference", "disturbance", "method")
 
 
 def _report(sweep: Sweep, kept: Sequence[dict[str, Any]], run: Run, reporter: Reporter) -> Rows:

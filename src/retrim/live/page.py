@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import re
 import socket
 import threading
 from collections.abc import Callable
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ..control.condition import describe_condition
-from ..errors import ConfigError, MessageError
+from ..errors import ConfigError, MessageError, excerpt
 from ..learn.screening import describe_counts
 from ..onboard.messages import Sample, last_note, last_sent, pack_note
 from ..onboard.note_fields import FIELDS, plain, read_fields, shown
@@ -40,7 +41,6 @@ FLOWN_BY = {
 """What the names of who flies mean."""
 NO_ROTATION = 0.1  # error of R R^T, above which an attitude is not shown
 FAR = 1e6  # [m], further than anything is drawn
-LONGEST_NAME = 253  # letters, of a host
 
 
 @dataclass(frozen=True)
@@ -53,14 +53,17 @@ class PagePlan:
     parent: int
 
 
+HOST = re.compile(r"(?:[\w-]{1,63}\.){0,9}[\w-]{1,63}|(?=.*:)[\da-fA-F:.]{2,45}(?:%\w{1,15})?", re.ASCII)
+
+
 def free_port(host: str, wanted: int) -> int:
     """Return a port of ``host`` that nobody listens on: the first of ten from ``wanted`` on.
 
     Raises:
         ConfigError: There is none, or no such address on this machine.
     """
-    if not host.isprintable() or len(host) > LONGEST_NAME:
-        raise ConfigError(f"page: {host[:80]!r} is no address of this machine")
+    if not HOST.fullmatch(host):
+        raise ConfigError(f"--page-host {excerpt(host)}: neither an address nor the name of a host")
     reason = ""
     for port in range(wanted, min(wanted + 10, 65536)):
         try:
@@ -68,7 +71,7 @@ def free_port(host: str, wanted: int) -> int:
                 return port
         except (OSError, ValueError) as error:  # not every text can be a name
             reason = str(getattr(error, "strerror", None) or error)[:160]
-    raise ConfigError(f"page: no free port from {wanted} on at {host[:80]!r} ({reason})")
+    raise ConfigError(f"page: no free port from {wanted} on at {excerpt(host)} ({reason})")
 
 
 def page_address(host: str, port: int, *, demanded: bool, say: Callable[[str], None]) -> tuple[str, int] | None:
