@@ -215,7 +215,7 @@ def test_a_policy_whose_numbers_cannot_be_flown_is_refused(tmp_path, setup, stat
         load_policy(tmp_path / "p.safetensors")
     state = eqx.tree_at(lambda s: s.policy.policy, states["full"], with_leaf(policy, where, value))
     save_learnt(tmp_path / "l.safetensors", state, setup.preset)
-    with pytest.raises(CheckpointError, match="holds|limits"):
+    with pytest.raises(CheckpointError, match=r"holds|limits"):
         load_learnt(tmp_path / "l.safetensors")
 
 

@@ -1,0 +1,162 @@
+"""Files and messages of strangers, with valid checksums: nothing of them runs, and each is one line of an error.
+
+A part of them in every run; ``pytest -n 0 -m slow tests/io/test_hostile_files.py`` reads all.
+"""
+
+import io
+import json
+import os
+import sys
+import tracemalloc
+import zipfile
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from hostile import Maker, Watch
+from retrim import load_learnt, load_policy
+from retrim.config import read_vehicle
+from retrim.errors import CheckpointError, ConfigError, LogError, RetrimError
+from retrim.experiments import sweep
+from retrim.io.logs import npz_members, read_flight_log
+from retrim.io.logs.npz_members import NpzMembers
+from retrim.live.page import free_port
+from retrim.tasks.trajectory_csv import from_csv
+
+LONGEST = 500
+FEW = 101
+"""Of how many cases one is read in every run."""
+
+
+@pytest.fixture(scope="module")
+def watch(tmp_path_factory):
+    return Watch(tmp_path_factory.getbasetemp())
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """The current folder, with a module that a stranger has put there."""
+    for name in ("mine_of_a_stranger", "calendar", "numpy", "x"):
+        (tmp_path / f"{name}.py").write_text("open('OWNED', 'w')\ndef run(*_): pass\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", sys.path[:])
+    return tmp_path
+
+
+def outcome(case, watch):
+    """What a case came to: ``refused``, ``read``, or a fault in words."""
+    watch.seen.clear()
+    watch.on = True
+    try:
+        case.read()
+        found = "read" if case.may_be_read else f"{case.name}: it was read"
+    except RetrimError as error:
+        line = str(error)
+        fine = line and line.isprintable() and len(line) < LONGEST
+        found = "refused" if fine else f"{case.name}: a message of {len(line)} characters: {line[:100]!r}"
+    except BaseException as error:
+        found = f"{case.name}: {type(error).__name__}: {str(error)[:200]}"
+    finally:
+        watch.on = False
+    return f"{case.name}: {watch.seen[:3]}" if watch.seen else found
+
+
+def read_all(folder, watch, every):
+    """Read each ``every``-th case twice: what is imported the first time, once and for all, is not the case's doing."""
+    maker, found = Maker(folder), list[str]()
+
+    def chosen(each):
+        return (case for i, case in enumerate(maker.cases()) if i % each == 0)
+
+    for case in chosen(50 * every):
+        outcome(case, watch)
+        maker.clear()
+    modules = set(sys.modules)
+    for case in chosen(every):
+        found.append(outcome(case, watch))
+        maker.clear()
+    faults = [each for each in found if each not in ("refused", "read")]
+    assert not faults, f"{len(faults)} of {len(found)}:\n" + "\n".join(faults[:100])
+    assert not {name for name in set(sys.modules) - modules if "stranger" in name}
+    assert not list(folder.glob("**/OWNED"))
+    return Counter(found)
+
+
+def test_some_hostile_files_run_nothing_and_are_one_line_each(folder, watch):
+    found = read_all(folder, watch, FEW)
+    assert found["refused"] > found["read"]
+
+
+@pytest.mark.slow
+def test_all_hostile_files_run_nothing_and_are_one_line_each(folder, watch):
+    found = read_all(folder, watch, 1)
+    assert found["refused"] >= 10_000
+
+
+# ---- files that are large, or unpack to much
+
+
+def archive_of(path, **arrays):
+    np.savez_compressed(path, **arrays)
+    return path
+
+
+def test_an_array_that_no_map_names_is_not_unpacked(folder):
+    n, zeros = 100, np.zeros((100, 3))
+    fine = {"t": 0.02 * np.arange(n), "p": zeros, "v": zeros, "R": np.tile(np.eye(3), (n, 1, 1)), "c": zeros[:, :1]}
+    path = archive_of(folder / "log.npz", **fine, unused=np.zeros(2**23))
+    assert path.stat().st_size < 2**20
+    members = NpzMembers(path)
+    tracemalloc.start()
+    assert {name: members[name].shape for name in fine} == {name: each.shape for name, each in fine.items()}
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 2**20
+
+
+def test_sizes_are_looked_at_before_a_file_is_read(folder, monkeypatch):
+    path = archive_of(folder / "log.npz", t=np.zeros(10_000))
+    monkeypatch.setattr(npz_members, "MAX_MEMBER", 1000)
+    with pytest.raises(LogError, match="array 't' has 80128 bytes, more than the 1000 that are accepted"):
+        NpzMembers(path)["t"]
+    logs = dict.fromkeys(("l.csv", "l.ulg", "l.npz"), read_flight_log)
+    others = {"t.csv": from_csv, "v.toml": read_vehicle, "p.safetensors": load_policy, "s.safetensors": load_learnt}
+    for name, read in (logs | others).items():
+        with (folder / name).open("wb") as file:
+            file.truncate(3 * 2**30)  # a hole: it takes no space
+        with pytest.raises(RetrimError, match="accepted"):
+            read(folder / name)
+        (folder / name).unlink()
+        os.mkfifo(folder / name)
+        with pytest.raises(RetrimError, match=r"no such file|not a regular file"):
+            read(folder / name)
+
+
+def test_a_head_that_promises_more_than_is_there_takes_no_memory(folder):
+    head = io.BytesIO()
+    np.lib.format.write_array_header_1_0(head, {"descr": "<f8", "fortran_order": False, "shape": (10**12,)})
+    with zipfile.ZipFile(folder / "log.npz", "w") as archive:
+        archive.writestr("t.npy", head.getvalue())
+    with pytest.raises(LogError, match=r"not a whole NPZ file \(an array of \(1000000000000,\)"):
+        NpzMembers(folder / "log.npz")["t"]
+    for size, why in ((2**40, "not a whole safetensors file"), (5 * 2**20, "a header of 5242880 bytes, more than")):
+        (folder / "p.safetensors").write_bytes(size.to_bytes(8, "little") + b"{" + 5 * 2**20 * b" ")
+        with pytest.raises(CheckpointError, match=why):
+            load_policy(folder / "p.safetensors")
+
+
+def test_rows_of_a_sweep_that_are_none_are_flown_again(folder):
+    row = dict.fromkeys((*sweep.GROUP, *sweep.FIGURES, "metric")) | {"key": "good", "metric": "m", "error": 0.1}
+    wrong = [{**row, "key": "a", "error": "x"}, {**row, "key": "b", "plant": 3}, {"key": "c"}, {**row, "key": 4}, [], 1]
+    lines = [json.dumps(each).encode() for each in (*wrong, row)]
+    (folder / "flights.jsonl").write_bytes(b"\n".join([b"\xff\xfe", *lines, b'{"key": "torn']))
+    assert list(sweep._Kept(folder / "flights.jsonl").rows) == ["good"]
+
+
+def test_a_host_that_cannot_be_is_one_line():
+    for host in ("a\x1b[2J", "a\x00b", 300 * "a" + ".b", "\ud800", "..", "é" * 100):
+        with pytest.raises(ConfigError, match="neither an address nor the name of a host") as caught:
+            free_port(host, 8080)
+        assert str(caught.value).isprintable()
+        assert len(str(caught.value)) < LONGEST
