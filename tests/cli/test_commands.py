@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from commands import SMALL, results, retrim
-from retrim import load_learnt, load_policy
+from retrim import Fleet, load_learnt, load_policy
 
 pytestmark = pytest.mark.usefixtures("as_a_user")
 
@@ -177,6 +177,15 @@ def test_help_names_every_command(folder):
 def test_doctor_and_version(folder):
     assert "right" in retrim("doctor", cwd=folder)
     assert re.fullmatch(r"retrim \d+\.\d+\.\d+\n", retrim("--version", cwd=folder))
+
+
+def test_an_interruption_before_the_first_flight_is_over_is_a_line(folder, monkeypatch):
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Fleet, "run", interrupted)
+    out = retrim("fly", "--policy", "p", "--seconds", "1", "--out", "none", cwd=folder, code=130)
+    assert "interrupted before the first flight was over; nothing was saved" in out
 
 
 def test_a_user_s_own_task_is_pretrained_and_flown_by_its_file(folder, monkeypatch):

@@ -1,6 +1,7 @@
 """Policies with their presets, and what a flight has learnt: exact round trips; headers that lie are refused."""
 
 import json
+import time
 
 import equinox as eqx
 import jax
@@ -16,6 +17,7 @@ from retrim.config.loading import dump
 from retrim.control import Policy
 from retrim.io import read_policy, write_policy
 from retrim.io.checkpoint import architecture, load_delta, lora_header, save_delta
+from retrim.io.files import npz_bytes
 from retrim.physics import small
 from retrim.transport import wire
 
@@ -240,3 +242,19 @@ def test_a_residual_that_makes_the_command_useless_is_refused(tmp_path):
     save_learnt(tmp_path / "l.safetensors", eqx.tree_at(lambda s: s.residual, state, wild), setup.preset)
     with pytest.raises(CheckpointError, match=r"residual\..* holds 1e\+30; at most 1e\+12 can be flown"):
         load_learnt(tmp_path / "l.safetensors")
+
+
+def test_the_same_content_is_the_same_file_at_any_time(tmp_path, setup, states, monkeypatch):
+    for year, name in ((1990, "a"), (2040, "b")):
+        now = time.struct_time((year, 1, 2, 3, 4, 5, 0, 2, 0))
+        monkeypatch.setattr(time, "localtime", lambda *_, now=now: now)
+        save_policy(tmp_path / f"{name}.p", setup.new_policy(random.key(4)), setup.preset)
+        save_learnt(tmp_path / f"{name}.l", states["lora"], setup.preset)
+        save_delta(tmp_path / f"{name}.d", states["lora"].policy.policy)
+        arrays = {"x": np.arange(5.0), "y": np.array("text")}
+        (tmp_path / f"{name}.n").write_bytes(npz_bytes(arrays, compressed=True))
+    for kind in "pldn":
+        assert (tmp_path / f"a.{kind}").read_bytes() == (tmp_path / f"b.{kind}").read_bytes()
+    with np.load(tmp_path / "a.n") as file:
+        np.testing.assert_array_equal(file["x"], np.arange(5.0))
+        assert str(file["y"]) == "text"

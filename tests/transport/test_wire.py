@@ -127,3 +127,17 @@ def test_size_of_a_paper_policy():
         shapes = eqx.filter_eval_shape(lambda key: Policy.of(15, small(), key=key), random.key(0))
         data = packed(jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes))
     assert len(data) == pytest.approx(1.09e6, rel=0.01)
+
+
+def test_the_same_content_has_the_same_bytes():
+    """The library that writes a header puts its fields in another order each time."""
+    about = {f"field{i}": str(i) for i in range(20)}
+    made = {packed(**dict(sorted(about.items(), reverse=back))) for back in (True, False) for _ in range(20)}
+    assert len(made) == 1
+    (data,) = made
+    size = int.from_bytes(data[:8], "little")
+    assert size % 8 == 0
+    assert list(json.loads(data[8 : 8 + size])["__metadata__"]) == sorted([*about, "checksum", "format", "kind"])
+    np.testing.assert_array_equal(unpacked(data)["a"], TREE["a"])
+    assert packed(field="ü €\n") == packed(field="ü €\n")
+    assert wire.describe(packed(field="ü €\n"), kind="test", source="x")["field"] == "ü €\n"

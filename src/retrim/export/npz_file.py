@@ -1,6 +1,5 @@
 """NPZ: arrays of a policy, or of a low-rank delta alone, with the runner beside."""
 
-import io
 import json
 from importlib.resources import files
 from pathlib import Path
@@ -10,7 +9,7 @@ import numpy as np
 from ..control.lora import LoraPolicy
 from ..errors import ConfigError
 from ..io.checkpoint import fingerprint
-from ..io.files import write_whole
+from ..io.files import npz_bytes, write_whole
 from .portable import Portable
 
 RUNNER = "runner.py"
@@ -45,6 +44,4 @@ def write_delta(path: Path, policy: LoraPolicy) -> list[Path]:
 
 
 def _write(path: Path, arrays: dict[str, np.ndarray], about: dict[str, object]) -> None:
-    data = io.BytesIO()
-    np.savez(data, about=np.array(json.dumps(about)), allow_pickle=False, **arrays)
-    write_whole(path, data.getvalue())
+    write_whole(path, npz_bytes({"about": np.array(json.dumps(about)), **arrays}))

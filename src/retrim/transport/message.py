@@ -37,7 +37,7 @@ class ArrayLike(Protocol):
 
 
 def pack_arrays(arrays: Mapping[str, Any], *, kind: str, about: Mapping[str, str]) -> bytes:
-    """Return the bytes of a message; the inverse of :func:`unpack_arrays`.
+    """Return the bytes of a message; the inverse of :func:`unpack_arrays`. The same content has the same bytes.
 
     Args:
         arrays: Arrays by name.
@@ -46,7 +46,7 @@ def pack_arrays(arrays: Mapping[str, Any], *, kind: str, about: Mapping[str, str
     """
     tensors = {name: np.array(array, order="C") for name, array in arrays.items()}
     header = {**about, "format": FORMAT, "kind": kind}
-    return save(tensors, metadata=header | {"checksum": _checksum(tensors, header)})
+    return _in_order(save(tensors, metadata=header | {"checksum": _checksum(tensors, header)}))
 
 
 def describe(data: bytes, *, kind: str, source: str) -> dict[str, str]:
@@ -111,6 +111,14 @@ def unpack_arrays(data: bytes, expected: Mapping[str, ArrayLike], *, kind: str, 
     if header.pop("checksum", None) != _checksum(tensors, header):
         raise MessageError(f"{source}: the checksum does not match; the file was damaged or edited")
     return {name: found[name] for name in expected}
+
+
+def _in_order(data: bytes) -> bytes:
+    """Return a safetensors file whose header is sorted: the library's own order changes from call to call."""
+    end = 8 + int.from_bytes(data[:8], "little")
+    text = json.dumps(json.loads(data[8:end]), sort_keys=True, separators=(",", ":"), ensure_ascii=False).encode()
+    text += b" " * (-len(text) % 8)
+    return len(text).to_bytes(8, "little") + text + data[end:]
 
 
 def _header(data: bytes, source: str) -> dict[str, str]:

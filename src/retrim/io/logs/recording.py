@@ -3,7 +3,6 @@
 Foxglove, PlotJuggler, rerun and ``ros2 bag`` open MCAP; it needs the extra ``mcap``. ``retrim replay`` reads both.
 """
 
-import io
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ...runtime.events import Event
-from ..files import write_whole
+from ..files import npz_bytes, write_whole
 
 FRAME = "world"
 
@@ -51,9 +50,7 @@ def write_npz(path: Path, flight: Recording) -> None:
         arrays |= {f"p{end}": x[:, :3], f"R{end}": x[:, 3:12].reshape(-1, 3, 3), f"v{end}": x[:, 12:15]}
     if flight.target is not None:
         arrays["target"] = flight.target
-    data = io.BytesIO()
-    np.savez_compressed(data, allow_pickle=False, terminated=flight.terminated, **arrays)
-    write_whole(path, data.getvalue())
+    write_whole(path, npz_bytes({"terminated": flight.terminated, **arrays}, compressed=True))
 
 
 def write_mcap(path: Path, flight: Recording) -> None:
