@@ -2,6 +2,7 @@
 
 import json
 import time
+from importlib.metadata import version
 
 import equinox as eqx
 import jax
@@ -258,3 +259,56 @@ def test_the_same_content_is_the_same_file_at_any_time(tmp_path, setup, states, 
     with np.load(tmp_path / "a.n") as file:
         np.testing.assert_array_equal(file["x"], np.arange(5.0))
         assert str(file["y"]) == "text"
+
+
+# ---- releases
+
+
+def test_files_say_which_release_wrote_them(tmp_path, setup, states):
+    save_policy(tmp_path / "p", setup.new_policy(random.key(4)), setup.preset)
+    save_learnt(tmp_path / "l", states["full"], setup.preset)
+    save_delta(tmp_path / "d", states["lora"].policy.policy)
+    for name, kind in (("p", "policy"), ("l", "learnt"), ("d", "delta")):
+        header = wire.describe((tmp_path / name).read_bytes(), kind=kind, source=name)
+        assert header["version"] == version("retrim")
+
+
+@pytest.mark.parametrize(
+    ("told", "newer"),
+    [
+        ("99.0", True),
+        ("99.0.1rc1", True),
+        ("0.0.1", False),
+        ("", False),
+        ("99", False),
+        ("9" * 9, False),
+        ("é.1", False),
+    ],
+)
+def test_a_key_of_a_newer_release_is_told_as_such(tmp_path, setup, told, newer):
+    policy = setup.new_policy(random.key(4))
+    about = {"preset": preset_with(setup.preset, more=3), "architecture": architecture(policy), "version": told}
+    (tmp_path / "p").write_bytes(wire.pack(policy, kind="policy", about=about))
+    wanted = (
+        rf"written by a newer release \({told}; this one is .*more: unknown key" if newer else "preset: more: unknown"
+    )
+    with pytest.raises(CheckpointError, match=wanted) as caught:
+        load_policy(tmp_path / "p")
+    assert ("newer release" in str(caught.value)) == newer
+    whole = about | {"preset": dump(setup.preset)}
+    (tmp_path / "p").write_bytes(wire.pack(policy, kind="policy", about=whole))
+    assert load_policy(tmp_path / "p")[1] == setup.preset
+
+
+def test_defaults_of_keys_that_an_older_file_lacks_are_listed(tmp_path, setup, caplog):
+    policy, tables = setup.new_policy(random.key(4)), json.loads(dump(setup.preset))
+    for table, key in ((tables, "jump_cost"), (tables["adapt"], "trim"), (tables, "goal")):
+        del table[key]
+    write_policy(tmp_path / "p", policy, {"preset": json.dumps(tables)})
+    assert load_policy(tmp_path / "p")[1] == changed(setup.preset)
+    (line,) = [record.getMessage() for record in caplog.records if record.name.startswith("retrim")]
+    assert line.endswith("what it lacks: goal = (0.0, 0.0, 1.0), jump_cost = 0.0, adapt.trim = 'free'")
+    caplog.clear()
+    save_policy(tmp_path / "p", policy, setup.preset)
+    load_policy(tmp_path / "p")
+    assert not [record for record in caplog.records if record.name.startswith("retrim")]

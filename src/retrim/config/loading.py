@@ -1,7 +1,8 @@
 """Presets from names, TOML files, flags and JSON; every mistake is one clear line."""
 
 import dataclasses
-from collections.abc import Collection
+import json
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -104,6 +105,24 @@ def parse(text: str | bytes, *, source: str) -> Preset:
         ConfigError: It is not a preset.
     """
     return validated(Preset, text, source=source)
+
+
+def defaults_taken(preset: Preset, text: str | bytes) -> dict[str, Any]:
+    """Return the values of a preset that its JSON does not have, by dotted name: those of this release.
+
+    Args:
+        preset: What :func:`parse` made of the text.
+        text: JSON.
+    """
+    return dict(_absent(values(preset), json.loads(text), ""))
+
+
+def _absent(whole: dict[str, Any], given: Any, before: str) -> Iterator[tuple[str, Any]]:
+    for name, value in whole.items():
+        if name not in given:
+            yield before + name, value
+        elif isinstance(value, dict) and isinstance(given[name], dict):
+            yield from _absent(value, given[name], f"{before}{name}.")
 
 
 def changed(preset: Preset, **tables: Any) -> Preset:

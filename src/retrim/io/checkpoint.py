@@ -15,6 +15,7 @@ from ..errors import CheckpointError, MessageError
 from ..physics.vehicle import small
 from ..transport import wire
 from .files import read_bounded, write_whole
+from .releases import this_release
 from .sanity import check_policy
 
 MAX_WIDTH, MAX_LAYERS = 16_384, 16
@@ -26,9 +27,9 @@ def write_policy(path: str | Path, policy: Policy, about: Mapping[str, str]) -> 
     Args:
         path: The file.
         policy: What to write.
-        about: Header fields, as a preset; the architecture is added.
+        about: Header fields, as a preset; the architecture and the version of this package are added.
     """
-    header = {**about, "architecture": architecture(policy)}
+    header = {**about, "architecture": architecture(policy), "version": this_release()}
     write_whole(Path(path), wire.pack(policy, kind="policy", about=header))
 
 
@@ -97,7 +98,7 @@ def save_delta(path: str | Path, policy: LoraPolicy) -> None:
     Raises:
         OSError: The file cannot be written.
     """
-    about = {"base": fingerprint(policy.base), **lora_header(policy)}
+    about = {"base": fingerprint(policy.base), **lora_header(policy), "version": this_release()}
     write_whole(Path(path), wire.pack((policy.delta, policy.shift), kind="delta", about=about))
 
 

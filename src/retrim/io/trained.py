@@ -1,5 +1,6 @@
 """Policies with the preset that says how to fly them, and what a flight has learnt, as files."""
 
+import logging
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any
@@ -12,21 +13,23 @@ from jax import random
 from jaxtyping import Array, Float
 
 from ..adapt.learner import LearnerState
-from ..config.loading import dump, parse
+from ..config.loading import defaults_taken, dump, parse
 from ..config.presets import Preset
 from ..config.setup import Setup
 from ..config.trust import check_trust
 from ..control.controller import AbstractController
 from ..control.lora import LoraPolicy
 from ..control.policy import Policy
-from ..errors import CheckpointError, ConfigError, MessageError
+from ..errors import CheckpointError, ConfigError, MessageError, one_line
 from ..physics.state import State
 from ..tasks.observation import AbstractObservation
 from ..transport import wire
 from .checkpoint import architecture, lora_header, lora_like, policy_like, read_policy, write_policy
 from .files import read_bounded, write_whole
+from .releases import newer_release, this_release
 from .sanity import check_policy, check_size
 
+LOG = logging.getLogger(__name__)
 MOST = 1e12  # of a number that a learner goes on with
 
 
@@ -75,6 +78,7 @@ def save_learnt(path: str | Path, state: LearnerState, preset: Preset) -> None:
     policy = state.policy.policy
     low_rank = lora_header(policy) if isinstance(policy, LoraPolicy) else {}
     about = {"preset": dump(preset), "architecture": architecture(policy.merged()), **low_rank}
+    about["version"] = this_release()
     write_whole(Path(path), wire.pack(state, kind="learnt", about=about))
 
 
@@ -114,7 +118,15 @@ def _setup(header: dict[str, str], sizes: str, source: str, trust: Collection[st
         check_trust(preset, trust, source=source)
         setup = Setup.of(preset)
     except ConfigError as error:
+        if newer := newer_release(header):
+            raise CheckpointError(
+                f"{source}: written by a newer release ({newer}; this one is {this_release()}), and cannot be used: "
+                f"{error}"
+            ) from error
         raise CheckpointError(str(error)) from error
+    if absent := defaults_taken(preset, header["preset"]):
+        shown = ", ".join(f"{name} = {value!r}" for name, value in absent.items())
+        LOG.warning(one_line(f"{source}: written by an earlier release; defaults are taken for what it lacks: {shown}"))
     expected = "-".join(map(str, (setup.env.task.observation.size, *preset.pretrain.hidden_sizes, 4)))
     if sizes != expected:
         raise CheckpointError(f"{source}: architecture {sizes}, but its preset {preset.name!r} needs {expected}")

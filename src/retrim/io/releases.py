@@ -1,0 +1,34 @@
+"""Which release wrote a file, and what that means for a preset that does not fit."""
+
+import functools
+import re
+from collections.abc import Mapping
+from importlib.metadata import PackageNotFoundError, version
+
+NUMBERS = re.compile(r"(\d{1,6})\.(\d{1,6})(?:\.(\d{1,6}))?[\w.+-]{0,40}", re.ASCII)
+UNKNOWN = "0.0"
+
+
+@functools.cache
+def this_release() -> str:
+    """Return the version of this package."""
+    try:
+        return version("retrim")
+    except PackageNotFoundError:  # a copy of the source that was never installed
+        return UNKNOWN
+
+
+def newer_release(header: Mapping[str, str]) -> str | None:
+    """Return the version that wrote a file if it is newer than this one; None if it is not, or not told.
+
+    Args:
+        header: Of the file.
+    """
+    told = header.get("version", "")
+    theirs, ours = _numbers(told), _numbers(this_release())
+    return told if theirs is not None and ours is not None and theirs > ours else None
+
+
+def _numbers(text: str) -> tuple[int, int, int] | None:
+    found = NUMBERS.fullmatch(text)
+    return None if found is None else (int(found[1]), int(found[2]), int(found[3] or 0))
