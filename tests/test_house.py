@@ -104,9 +104,21 @@ def test_processes_of_ours_take_no_module_from_the_current_folder():
     assert PYTHON[1:] == ("-P", "-m")
 
 
-def test_pins_hold_names_and_versions_only():
-    for line in (ROOT / "constraints.txt").read_text().splitlines():
-        assert re.fullmatch(r"[A-Za-z0-9._-]+==[^ ]+( ; .+)?", line), line
+@pytest.mark.parametrize("name", ["constraints.txt", "tools/uv.txt"])
+def test_pins_hold_names_versions_and_hashes_only(name):
+    pins = (ROOT / name).read_text().replace(" \\\n    ", " ").splitlines()
+    assert pins
+    for line in pins:
+        assert re.fullmatch(r"[A-Za-z0-9._-]+==[^ ]+( ; [^#]+?)?( --hash=sha256:[0-9a-f]{64})+", line), line[:200]
+
+
+def test_tools_of_hosted_checks_are_pinned():
+    """A moving tag, as v4, is another program tomorrow."""
+    used = re.findall(r"uses: (\S+)@(\S+)", (ROOT / ".github" / "workflows" / "ci.yml").read_text())
+    assert used
+    assert not [each for each in used if not re.fullmatch(r"[0-9a-f]{40}|v\d+\.\d+\.\d+", each[1])]
+    (wanted,) = re.findall(r"^UV_PIN := (\S+)$", (ROOT / "Makefile").read_text(), re.M)
+    assert (ROOT / "tools" / "uv.txt").read_text().startswith(f"uv=={wanted} ")
 
 
 def test_every_public_name_resolves():
