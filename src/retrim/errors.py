@@ -22,12 +22,16 @@ def one_line(text: str, most: int = LONGEST) -> str:
     """
     if len(text) > 4 * most:  # escaping megabytes is slow
         text = text[: 2 * most] + CUT + text[-most:]
-    words = " ".join(text.split())
-    line = "".join(sign if sign.isprintable() else ascii(sign)[1:-1] for sign in words)
+    line = printable(" ".join(text.split()))
     if len(line) <= most:
         return line
     tail = most // 3
     return line[: most - tail - len(CUT)] + CUT + line[-tail:]
+
+
+def printable(text: str) -> str:
+    """Return a text whose control characters are escaped, but for the ends of lines: it cannot steer a terminal."""
+    return "".join(sign if sign.isprintable() or sign == "\n" else ascii(sign)[1:-1] for sign in text)
 
 
 def excerpt(value: object, most: int = 60, *, quotes: bool = True) -> str:

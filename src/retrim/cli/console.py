@@ -10,6 +10,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
+from ..errors import one_line, printable
 from ..experiments.reporter import Advance
 from ..experiments.run import Run
 from ..experiments.tables.document import TableSection
@@ -24,7 +25,7 @@ class RichReporter:
 
     def say(self, text: str) -> None:
         """Print plain text."""
-        console.print(text, markup=False, soft_wrap=True)
+        console.print(printable(text), markup=False, soft_wrap=True)
 
     @contextmanager
     def progress(self, title: str) -> Iterator[Advance]:
@@ -38,7 +39,7 @@ class RichReporter:
         )  # fmt: skip
         with Progress(*columns, console=console) as bars:
             bar = bars.add_task(title, total=1.0, note="")
-            yield lambda share, note: bars.update(bar, completed=share, note=escape(note))
+            yield lambda share, note: bars.update(bar, completed=share, note=escape(printable(note)))
 
 
 def _lines(title: str) -> Advance:
@@ -49,7 +50,9 @@ def _lines(title: str) -> Advance:
         now = time.monotonic()
         if now - last[0] >= LINE_EVERY or share >= 1.0:
             last[0] = now
-            console.print(f"{title}: {100 * share:.0f} %, {note}, {now - began:.0f} s", markup=False, soft_wrap=True)
+            console.print(
+                f"{title}: {100 * share:.0f} %, {printable(note)}, {now - began:.0f} s", markup=False, soft_wrap=True
+            )
 
     return advance
 
@@ -63,8 +66,7 @@ def started(run: Run) -> Run:
 
 def refuse(message: str) -> int:
     """Print one clear line and return the exit code of a refusal."""
-    line = " ".join(message.split())
-    console.print(f"[bold red]retrim:[/] {escape(line)}", soft_wrap=True)
+    console.print(f"[bold red]retrim:[/] {escape(one_line(message))}", soft_wrap=True)
     return 1
 
 

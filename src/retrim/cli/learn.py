@@ -7,6 +7,7 @@ from pathlib import Path
 
 import tyro
 
+from ..errors import printable
 from ..live.ground import flights_at, learn_for
 from .console import RichReporter, Trust, console
 
@@ -31,7 +32,7 @@ def learn(
         found = flights_at(addresses, key)
         with RichReporter().progress(", ".join(addresses)) as advance:
             last = learn_for(found, stop, lambda text: advance(0.5, text), trust)
-        console.print(last, markup=False, soft_wrap=True)
+        console.print(printable(last), markup=False, soft_wrap=True)
         return 0
 
     return ordered

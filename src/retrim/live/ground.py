@@ -11,7 +11,7 @@ from pathlib import Path
 from subprocess import Popen
 from typing import Any
 
-from ..errors import ConfigError, MessageError, RetrimError
+from ..errors import ConfigError, MessageError, RetrimError, one_line
 from ..onboard.launch import last_words, launch
 from ..onboard.messages import last_note, pack_note
 from ..onboard.topics import INTO, MOST, OUT
@@ -101,7 +101,7 @@ class Ground:
             if ended := last_note(self._bus, "ended"):
                 self._tell(over=True)
                 time.sleep(FAREWELL)  # the flight waits for that word before it takes its bridge away
-                yield f"flight over: {ended.get('reason', '')}"
+                yield one_line(f"flight over: {ended.get('reason', '')}")
                 return
             yield self._standing
 

@@ -1,0 +1,42 @@
+"""Messages of errors are one printable line of limited length, whatever they quote."""
+
+import pickle
+
+import pytest
+
+from retrim import errors
+from retrim.cli.console import RichReporter, console, refuse
+from retrim.errors import LONGEST, RetrimError, excerpt, one_line, printable
+
+KINDS = [each for each in vars(errors).values() if isinstance(each, type) and issubclass(each, RetrimError)]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_message_is_a_line_whatever_it_quotes(kind):
+    for text in ("plain", "a\nb\tc", "\x1b[2J\x00\u202e", "start " + 10**7 * "x" + " end", ""):
+        error = kind(text)
+        assert len(str(error)) <= LONGEST
+        assert str(error).isprintable()
+        assert str(pickle.loads(pickle.dumps(error))) == str(error)
+    assert str(kind("plain: 'a' must be b")) == "plain: 'a' must be b"
+
+
+def test_a_long_line_keeps_its_beginning_and_its_end():
+    line = one_line("start " + 10**7 * "x" + " end")
+    assert line.startswith("start x")
+    assert line.endswith("x end")
+    assert len(line) == LONGEST
+    assert one_line("a \n b\x07") == "a b\\x07"
+    assert excerpt(10**7 * "x") == f"'{'x' * 34} ... {'x' * 19}'"
+    assert excerpt("a'b\n") == '"a\'b\\n"'
+
+
+def test_nothing_that_is_shown_steers_a_terminal():
+    with console.capture() as shown:
+        refuse("a\x1b]0;owned\x07")
+        RichReporter().say("b\x1b[2J\nc")
+        with RichReporter().progress("d") as advance:
+            advance(1.0, "e\x1b[2J")
+    assert "\x1b[2J" not in shown.get()
+    assert "\x07" not in shown.get()
+    assert printable("a\tb\nc\x9b") == "a\\tb\nc\\x9b"
