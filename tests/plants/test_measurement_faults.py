@@ -73,7 +73,9 @@ def test_scale_biases_and_drift():
     np.testing.assert_allclose(so3.log(xs[-1].R.T @ x.R), [0.03, 0.0, 0.0], atol=1e-12)
     drifts = [float((reported(measurement_fault("drift=0.1"), k)[0].p - random_state(random.key(29)).p)[0]) for k in
               (0, 62, 63, 125, 187, 188)]  # fmt: skip
-    np.testing.assert_allclose(drifts, 0.1 * np.sin(2.0 * np.pi * np.array([0, 62, 63, 125, 187, 188]) / 250), atol=1e-9)
+    np.testing.assert_allclose(
+        drifts, 0.1 * np.sin(2.0 * np.pi * np.array([0, 62, 63, 125, 187, 188]) / 250), atol=1e-9
+    )
 
 
 def test_gaps_and_clock_jumps_show_in_the_times_of_a_plant():

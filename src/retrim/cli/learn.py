@@ -8,7 +8,8 @@ from pathlib import Path
 import tyro
 
 from ..errors import printable
-from ..live.ground import flights_at, learn_for
+from ..live.ground import learn_for
+from ..transport.remote import flights_at
 from .console import RichReporter, Trust, console
 
 
@@ -17,8 +18,7 @@ def learn(
 ) -> Callable[[threading.Event], int]:
     """Learn for flights on other machines: `retrim live --learners ADDRESS` flies one.
 
-    For several flights one process learns for all that are due at once. Ctrl-C ends it; the flights go on with their
-    last policies.
+    One process learns for several flights, too. Ctrl-C ends it; the flights go on with their last policies.
 
     Args:
         addresses: Where the flights are: zenoh:HOST:PORT of a machine that flies, or ros:HOST:PORT of a rosmaster;

@@ -18,7 +18,6 @@ from ..onboard.topics import INTO, MOST, OUT
 from ..transport.bridge import Bridge
 from ..transport.network import DISTRUST, FAREWELL
 from ..transport.remote import Address
-from ..transport.shared_key import read_key
 from ..transport.shared_memory import SharedMemoryBus
 from .fleet_process import FleetProcess, Seat
 from .learner_process import LearnerPlan
@@ -211,22 +210,6 @@ class Ground:
         if version != self._heard[0] or not version:
             self._heard = version, time.monotonic()
         return time.monotonic() - self._heard[1]
-
-
-def flights_at(texts: Sequence[str], key: Path | None) -> list[Address]:
-    """Return where flights are to learn for.
-
-    Args:
-        texts: As ``zenoh:192.168.1.5:7447``.
-        key: File with the key that the flights have, too; None: that of ``RETRIM_KEY``, if there is one.
-
-    Raises:
-        ConfigError: There is none, one of them is no address, or the key cannot be read.
-    """
-    if not texts:
-        raise ConfigError("no address; one is zenoh:HOST:PORT or ros:HOST:PORT")
-    shared = read_key(key)
-    return [Address.of(text, shared) for text in texts]
 
 
 def learn_for(
