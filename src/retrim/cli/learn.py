@@ -21,8 +21,7 @@ def learn(
     One process learns for several flights, too. Ctrl-C ends it; the flights go on with their last policies.
 
     Args:
-        addresses: Where the flights are: zenoh:HOST:PORT of a machine that flies, or ros:HOST:PORT of a rosmaster;
-            several vehicles at one rosmaster have a name each, as in ros:HOST:PORT/quad1.
+        addresses: Flights: zenoh:HOST:PORT of a machine that flies, or ros:HOST:PORT/quad1 of a rosmaster and vehicle.
         key: File with the key that the flights have, too, or RETRIM_KEY; needed where they are on other machines.
         trust: Python name that a flight may name, as mine:task; its code is run here. Once for each name.
     """

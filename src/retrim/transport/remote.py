@@ -1,13 +1,14 @@
 """Buses between machines by name: ``zenoh:192.168.1.5:7447``, ``ros:192.168.1.5:11311/quad1``."""
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from ..errors import ConfigError
 from .network import NetworkBus
 from .session import GREETINGS, Session
-from .shared_key import MAKING, VARIABLE, SharedKey
+from .shared_key import MAKING, VARIABLE, SharedKey, read_key
 
 KINDS = ("zenoh", "ros")
 LOOPBACK = ("127.0.0.1", "localhost")
@@ -89,3 +90,19 @@ class Address:
         if session is None:
             bus.publish(greeting, b"")  # so that an end with a key knows that this one has none
         return bus
+
+
+def flights_at(texts: Sequence[str], key: Path | None) -> list[Address]:
+    """Return where flights are to learn for.
+
+    Args:
+        texts: As ``zenoh:192.168.1.5:7447``.
+        key: File with the key that the flights have, too; None: that of ``RETRIM_KEY``, if there is one.
+
+    Raises:
+        ConfigError: There is none, one of them is no address, or the key cannot be read.
+    """
+    if not texts:
+        raise ConfigError("no address; one is zenoh:HOST:PORT or ros:HOST:PORT")
+    shared = read_key(key)
+    return [Address.of(text, shared) for text in texts]
