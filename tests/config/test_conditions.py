@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from retrim.config import PRESETS, changed
-from retrim.config.conditions import FLOWN, conditions
-from retrim.config.scenario import THRUST_ERROR
+from retrim.config.conditions import FLOWN, PUSH, conditions, fault_conditions
+from retrim.config.faults import FAULTS, NO_FAULT
+from retrim.config.scenario import THRUST_ERROR, Scenario
 from retrim.physics.vehicle import kingfisher, small
 
 AGREE = ("disturbance", "plant", "sensors", "reference", "thrust_error", "delay")
@@ -47,6 +48,19 @@ def test_a_condition_at_hover_is_its_disturbance_with_one_thing_changed():
     assert {name: np.unique(np.round(ratio, 6)).tolist() for name, ratio in slow.items()} == {
         name: [2.0 if name == "motor_tau" else 1.0] for name in slow
     }
+
+
+def test_a_fault_condition_has_one_fault_beside_a_push():
+    found = fault_conditions(PRESETS["hover/retrim"])
+    assert set(FAULTS) - {NO_FAULT} <= set(found)
+    for name, scenario in found.items():
+        differs = {field for field in (*AGREE, "fault") if getattr(scenario, field) != getattr(Scenario(PUSH), field)}
+        assert len(differs) == 1, name
+        if "fault" in differs:
+            assert scenario.fault == name
+    heavier = found["mass+50"].disturbance.removeprefix(f"{PUSH}+payload=")
+    assert float(heavier) == pytest.approx(0.5 * float(small().mass), rel=1e-3)
+    assert (found["delay-60ms"].delay, found["thrust-50"].thrust_error) == (0.06, -0.5)
 
 
 @pytest.mark.parametrize("preset", ["hover/retrim", "track/retrim"])

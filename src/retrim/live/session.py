@@ -14,6 +14,7 @@ from jax import random
 
 from ..adapt.learner import LearnerState
 from ..adapt.updates import Layer
+from ..config.faults import measurement_fault
 from ..config.methods import find_method
 from ..config.scenario import Scenario
 from ..config.setup import Setup
@@ -114,6 +115,11 @@ def live_spec(request: LiveRequest) -> LiveSpec:
     vehicle = request.scenario.entry.is_vehicle  # which starts at rest where its reference does
     if request.learners is not None:
         _check_remote(request)
+    fault = measurement_fault(request.scenario.fault)
+    if fault is not None and fault.interrupts:
+        raise ConfigError(
+            f"--fault {request.scenario.fault}: a live flight has a clock of its own; fly it by `retrim fly`"
+        )
     if window > MOST_TICKS:
         raise ConfigError(f"adapt.window = {window} ticks: a live flight reports at most {MOST_TICKS}")
     start = request.folder / "start.safetensors"
