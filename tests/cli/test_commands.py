@@ -119,6 +119,8 @@ def test_what_live_refuses(folder):
         (("--policy-age", "-1"), "--policy-age -1 s must be positive"),
         (("--page", "--no-page"), "--page and --no-page: choose one"),
         (("--page", "--page-port", "0"), "--page-port 0 must be between 1 and 65535"),
+        (("--fault", "gaps"), "--fault gaps: a live flight has a clock of its own; fly it by `retrim fly`"),
+        (("--fault", "lat"), "'lat'"),
         (("--page", "--page-host", "192.0.2.1"), "no free port from 8080 on at '192.0.2.1'"),
         (("--learners", "somewhere"), "'somewhere' is no address of a bus; one is zenoh:HOST:PORT or ros:HOST:PORT"),
         (("--learners", "zenoh:192.0.2.1:7447"), "learners beyond this machine need a shared key: --key FILE"),
