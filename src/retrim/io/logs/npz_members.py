@@ -16,7 +16,7 @@ MAX_MEMBER = 512 * 2**20
 SUFFIX = ".npy"
 
 
-class NpzMembers(Mapping[str, np.ndarray]):
+class NpzMembers(Mapping[str, Any]):
     """The arrays of a file by name. A member that nobody looks up is not unpacked, however large it is."""
 
     def __init__(self, path: Path) -> None:
