@@ -84,6 +84,35 @@ def test_a_wrong_sign_is_named_and_the_map_can_say_it(table, names, tmp_path):
     is_the_flight(read(tmp_path, wrong, **changes | {f"{table}__fields": mended}))
 
 
+@pytest.mark.parametrize(
+    ("table", "order"),
+    [("velocity", ("vy", "vx", "vz")), ("position", ("py", "-px", "pz")), ("rates", ("wy", "wx", "wz")),
+     ("measured_rates", ("gy", "gx", "-gz")), ("attitude", ("yaw", "pitch", "roll")),
+     ("attitude", ("pitch", "roll", "yaw"))],
+)  # fmt: skip
+def test_a_wrong_order_is_named_and_the_map_can_say_it(table, order, tmp_path):
+    changes = AXES.get(table, {})
+    fields = FIELDS[table]
+    wrong = dict(TABLE)
+    for name, place in zip(fields, order, strict=True):
+        wrong[place.removeprefix("-")] = -TABLE[name] if place.startswith("-") else TABLE[name]
+    mended = "[" + ", ".join(f'"{name}"' for name in order) + "]"
+    with pytest.raises(LogError) as caught:
+        read(tmp_path, wrong, **changes)
+    assert f"{table}.fields = {mended} they would" in str(caught.value)
+    is_the_flight(read(tmp_path, wrong, **changes | {f"{table}__fields": mended}))
+
+
+@pytest.mark.parametrize(("world", "body"), [("NWU", "FLU"), ("SEU", "FLU"), ("ENU", "LBU"), ("ENU", "RFU")])
+def test_an_attitude_that_is_turned_about_z_is_named(world, body, tmp_path):
+    own = np.swapaxes(to_world(world)[None], 1, 2) @ FLIGHT.R @ to_body(body)
+    table = columns(dataclasses.replace(FLIGHT, R=own))
+    said = f'attitude.world = "{world}"' if world != "ENU" else f'attitude.body = "{body}"'
+    with pytest.raises(LogError, match=f"with {said} they would"):
+        read(tmp_path, table)
+    is_the_flight(read(tmp_path, table, attitude__world=f'"{world}"', attitude__body=f'"{body}"'))
+
+
 @pytest.mark.parametrize("names", [("pitch",), ("roll",)])
 def test_a_wrong_sign_is_named_without_rates(names, tmp_path):
     """By the acceleration alone."""
@@ -148,7 +177,7 @@ def test_axes_that_are_none_are_named(changes, said, tmp_path):
 
 def test_an_attitude_that_explains_little_is_read_with_a_warning(tmp_path):
     """A tilt that wanders: no statement of the map mends it."""
-    off = 0.45 * np.sin(np.stack([2.3 * FLIGHT.t, 1.7 * FLIGHT.t + 1.0, 0.0 * FLIGHT.t], axis=1))
+    off = 0.9 * np.sin(np.stack([2.3 * FLIGHT.t, 1.7 * FLIGHT.t + 1.0, 0.0 * FLIGHT.t], axis=1))
     shaken = Rotation.from_matrix(FLIGHT.R) * Rotation.from_rotvec(off)
     table = columns(dataclasses.replace(FLIGHT, R=shaken.as_matrix()))
     text = MAP.partition("[rates]")[0]

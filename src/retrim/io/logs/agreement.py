@@ -4,7 +4,8 @@ Positions move as velocities say; a vehicle accelerates along its thrust axis, a
 told and as its gyroscope says. Wind, drag and lags leave something unexplained in every log.
 """
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
@@ -13,9 +14,8 @@ from .on_one_clock import UP, Ticks, turning
 from .resampling import smoothed
 
 SMOOTH = 0.2  # [s] over which differences are taken
-MOVES, TILTS, TURNS, CLIMBS = 0.15, 0.03, 0.1, 0.5  # [m/s], [rad], [rad/s], [m/s^2]: nothing can be told below
-TURNS_AXIS = 0.3  # [rad/s] of one axis
-SHARE = 0.1  # of the motion of all axes that one axis has if it is looked at by itself
+MOVES, TILTS, TURNS, CLIMBS = 0.15, 0.03, 0.1, 0.25  # [m/s], [rad], [rad/s], [m/s^2]: nothing can be told below
+AGAINST = -0.3  # agreement of one axis below which it has the other sign, however little it counts
 SLOW = 3.0  # [s]: slower changes, as those of a battery, explain nothing
 LATE = 0.2  # [s] by which an acceleration may follow the thrust
 
@@ -45,16 +45,17 @@ def agreement(chosen: LogMap, ticks: Ticks, valid: np.ndarray) -> dict[str, floa
     moved, told = ((ticks.p[k:] - ticks.p[:-k]) / (k * ticks.dt))[both], mean(ticks.v)
     independent = chosen.position is not None and chosen.velocity is not None
     if independent and max(_rms(moved), _rms(told)) > MOVES:
-        scores["motion"] = _explained(moved, told)
+        scores["motion"] = _with_signs(_explained(moved, told), moved, told, MOVES, _explained)
     felt, axis = mean(ticks.a + UP), mean(ticks.R[:, :, 2])
     scores["lift"] = _lift(felt, axis)
     along = np.sum(felt * axis, axis=1)
     if (scale := chosen.thrust.scale) is not None:
         given = scale * float(np.median(mean(ticks.thrust[:, None])))
-        scores["thrust"] = 1.0 - abs(np.log2(max(given, 1e-6) / max(float(np.median(np.abs(along))), 1e-6)))
+        had = float(np.median(np.abs(along)))
+        scores["thrust"] = 1.0 - abs(math.log2(max(given, 1e-6) / max(had, 1e-6)))
     rows = max(1, round(SLOW / ticks.dt))
     changes = along - smoothed(along, rows)
-    if float(np.std(changes)) > CLIMBS:
+    if _beyond_noise(changes, k) > CLIMBS:
         late = max(1, round(LATE / ticks.dt))
         shifts = [np.concatenate([np.full(lag, ticks.thrust[0]), ticks.thrust])[: len(ticks.t)] for lag in range(late)]
         thrusts = [mean(each[:, None])[:, 0] for each in shifts]
@@ -63,7 +64,7 @@ def agreement(chosen: LogMap, ticks: Ticks, valid: np.ndarray) -> dict[str, floa
     turned = mean(turning(ticks.R, ticks.dt))
     for name, rates in (("turning", ticks.command), ("gyroscope", ticks.rates if ticks.gyroscope else None)):
         if rates is not None and max(_rms(mean(rates)), _rms(turned)) > TURNS:
-            scores[name] = _turning(turned, mean(rates))
+            scores[name] = _with_signs(_alike(turned, mean(rates)), turned, mean(rates), TURNS, _alike)
     return scores
 
 
@@ -73,21 +74,28 @@ def _lift(felt: np.ndarray, axis: np.ndarray) -> float:
     sideways, tilt = (x[:, :2] - x[:, :2].mean(axis=0) for x in (felt, axis))
     if _rms(tilt) <= TILTS:
         return aligned
-    found = [float(np.sum(sideways * tilt) / max(np.linalg.norm(sideways) * np.linalg.norm(tilt), 1e-12))]
-    for x, y in zip(sideways.T, tilt.T, strict=True):
-        if np.std(y) > TILTS and np.sum(y**2) > SHARE * np.sum(tilt**2):
-            found.append(_correlation(x, y))
-    return min(aligned, *found)
+    leans = float(np.sum(sideways * tilt) / max(np.linalg.norm(sideways) * np.linalg.norm(tilt), 1e-12))
+    return min(aligned, _with_signs(leans, sideways, tilt, TILTS, _correlation))
 
 
-def _turning(turned: np.ndarray, rates: np.ndarray) -> float:
-    """Return how far rates are alike, all axes together and each that turns by itself."""
-    found = [_alike(turned, rates)]
-    for x, y in zip(turned.T, rates.T, strict=True):
-        energy = max(float(np.sum(x**2)), float(np.sum(y**2)))
-        if np.sqrt(energy / len(x)) > TURNS_AXIS and energy > SHARE * np.sum(turned**2):
-            found.append(_alike(x, y))
-    return min(found)
+def _with_signs(
+    score: float, x: np.ndarray, by: np.ndarray, least: float, agree: Callable[[np.ndarray, np.ndarray], float]
+) -> float:
+    """Return the agreement of all axes, or that of one axis that moves at least so much and has the other sign."""
+    axes = [(p, q) for p, q in zip(x.T, by.T, strict=True) if min(_size(p), _size(q)) > least]
+    return min([score, *(found for p, q in axes if (found := agree(p, q)) < AGAINST)])
+
+
+def _beyond_noise(changes: np.ndarray, k: int) -> float:
+    """Return the size of mean accelerations less the noise of the velocities, which one span has against the next."""
+    if len(changes) < 3 * k:
+        return 0.0
+    signal = np.mean(changes**2) + 2.0 * np.mean(changes[k:] * changes[:-k])
+    return float(np.sqrt(max(0.0, signal / 3.0)))
+
+
+def _size(x: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(x**2)))
 
 
 def _rms(x: np.ndarray) -> float:

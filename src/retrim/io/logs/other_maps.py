@@ -1,12 +1,13 @@
 """Maps that differ from one in one statement, in words: what may have been meant."""
 
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, get_args
 
 import numpy as np
 
 from . import log_map as maps
+from .axes import left_handed
 from .log_map import LogMap
 from .series import Series
 
@@ -52,17 +53,38 @@ def others(chosen: LogMap) -> Iterator[Other]:
 
 def _frames(chosen: LogMap) -> Iterator[Other]:
     frames = chosen.frames
-    for world, body in ((frames.world, other_body(frames.body)), (other_world(frames.world), frames.body),
-                        (other_world(frames.world), other_body(frames.body))):  # fmt: skip
-        words = " and ".join(
-            [f'frames.world = "{world}"'] * (world != frames.world)
-            + [f'frames.body = "{body}"'] * (body != frames.body)
-        )
-        yield Other(words, dataclasses.replace(chosen, frames=maps.Frames(world, body)), {})
-        if chosen.attitude.world is None and chosen.attitude.body is None:
-            words = words.replace("frames.", "attitude.")
+    pairs = [
+        (frames.world, other_body(frames.body)),
+        (other_world(frames.world), frames.body),
+        (other_world(frames.world), other_body(frames.body)),
+    ]
+    for world, body in pairs:
+        if left_handed(world) == left_handed(body):
+            words = _differences("frames", (frames.world, frames.body), (world, body))
+            yield Other(words, dataclasses.replace(chosen, frames=maps.Frames(world, body)), {})
+    own = chosen.attitude.world or frames.world, chosen.attitude.body or frames.body
+    turned = [(world, own[1]) for world in turned_about_z(own[0], "ENWS")]
+    turned += [(own[0], body) for body in turned_about_z(own[1], "FLBR")]
+    for world, body in [*pairs, *turned]:
+        if left_handed(world) == left_handed(body):
             attitude = dataclasses.replace(chosen.attitude, world=world, body=body)
+            words = _differences("attitude", own, (world, body))
             yield Other(words, dataclasses.replace(chosen, attitude=attitude), {})
+
+
+def _differences(table: str, old: tuple[str, str], new: tuple[str, str]) -> str:
+    """Return the axes that differ, as a map writes them."""
+    names = ("world", "body")
+    said = [f'{table}.{name} = "{b}"' for name, a, b in zip(names, old, new, strict=True) if a != b]
+    return " and ".join(said)
+
+
+def turned_about_z(name: str, letters: str) -> list[str]:
+    """Return the other axes that point upwards, or downwards, as the last of some do, and have the same hand."""
+    if name[2] not in "UD":
+        return []
+    around = [letters[k] + letters[(k + step) % 4] + name[2] for k in range(4) for step in (1, 3)]
+    return [each for each in around if left_handed(each) == left_handed(name) and each != name]
 
 
 def other_world(name: str) -> str:
@@ -76,7 +98,7 @@ def other_body(name: str) -> str:
 
 
 def _signs(chosen: LogMap) -> Iterator[Other]:
-    """Other signs of the numbers of a quantity; and x and y in each other's place, with z the other way."""
+    """Other signs of the numbers of a quantity; and x and y in each other's place."""
     for table in ("position", "velocity", "attitude", "rates", "measured_rates"):
         spec: Any = getattr(chosen, table)
         if spec is None or (table == "attitude" and spec.form in ("matrix", "rotation vector")):
@@ -86,21 +108,29 @@ def _signs(chosen: LogMap) -> Iterator[Other]:
             if quaternion and signs == (-1, -1, -1):
                 continue  # the inverse, which `turns` says
             row = signs if not quaternion else (*signs, 1) if spec.form == "xyzw" else (1, *signs)
-            yield Other(f"{table}.fields = {_words(spec, row)}", chosen, {table: np.diag(np.array(row, dtype=float))})
-        if table in ("position", "velocity") and (table == "position" or spec.axes == "world"):
-            swap = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-            yield Other(f"x and y of {table}.fields in each other's place and a minus before z", chosen, {table: swap})
+            yield _arranged(chosen, table, range(len(row)), row)
+        if table == "attitude" and not quaternion:
+            for order in ((1, 0, 2), (2, 1, 0)):
+                yield _arranged(chosen, table, order, (1, 1, 1))
+        if table != "attitude":
+            for signs in ((1, 1, 1), *SIGNS):
+                yield _arranged(chosen, table, (1, 0, 2), signs)
 
 
-def _words(spec: Any, signs: tuple[int, ...]) -> str:
-    """Return fields with other signs, as a map writes them."""
-    if len(spec.fields) != len(signs):
-        return f"the signs {list(signs)} of the numbers in {', '.join(spec.fields)}"
-    names = [
-        name if sign > 0 else name[1:] if name.startswith("-") else f"-{name}"
-        for name, sign in zip(spec.fields, signs, strict=True)
-    ]
-    return "[" + ", ".join(f'"{name}"' for name in names) + "]"
+def _arranged(chosen: LogMap, table: str, order: Sequence[int], signs: Sequence[int]) -> Other:
+    """Return a map whose fields stand in another order, each with a sign."""
+    spec: Any = getattr(chosen, table)
+    turn = np.zeros((len(order), len(order)))
+    for column, (row, sign) in enumerate(zip(order, signs, strict=True)):
+        turn[row, column] = sign
+    if len(spec.fields) != len(order):
+        shown = ", ".join("-" * (sign < 0) + str(row) for row, sign in zip(order, signs, strict=True))
+        words = f"the numbers {shown} of {', '.join(spec.fields)} for {table}.fields"
+    else:
+        names = [(spec.fields[row], sign) for row, sign in zip(order, signs, strict=True)]
+        signed = [name if sign > 0 else name[1:] if name.startswith("-") else f"-{name}" for name, sign in names]
+        words = f"{table}.fields = [" + ", ".join(f'"{name}"' for name in signed) + "]"
+    return Other(words, chosen, {table: turn})
 
 
 def _values(spec: Any, key: str) -> tuple[Any, ...]:

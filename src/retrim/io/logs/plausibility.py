@@ -18,10 +18,10 @@ from .other_maps import Other, others
 
 SUSPECT = 0.05  # share that is not explained above which other maps are tried
 BETTER, AGREES = 5.0, 0.75  # one of them must leave so much less, and explain at least that
-PART = 5000  # ticks of a long log with which other maps are tried
+PART = 3000  # ticks of a long log with which other maps are tried
 REFUSED = {"motion": 0.0, "lift": 0.0, "thrust": 0.0, "turning": -0.3, "gyroscope": -0.3}
 """Below these a log is refused."""
-DOUBTFUL = {"motion": 0.75, "lift": 0.5, "thrust": 0.5, "climb": 0.25, "turning": 0.5, "gyroscope": 0.75}
+DOUBTFUL = {"motion": 0.75, "lift": 0.5, "thrust": 0.65, "climb": 0.25, "turning": 0.5, "gyroscope": 0.75}
 """Below these a report begins with a warning."""
 
 
@@ -65,16 +65,18 @@ def _mended(chosen: LogMap, read: Callable[[Other, slice], Ticks], valid: np.nda
     part = _part(valid)
     scores = agreement(chosen, read(Other("", chosen, {}), part), valid[part])
     wrong = {name: score for name, score in scores.items() if score < 1.0 - SUSPECT and name != "climb"}
-    best, found = 0.0, ""
+    best, found = (0.0, 0.0), ""
     for other in others(chosen) if wrong else ():
         try:
             after = agreement(other.log_map, read(other, part), valid[part])
         except LogError:
             continue
         mended = [name for name in wrong if 1.0 - after.get(name, -1.0) < (1.0 - wrong[name]) / BETTER]
-        kept = all(after.get(name, -1.0) > score - SUSPECT for name, score in scores.items() if name != "climb")
-        if mended and kept and (least := _least(after)) > max(best, AGREES):
-            name, best = min(mended, key=lambda each: wrong[each]), least
+        kept = all(after.get(name, -1.0) > score - SUSPECT for name, score in scores.items())
+        if not mended or not kept or _least(after) < AGREES:
+            continue
+        if (rank := (round(_least(after), 1), sum(after.values()))) > best:
+            name, best = min(mended, key=lambda each: wrong[each]), rank
             found = f"{EXPLAINED[name]} ({100 * wrong[name]:.0f} % agreement); with {other.words} they would"
     return found
 
