@@ -174,3 +174,25 @@ def test_a_position_that_is_never_valid_is_not_used(tmp_path):
     assert "position is never valid, and is not used" in log.notes
     assert missed(log)[1] < 0.03
     assert log.valid[3:-3].all()
+
+
+def test_marks_may_be_compared_with_a_number(tmp_path):
+    """As a state that is 1 on the ground, or a fix that is 3 where it holds."""
+    t = FLIGHT.t
+    table = columns(FLIGHT) | {"state": np.where(t < 3.0, 1.0, 2.0), "fix": np.where((t > 8.0) & (t < 10.0), 1.0, 3.0)}
+    table["vx"] = np.where((t > 8.0) & (t < 10.0), 0.0, table["vx"])
+    chosen = write_map(tmp_path / "map.toml", landed__fields='["state==1"]', velocity__valid='["fix==3"]')
+    log = read_flight_log(write_csv(tmp_path / "log.csv", table), read_map(chosen))
+    assert not log.valid[log.t < 2.9].any()
+    assert not log.valid[(log.t > 7.99) & (log.t < 9.99)].any()
+    assert log.valid[((log.t > 3.1) & (log.t < 7.9)) | ((log.t > 10.1) & (log.t < 15.9))].all()
+    assert "velocity was not valid for 2.0 s, which are left out" in log.notes
+    assert missed(log)[1] < 0.03
+
+
+def test_marks_that_a_log_does_not_have_are_passed_over(tmp_path):
+    chosen = write_map(
+        tmp_path / "map.toml", landed__fields='["ground"]', velocity__valid='["ok"]', attitude__resets='["n"]'
+    )
+    log = read_flight_log(write_csv(tmp_path / "log.csv", columns(FLIGHT)), read_map(chosen))
+    assert log.valid[3:-3].all()

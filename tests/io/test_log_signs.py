@@ -167,6 +167,7 @@ def test_alternatives_and_names_in_other_letters(tmp_path):
         ({"frames__body": '"ENU"'}, "no three axes"),
         ({"frames__world": '"NEU"'}, "must both be right-handed, or both left"),
         ({"attitude__body": '"FRU"'}, "must both be right-handed, or both left"),
+        ({"landed__fields": '["state==on"]'}, "'on' is no number; a flag is a field, or field==number"),
         ({"thrust__full": "65535.0"}, 'full goes with unit = "share"'),
     ],
 )
@@ -203,3 +204,6 @@ def test_rates_that_are_not_commanded_are_not_used(tmp_path):
     log = read(tmp_path, TABLE | {name: 0.0 * TABLE[name] for name in ("wx", "wy", "wz")})
     assert log.command is None
     assert "rates are 0 throughout, and are not used" in log.notes
+    log = read(tmp_path, TABLE | {name: np.nan * TABLE[name] for name in ("wx", "wy", "wz")})
+    assert log.command is None
+    assert "rates are not finite throughout, and are not used" in log.notes

@@ -12,9 +12,23 @@ from pydantic.dataclasses import dataclass
 from .axes import check_body, check_world, left_handed
 
 STRICT = ConfigDict(extra="forbid")
+
+
+def check_flag(name: str) -> str:
+    """Return a flag, a field that is not zero or ``field==number``, if its number is one."""
+    _, sign, number = name.partition("==")
+    if sign:
+        try:
+            float(number)
+        except ValueError as error:
+            raise ValueError(f"{number[:20]!r} is no number; a flag is a field, or field==number") from error
+    return name
+
+
 Name = Annotated[str, Field(min_length=1, max_length=200)]
 Fields = Annotated[tuple[Name, ...], Field(min_length=1, max_length=9)]
-Flags = Annotated[tuple[Name, ...], Field(max_length=9)]
+Flag = Annotated[Name, AfterValidator(check_flag)]
+Flags = Annotated[tuple[Flag, ...], Field(max_length=9)]
 World = Annotated[str, AfterValidator(check_world)]
 Body = Annotated[str, AfterValidator(check_body)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -137,7 +151,7 @@ class Acceleration:
 class Landed:
     """Fields that are not zero while the vehicle is on the ground, if the log has them."""
 
-    fields: Fields
+    fields: Flags
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -55,9 +55,10 @@ def read_quantities(path: Path, log_map: LogMap | None) -> tuple[dict[str, Serie
             if name in raw:
                 raw[name] = Series(raw[name].t - clock.scale * age.values[:, 0], raw[name].values)
     for name in ("rates", "measured_rates"):
-        if name in raw and not np.any(raw[name].values):
+        if name in raw and not np.any(np.nan_to_num(raw[name].values)):
+            what = "not finite" if np.isnan(raw[name].values).any() else "0"
             del raw[name]
-            notes.append(f"{name} are 0 throughout, and are not used")
+            notes.append(f"{name} are {what} throughout, and are not used")
     series = dict[str, Series]()
     for name, each in raw.items():
         if " " in name:  # a mark, which may have been told once

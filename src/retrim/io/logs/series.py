@@ -87,5 +87,7 @@ def missing_field(path: Path, name: str, known: Sequence[str]) -> LogError:
     """Return the error for a field that is not there."""
     more = f", and {len(known) - MANY} more" if len(known) > MANY else ""
     near = get_close_matches(name, known, n=1)
-    shown = [each[:80] for each in dict.fromkeys([*near, *known])][:MANY]
+    shown = ["".join(c if c.isprintable() else "\ufffd" for c in each[:80]) for each in dict.fromkeys([*near, *known])][
+        :MANY
+    ]
     return LogError(f"{path}: no field {name[:80]!r}; {suggestion(name, shown)}{more}")
