@@ -13,7 +13,7 @@ from retrim.io.logs.axes import to_body, to_world
 from retrim.replay import rows_of
 
 PUSH = (0.4, -0.3, 0.1)
-FLIGHT = flown(16.0, wind=PUSH, size=1.5)
+FLIGHT = flown(11.0, wind=PUSH, size=1.5)
 ANGLES = dict(zip(("yaw", "pitch", "roll"), Rotation.from_matrix(FLIGHT.R).as_euler("ZYX").T, strict=True))
 GYRO = 0.5 * (FLIGHT.omega + np.concatenate([FLIGHT.omega[:1], FLIGHT.omega[:-1]]))
 TABLE = columns(FLIGHT) | ANGLES | {f"g{axis}": GYRO[:, i] for i, axis in enumerate("xyz")}
@@ -111,6 +111,16 @@ def test_an_attitude_that_is_turned_about_z_is_named(world, body, tmp_path):
     with pytest.raises(LogError, match=f"with {said} they would"):
         read(tmp_path, table)
     is_the_flight(read(tmp_path, table, attitude__world=f'"{world}"', attitude__body=f'"{body}"'))
+
+
+@pytest.mark.parametrize("degrees", [-150.0, -40.0, 30.0, 100.0])
+def test_a_heading_of_the_attitude_that_differs_is_named(degrees, tmp_path):
+    """As that of a compass beside the axes of motion capture."""
+    turned = Rotation.from_euler("z", -degrees, degrees=True) * Rotation.from_matrix(FLIGHT.R)
+    table = columns(dataclasses.replace(FLIGHT, R=turned.as_matrix()))
+    with pytest.raises(LogError, match=rf"with attitude.heading = {degrees:.0f} they would"):
+        read(tmp_path, table)
+    is_the_flight(read(tmp_path, table, attitude__heading=f"{degrees:.0f}"))
 
 
 @pytest.mark.parametrize("names", [("pitch",), ("roll",)])

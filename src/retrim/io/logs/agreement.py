@@ -68,6 +68,13 @@ def agreement(chosen: LogMap, ticks: Ticks, valid: np.ndarray) -> dict[str, floa
     return scores
 
 
+def heading_between(ticks: Ticks, valid: np.ndarray) -> float:
+    """Return by how much attitudes must be turned about the vertical to lean as the vehicle accelerates [deg]."""
+    felt, axis = (x - x.mean(axis=0) for x in ((ticks.a + UP)[valid, :2], ticks.R[valid, :2, 2]))
+    cross = np.sum(axis[:, 0] * felt[:, 1] - axis[:, 1] * felt[:, 0])
+    return float(np.degrees(np.arctan2(cross, np.sum(axis * felt))))
+
+
 def _lift(felt: np.ndarray, axis: np.ndarray) -> float:
     """Return how far what is felt lies along the thrust axis, and how far it leans as the axis does."""
     aligned = float(np.mean(np.sum(felt * axis, axis=1) / np.maximum(np.linalg.norm(felt, axis=1), 1e-9)))

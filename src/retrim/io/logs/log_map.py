@@ -86,6 +86,8 @@ class Attitude:
     world: World | None = None
     """Axes of the world that the attitude refers to, if they are not those of [frames]."""
     body: Body | None = None
+    heading: Annotated[float, Field(ge=-360.0, le=360.0)] = 0.0
+    """By which it is turned about the vertical, counter-clockwise from above, to agree with the positions [deg]."""
     valid: Flags = ()
     resets: Flags = ()
 

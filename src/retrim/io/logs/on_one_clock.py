@@ -106,6 +106,9 @@ def on_one_clock(path: Path, log_map: LogMap, series: dict[str, Series], grid: G
         there &= held(Series(stamps, rotations[:, None].astype(float)), t)[:, 0] > 0.5
     own_world, own_body = log_map.attitude.world, log_map.attitude.body
     R = (to_world(own_world) if own_world else W) @ R @ (to_body(own_body) if own_body else B).T
+    if log_map.attitude.heading:
+        c, s = np.cos(np.deg2rad(log_map.attitude.heading)), np.sin(np.deg2rad(log_map.attitude.heading))
+        R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ R
     v = _speed(log_map) * interpolated(of["velocity"], t)
     in_world = log_map.velocity is None or log_map.velocity.axes == "world"
     v = v @ W.T if in_world else np.einsum("nij,nj->ni", R, v @ B.T)

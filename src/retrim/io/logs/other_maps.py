@@ -1,6 +1,7 @@
 """Maps that differ from one in one statement, in words: what may have been meant."""
 
 import dataclasses
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, get_args
 
@@ -49,6 +50,13 @@ def others(chosen: LogMap) -> Iterator[Other]:
             yield Other(f'{table}.{key} = "{value}"', _with(chosen, table, key, value), {})
     yield from _frames(chosen)
     yield from _signs(chosen)
+
+
+def with_heading(chosen: LogMap, degrees: float) -> Other:
+    """Return a map whose attitudes are turned further about the vertical."""
+    heading = math.remainder(chosen.attitude.heading + round(degrees), 360.0)
+    attitude = dataclasses.replace(chosen.attitude, heading=heading)
+    return Other(f"attitude.heading = {heading:.0f}", dataclasses.replace(chosen, attitude=attitude), {})
 
 
 def _frames(chosen: LogMap) -> Iterator[Other]:

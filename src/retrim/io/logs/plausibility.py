@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import LogError
-from .agreement import CLAIMS, agreement
+from .agreement import CLAIMS, agreement, heading_between
 from .log_map import LogMap
 from .on_one_clock import Ticks
-from .other_maps import Other, others
+from .other_maps import Other, others, with_heading
 
 SUSPECT = 0.05  # share that is not explained above which other maps are tried
 BETTER, AGREES = 5.0, 0.75  # one of them must leave so much less, and explain at least that
@@ -63,10 +63,12 @@ def check_plausible(
 def _mended(chosen: LogMap, read: Callable[[Other, slice], Ticks], valid: np.ndarray) -> str:
     """Return what is wrong and the statement of the map that mends it best; nothing if none does."""
     part = _part(valid)
-    scores = agreement(chosen, read(Other("", chosen, {}), part), valid[part])
+    ticks = read(Other("", chosen, {}), part)
+    scores = agreement(chosen, ticks, valid[part])
     wrong = {name: score for name, score in scores.items() if score < 1.0 - SUSPECT and name != "climb"}
     best, found = (0.0, 0.0), ""
-    for other in others(chosen) if wrong else ():
+    turned = with_heading(chosen, heading_between(ticks, valid[part]) if valid[part].any() else 0.0)
+    for other in (*others(chosen), turned) if wrong else ():
         try:
             after = agreement(other.log_map, read(other, part), valid[part])
         except LogError:
