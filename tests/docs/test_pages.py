@@ -16,6 +16,9 @@ from retrim.config.named_presets import PRESETS
 from retrim.config.vehicle_file import VehicleSpec, read_vehicle
 from retrim.experiments.sweep import Sweep, read_sweep
 from retrim.io.logs import read_map
+from retrim.io.logs.named_maps import names
+from retrim.io.logs.plausibility import DOUBTFUL, REFUSED
+from retrim.replay.report import WORDS
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -53,6 +56,19 @@ def test_the_page_of_sweeps_tells_the_defaults():
     for key, text in told.items():
         value = getattr(plain, key)
         assert json.loads(text) == (list(value) if isinstance(value, tuple) else value), key
+
+
+def test_the_page_of_replay_tells_the_limits_and_every_map():
+    page = (DOCS / "how-to" / "replay.md").read_text()
+    rows = re.findall(r"^\| ([^|]+?) \| (-?\d* ?%?) ?\| (\d+) % \|$", page, re.M)
+    for name, words in WORDS.items():
+        (found,) = [row for row in rows if row[0].startswith(words)]
+        refused = f"{round(100 * REFUSED[name])} %" if name in REFUSED else ""
+        assert found[1:] == (refused, f"{round(100 * DOUBTFUL[name])}")
+    command = (ROOT / "src" / "retrim" / "replay" / "replay.py").read_text()
+    for name in names():
+        assert f"`{name}`" in page
+        assert name in command
 
 
 def test_toml_files_of_pages_are_accepted(tmp_path):
