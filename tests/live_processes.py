@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from retrim.onboard.guard import UP, G
+from retrim.onboard.heart import Heart
 from retrim.onboard.messages import Parameters, Sample, Setpoint, pack_note
 from retrim.onboard.orders import wait_for_take_off
 from retrim.onboard.realtime import Lifeline, be_punctual, sleep_until
@@ -82,8 +83,9 @@ def learner(plan: DrillPlan) -> None:
     """Gains near those that are flown, now and then."""
     bus, parent = SharedMemoryBus(plan.folder), Lifeline(plan.parent)
     bus.publish(f"ready.{plan.role}", pack_note("ready", base=plan.base))
-    topic, rng = "parameters.policy", np.random.default_rng()
+    topic, rng, heart = "parameters.policy", np.random.default_rng(), Heart(bus, plan.role)
     while not parent.gone(0.1) and bus.latest("ended") is None:
+        heart.beat()
         before = bus.latest(topic)
         version = 1 if before is None else before.version + 1
         gains = np.array([4.0, 3.5]) + 0.1 * rng.normal(size=2)

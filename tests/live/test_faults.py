@@ -64,7 +64,7 @@ def spec_in(folder, controller, **changes):
     )  # fmt: skip
 
 
-def flown(spec, kills=None, seconds=SECONDS):
+def flown(spec, kills=None, seconds=SECONDS, number=signal.SIGKILL):
     """Fly, and kill processes on the way, each at its time; return the last status, the events, how long the watchdog
     took, and whether the system allowed real-time scheduling, without which a loaded machine is late."""
     events, took, kills = LiveEvents(), None, dict(kills or {})
@@ -77,7 +77,7 @@ def flown(spec, kills=None, seconds=SECONDS):
             events.take(status)
             for role in [role for role, at in kills.items() if status.t >= at]:
                 del kills[role]
-                os.kill(drill.processes[role].pid, signal.SIGKILL)
+                os.kill(drill.processes[role].pid, number)
                 took = _first_fallback(drill.bus, time.monotonic()) if role == "control" else None
             if status.t > seconds:
                 drill.land()
@@ -152,6 +152,27 @@ def test_each_process_is_killed_at_a_random_time(tmp_path, controller, roles, se
         assert status.restarts == dict.fromkeys(kills, 1)
         assert rows[-1, -1] == Mode.LANDED
         assert not punctual or (rows[rows[:, 1] < SECONDS, -1] == Mode.POLICY).all()
+
+
+@pytest.mark.parametrize("seed", range(int(os.environ.get("RETRIM_DRILLS", "1"))))
+@pytest.mark.parametrize("roles", ["control", "plant", "watchdog recorder residual policy"])
+def test_each_process_is_suspended_for_ever_at_a_random_time(tmp_path, controller, roles, seed):
+    names = roles.split()
+    times = np.random.default_rng([seed, len(roles)]).uniform(0.0, 1.0, len(names))
+    stops, spec = dict(zip(names, times, strict=True)), spec_in(tmp_path, controller, seconds=4.0)
+    status, events, *_ = flown(spec, stops, seconds=4.0, number=signal.SIGSTOP)
+    rows = whole_log(tmp_path, status, times[0] - 2 * DT if roles == "control" else None)
+    told = [event.note for event in events if "hung" in event.note]
+    assert status.hangs == dict.fromkeys(stops, 1)
+    assert sorted(note.split()[1] for note in told) == sorted(names)
+    if roles == "plant":
+        assert status.ended.startswith("the plant process hung: it said nothing for 2 s")
+        assert abs(rows[-1, 1] - times[0]) < 0.3
+        return
+    assert status.ended == "landed"
+    assert np.abs(rows[:, 3:5]).max() < 0.3
+    assert rows[-1, -1] == (Mode.WATCHDOG if roles == "control" else Mode.LANDED)
+    assert status.restarts == ({} if roles == "control" else dict.fromkeys(stops, 1))
 
 
 def test_without_its_supervisor_the_vehicle_lands_and_the_log_is_whole(tmp_path, controller):

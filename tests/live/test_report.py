@@ -11,7 +11,7 @@ from retrim.config.scenario import Scenario
 from retrim.config.setup import Setup
 from retrim.live.events import LiveEvents
 from retrim.live.plant_process import CRASHED
-from retrim.live.report import flight_of, histograms, results
+from retrim.live.report import flight_of, histograms, missing, results
 from retrim.live.session import LiveRequest
 from retrim.live.status import Status
 from retrim.onboard.guard import HOVER, Mode
@@ -77,3 +77,19 @@ def test_a_hang_is_in_the_statistics_and_what_nobody_timed_is_not(asked):
     assert found["step_p50_ms"]["value"] == pytest.approx(1.0)
     assert found["fallback_ticks"]["value"] == 3
     assert [ticks for ticks in histograms(rows)["step"] if ticks] == [26, 1]
+
+
+def test_a_log_that_is_shorter_than_the_flight_is_a_fault_and_missed_ticks_are_none(asked):
+    rows = flown(asked, ticks=340)
+
+    def lost(kept, ticks=340, **control):
+        return missing(kept, Status(1.0, control, {}, {}, {}, "landed", [], False, 0, None, ticks=ticks), DT)
+
+    assert lost(rows) == lost(rows[:-5]) == lost(rows[20:]) == lost(rows, ticks=0) == []
+    said = "the log is shorter than the flight: it holds"
+    assert lost(rows[:100]) == [f"{said} 100 of 340 ticks, none from 2.00 to 6.80 s"]
+    assert lost(rows[50:]) == [f"{said} 290 of 340 ticks, none from 0.00 to 1.00 s"]
+    holed = np.delete(rows, np.arange(100, 200), axis=0)
+    assert lost(holed) == [f"{said} 240 of 340 ticks, none from 2.00 to 4.00 s"]
+    assert lost(holed, gaps=[(2.0, 4.0, 100)]) == []
+    assert lost(rows[:0]) == [f"{said} 0 of 340 ticks, none from 0.00 to 6.80 s"]

@@ -7,7 +7,7 @@ import pytest
 
 from live.test_faults import controller, spec_in  # noqa: F401
 from live_processes import DT
-from retrim.live import supervisor
+from retrim.live import remote_learners
 from retrim.live.supervisor import Supervisor
 from retrim.onboard.messages import last_note, pack_note
 from retrim.transport.network import FAREWELL
@@ -48,7 +48,7 @@ def test_learners_elsewhere_hear_of_the_end_before_their_bridge_goes(tmp_path, c
 
 
 def test_learners_elsewhere_that_are_gone_are_not_waited_for(tmp_path, controller, monkeypatch):  # noqa: F811
-    monkeypatch.setattr(supervisor, "PARTING", 1000.0)
+    monkeypatch.setattr(remote_learners, "PARTING", 1000.0)
     with Supervisor(spec_in(tmp_path, controller, learners=ADDRESS)) as flight:
         folder = flight.bus.folder
         flight.bus.publish("ground", pack_note("ground", base=controller.base, alive={"policy": True}))
@@ -68,6 +68,9 @@ class Process:
 
     def wait(self, patience=None):
         return self._code
+
+    def kill(self):
+        self._code = -9
 
     def terminate(self):
         self.told, self._code = time.monotonic(), -15

@@ -29,7 +29,7 @@ from ..live.session import LONGEST, LiveRequest, check_limits, learners_at
 from ..live.status import Status
 from ..runtime.events import Event
 from ..transport.remote import LOOPBACK
-from .console import RichReporter, Trust, console, show_paths, show_table, started
+from .console import RichReporter, Trust, console, refuse, show_paths, show_table, started
 
 LINE_EVERY = 5.0  # [s], where the output is no terminal
 
@@ -122,7 +122,8 @@ def _fly(request: LiveRequest, run: Run) -> int:
     show_table(TableSection(("figure", "unit", "value"), figures(done.rows), f"live, {done.flight.log.t[-1]:.1f} s"))
     drawn = picture([done.flight], done.request.setup, request.scenario, run.folder, stem="live")
     show_paths([*drawn[:1], *done.paths])
-    return run.exit_code or int(not done.landed)
+    codes = [refuse(fault) for fault in done.faults]
+    return run.exit_code or max(codes, default=int(not done.landed))
 
 
 def _open_page(url: str, folder: Path) -> None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 
+from ..onboard.heart import Pacemaker
 from ..onboard.messages import pack_note
 from ..onboard.realtime import Lifeline
 from ..onboard.topics import INTO, MOST, OUT, SLOWLY
@@ -18,6 +19,7 @@ from .refused_notes import NETWORK
 
 IDLE = 0.002  # [s]
 SILENCE = 10.0  # [s] without a measurement, after which a flight without a supervisor is over; an autopilot may land it
+PATIENCE = 10.0  # [s] that a network may keep the bridge waiting
 LINGER = 2.0  # [s] after its end, for that to reach the learners
 
 
@@ -40,13 +42,15 @@ def carry(plan: BridgePlan) -> None:
         bridge = Bridge(bus, network, out=OUT, into=INTO, slowly=SLOWLY)
         bus.publish("ready.bridge", pack_note("ready"))
         said, since, told = (0, 0), time.monotonic(), (0, "")
-        # A vehicle that has lost its supervisor still lands, and the learners wait until they are told.
-        while not (parent.gone() and time.monotonic() > since + (LINGER if said[1] else SILENCE)):
-            if not bridge.step():
-                time.sleep(IDLE)
-            told = _told(bus, network, told)
-            if (now := _said(bus)) != said:
-                said, since = now, time.monotonic()
+        with Pacemaker(bus, "bridge") as heart:
+            # A vehicle that has lost its supervisor still lands, and the learners wait until they are told.
+            while not (parent.gone() and time.monotonic() > since + (LINGER if said[1] else SILENCE)):
+                heart.touch(PATIENCE)
+                if not bridge.step():
+                    time.sleep(IDLE)
+                told = _told(bus, network, told)
+                if (now := _said(bus)) != said:
+                    said, since = now, time.monotonic()
     finally:
         network.close()  # its threads would keep the process alive
 

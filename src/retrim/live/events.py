@@ -5,9 +5,16 @@ from collections.abc import Iterable
 from ..control.condition import describe_condition
 from ..learn.screening import describe_counts
 from ..runtime.events import Event
+from .pulses import SILENCE
 from .status import Status
 
 EXCLUDED_EVERY = 5.0  # [s] between two events about excluded measurements: a window is as long
+HUNG = f"hung: it said nothing for {SILENCE:g} s and was ended"
+WITHOUT = {
+    "control": "the watchdog flies, holds and lands",
+    "plant": "nobody measures any more, and the flight is over",
+}
+"""What becomes of a flight without a process that is not started again."""
 WATCHDOG = "watchdog: the process that flew is gone or hangs, the watchdog flies the fallback"
 
 
@@ -22,6 +29,7 @@ class LiveEvents:
         self._mode, self._watchdog, self._log_failed = "policy", False, False
         self._watchdog_ticks = 0
         self._restarts: dict[str, int] = {}
+        self._hangs: dict[str, int] = {}
         self._given_up: set[int] = set()
         self._refused: dict[str, int] = {}
         self._knobs_refused = ""
@@ -59,10 +67,7 @@ class LiveEvents:
             if note not in self._vehicle_notes:
                 self._vehicle_notes.add(note)
                 new.append(Event(t, "refused", f"vehicle: {note}; such messages are ignored"))
-        for role, count in status.restarts.items():
-            if count > self._restarts.get(role, 0):
-                self._restarts[role] = count
-                new.append(Event(t, "restarted", f"the {role} process had died"))
+        new += self._processes(status)
         if (refused := status.world.get("knobs_refused", "")) and refused != self._knobs_refused:
             new.append(Event(t, "refused", f"knobs: {refused}"))
         self._knobs_refused = refused
@@ -79,4 +84,18 @@ class LiveEvents:
             self._mode = mode
             new.append(Event(t, "guard", f"{mode}: {control.get('reason', '')}"))
         self.all += new
+        return new
+
+    def _processes(self, status: Status) -> list[Event]:
+        """Return which processes hang, and which were started again."""
+        new = []
+        for role in sorted(status.hangs.keys() | status.restarts.keys()):
+            hung = status.hangs.get(role, 0) > self._hangs.get(role, 0)
+            again = status.restarts.get(role, 0) > self._restarts.get(role, 0)
+            why = f"the {role} process {HUNG if hung else 'had died'}"
+            if again:
+                new.append(Event(status.t, "restarted", why))
+            elif hung:
+                new.append(Event(status.t, "guard", f"{why}; {WITHOUT.get(role, 'the flight goes on without it')}"))
+        self._hangs, self._restarts = dict(status.hangs), dict(status.restarts)
         return new

@@ -22,7 +22,7 @@ from ..runtime.events import Event
 from ..tasks.transition import spliced
 from .events import LiveEvents
 from .page_access import page_url
-from .report import complaints, flight_of, histograms, learnt_in, results
+from .report import complaints, flight_of, histograms, learnt_in, missing, results
 from .session import LEARNING, LiveRequest, live_spec
 from .status import Status
 from .supervisor import Supervisor
@@ -45,6 +45,8 @@ class LiveFlight(NamedTuple):
     """The request, on all that was followed."""
     landed: bool
     """Whether the vehicle came down by this flight's own doing: it was not lost, and did not crash."""
+    faults: list[str]
+    """What is missing of its files, each in a line."""
 
 
 def fly_live(
@@ -102,10 +104,10 @@ def _written(
 ) -> LiveFlight:
     """Write what a flight leaves."""
     flight, rows = flight_of(request, events.all, status, learnt)
-    found = results(request, flight, rows, status, events)
+    found, faults = results(request, flight, rows, status, events), missing(rows, status, request.setup.preset.dt)
     run.write_results(
         found, seeds=[request.seed], preset=request.setup.preset.name, seconds=float(flight.log.t[-1]),
-        ended=status.ended, scheduling=refused, histograms_ms=histograms(rows),
+        ended=status.ended, faults=faults, scheduling=refused, histograms_ms=histograms(rows),
     )  # fmt: skip
     write_events([flight], run.folder)
     write_learnt([flight], request.setup.preset, run.folder)
@@ -113,7 +115,7 @@ def _written(
     for start in run.folder.glob("start*.safetensors"):  # what learners went on from; it is in what they learnt
         start.unlink()
     paths = [*recorded, run.folder / "results.json", run.folder / "flight.csv", *complaints(run.folder)]
-    return LiveFlight(flight, found, paths, request, status.ended == "landed")
+    return LiveFlight(flight, found, paths, request, status.ended == "landed", faults)
 
 
 def _recorded(request: LiveRequest, rows: np.ndarray, events: LiveEvents) -> list[Path]:

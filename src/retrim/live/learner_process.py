@@ -23,6 +23,7 @@ from ..errors import MessageError
 from ..experiments.compile_cache import enable_compile_cache
 from ..io.trained import load_learnt
 from ..learn.window import Window
+from ..onboard.heart import Pacemaker
 from ..onboard.messages import COMMAND, MEASURED, FlightRows, Parameters, last_note, pack_note
 from ..onboard.realtime import Lifeline
 from ..onboard.topics import REFERENCE
@@ -35,6 +36,7 @@ from .published import flown_update, keep, newest_update
 from .states import state_of
 
 CHECK_EVERY = 0.005  # [s]
+LOOKING, COMPUTING = 5.0, 60.0  # [s] that a look at the bus and that an update may take
 VERDICT = 1.0  # [s] that a policy waits to be taken or refused; after it, it counts as lost
 NICE = 10
 REMEMBERED = 8  # policies that were flown
@@ -267,6 +269,12 @@ def learn(plan: LearnerPlan) -> None:
     loop.warm_up()
     loop.catch_up()
     bus.publish(f"ready.{plan.layer}", pack_note("ready", base=plan.base, device=jax.devices()[0].platform))
-    while not parent.gone() and bus.latest("ended") is None:
-        if not loop.step():
-            time.sleep(CHECK_EVERY)
+    with Pacemaker(bus, plan.layer) as heart:
+        while not parent.gone() and bus.latest("ended") is None:
+            heart.touch(LOOKING)
+            window = loop.due()
+            if window is None:
+                time.sleep(CHECK_EVERY)
+                continue
+            heart.touch(COMPUTING)
+            loop.learnt(loop.worker.learn(window))

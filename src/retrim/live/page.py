@@ -16,6 +16,7 @@ import numpy as np
 from ..control.condition import describe_condition
 from ..errors import ConfigError, MessageError, excerpt
 from ..learn.screening import describe_counts
+from ..onboard.heart import Heart
 from ..onboard.messages import Sample, last_note, last_sent, pack_note
 from ..onboard.note_fields import FIELDS, plain, read_fields, shown
 from ..onboard.realtime import Lifeline
@@ -113,8 +114,9 @@ def show(plan: PagePlan) -> None:
     page = _Page(spec, bus, server)
     take_values_only(server, page.refuse)
     bus.publish("ready.page", pack_note("ready", port=server.get_port()))
-    refreshed = 0
+    refreshed, heart = 0, Heart(bus, "page")
     while not parent.gone(1.0 / RATE):
+        heart.beat()
         try:
             page.refresh(text=refreshed % TEXT_EVERY == 0)
         except Exception as error:  # the button that lands outlives whatever cannot be shown

@@ -6,8 +6,8 @@ from ..errors import MessageError
 from ..onboard.messages import last_note, unpack_note
 from ..transport.bus import Bus
 
-NOTES = ("airborne", "ended", "followed", "ground", "knobs", "learner.", "learning", "order", "ready.", "refusals.",
-         "stalls", "status", "wish", "world")  # fmt: skip
+NOTES = ("airborne", "beat.", "ended", "followed", "ground", "knobs", "learner.", "learning", "order", "ready.",
+         "refusals.", "stalls", "status", "wish", "world")  # fmt: skip
 """Topics of notes, or how their names begin."""
 PAGE, NETWORK = "refusals.page", "refusals.network"
 """Topics of what the page has refused of a browser, and the bridge of the network."""

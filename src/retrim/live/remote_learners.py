@@ -5,13 +5,14 @@ from pathlib import Path
 
 from ..onboard.messages import last_note
 from ..transport.bus import Bus
-from ..transport.network import DISTRUST
+from ..transport.network import DISTRUST, FAREWELL
 from .mission import Mission
 from .refused_notes import NETWORK
 from .spec import LiveSpec
 from .topics import topics
 
 LOST = 2.0  # [s] without a word
+PARTING = 5.0  # [s] in which they may say that they have heard of the end
 
 
 class RemoteLearners:
@@ -56,3 +57,14 @@ class RemoteLearners:
         if said.get("base") != self._spec.controller.base or not isinstance(words, str) or not words:
             return None
         return words
+
+    def part(self) -> None:
+        """Wait until they have heard of the end, which they wait for, or are gone."""
+        base, began = self._spec.controller.base, time.monotonic()
+        while (waited := time.monotonic() - began) < PARTING:
+            said = last_note(self._bus, "ground")
+            if said.get("over") and said.get("base") == base:
+                return
+            if waited > FAREWELL and not any(self.alive().values()):  # what they said last may be on its way
+                return
+            time.sleep(0.02)

@@ -28,6 +28,8 @@ from .published import flown_update
 from .session import LiveRequest
 from .status import Status
 
+GAP_S = 0.5  # [s] of a log that may be missing: a machine that stands still sends nothing
+
 
 def flight_of(
     request: LiveRequest, events: Sequence[Event], status: Status, learnt: LearnerState | None
@@ -117,6 +119,25 @@ def _stalls(status: Status, dt: float) -> dict[str, Any]:
         return dict.fromkeys(("missed_in_stalls", "stalls", "stall_max_ms"))
     missed = lost_in(seen["newest"], status.control.get("gaps", []), dt)
     return {"missed_in_stalls": missed, "stalls": seen["count"], "stall_max_ms": 1e3 * seen["longest"]}
+
+
+def missing(rows: np.ndarray, status: Status, dt: float) -> list[str]:
+    """Return which part of a flight its log does not hold, in a line; none if it holds all that was flown.
+
+    Args:
+        rows: All of the log.
+        status: The last one.
+        dt: Control tick [s].
+    """
+    ticks = np.concatenate([[-1], rows[:, 0], [max(status.ticks, rows[-1, 0] + 1 if len(rows) else 0)]])
+    gaps = np.diff(ticks) - 1
+    missed = max((int(n) for *_, n in status.control.get("gaps", [])), default=0)  # nobody flew those
+    if gaps.max() <= missed + GAP_S / dt:
+        return []
+    at = int(np.argmax(gaps))
+    begin, end = (float(dt * (tick + 1)) for tick in (ticks[at], ticks[at + 1] - 1))
+    part = f"{len(rows)} of {ticks[-1]:.0f} ticks, none from {begin:.2f} to {end:.2f} s"
+    return [f"the log is shorter than the flight: it holds {part}"]
 
 
 def histograms(rows: np.ndarray) -> dict[str, Any]:

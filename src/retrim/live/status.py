@@ -32,3 +32,7 @@ class Status:
     """How many notes and inputs of a browser were refused so far."""
     excluded: list[int] = field(default_factory=list)
     """Numbers of measurements that the last fit excluded, by reason."""
+    hangs: dict[str, int] = field(default_factory=dict)
+    """How often each process was ended because it was silent."""
+    ticks: int = 0
+    """Ticks that the plant has sent so far."""

@@ -12,13 +12,14 @@ from typing import Any
 
 from ..errors import MessageError, PlantError
 from ..onboard.launch import last_words, launch
-from ..onboard.messages import last_note, last_sent, pack_note
+from ..onboard.messages import last_note, last_sent, pack_note, ticks_of
 from ..onboard.note_fields import plain
 from ..onboard.realtime import cores_of
+from ..onboard.recorder import Recorder
 from ..transport.message import describe
-from ..transport.network import FAREWELL
 from ..transport.shared_memory import SharedMemoryBus
 from .plans import plan_of
+from .pulses import SILENCE, Pulses
 from .refused_notes import RefusedNotes
 from .remote_learners import RemoteLearners
 from .spec import LiveSpec
@@ -26,7 +27,6 @@ from .status import Status
 from .topics import topics
 
 LANDING = 60.0  # [s], after which processes are ended wherever the vehicle is
-PARTING = 5.0  # [s] in which learners elsewhere may say that they have heard of the end
 LAST = 5  # ticks in which what control said last is written down, once it has nothing left to fly
 ATTEMPTS = 5  # to bring a process back
 LEARN = ("residual", "policy", "recorder", "page", "bridge")
@@ -42,6 +42,8 @@ class Supervisor:
     spec: LiveSpec
     processes: dict[str, "Popen[bytes]"] = field(default_factory=dict)
     restarts: dict[str, int] = field(default_factory=dict)
+    hangs: dict[str, int] = field(default_factory=dict)
+    """How often each process was ended because it was silent."""
     refused: dict[str, list[str]] = field(default_factory=dict)
     """What the operating system refused to which process."""
     epoch: float | None = None
@@ -53,7 +55,7 @@ class Supervisor:
     def __enter__(self) -> "Supervisor":
         """Make the bus."""
         self.bus, self.start, self.floor = SharedMemoryBus.create(topics(self.spec)), self.spec.start, 0
-        self._notes = RefusedNotes(self.bus, topics(self.spec))
+        self._notes, self._pulses = RefusedNotes(self.bus, topics(self.spec)), Pulses(self.bus)
         self._remote = None if self.spec.learners is None else RemoteLearners(self.spec, self.bus)
         self._cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else None
         if self._cores:
@@ -71,7 +73,7 @@ class Supervisor:
         if self._remote is not None:
             if not last_note(self.bus, "ended"):
                 self.bus.publish("ended", pack_note("ended", reason="the flight did not come to its end"))
-            self._part_from(self._remote)
+            self._remote.part()
         if self._cores:
             os.sched_setaffinity(0, self._cores)
         for process in self.processes.values():
@@ -122,6 +124,8 @@ class Supervisor:
         self._check_alive()
         self.epoch = time.monotonic() + 0.5
         self.bus.publish("order", pack_note("order", epoch=self.epoch))
+        for role in self.processes:
+            self._pulses.expect(role)
 
     def _lift_off(self) -> Iterator[tuple[str, float]]:
         """Let a vehicle take off by its autopilot, now that all are ready to fly it."""
@@ -149,11 +153,10 @@ class Supervisor:
         if self._remote is not None:
             self._remote.announce(start)
             return
-        process = self.processes["policy"]
-        process.kill()
-        process.wait()
+        self._end("policy")
         with contextlib.suppress(OSError):
             self._start("policy")
+            self._pulses.expect("policy", READY_S)
 
     @property
     def landing(self) -> bool:
@@ -166,17 +169,17 @@ class Supervisor:
         return last_note(self.bus, "ready.page", "ready").get("port")
 
     def watch(self) -> Status:
-        """Bring back processes that have died and may; return how the flight stands."""
+        """Bring back processes that have died or hang, and may; return how the flight stands."""
         assert self.epoch is not None
         ended = last_note(self.bus, "ended").get("reason")
-        for role, process in self.processes.items():
-            died = process.poll() not in (None, 0)  # who ends by itself says that the flight is over
-            if role in RESTARTED and died and ended is None and self.restarts.get(role, 0) < ATTEMPTS:
-                self.restarts[role] = self.restarts.get(role, 0) + 1
-                with contextlib.suppress(OSError):  # the flight goes on without it
-                    self._start(role)
-        if ended is None and self.processes["plant"].poll() is not None:
-            ended = f"the plant process is gone: {last_words(self._complaints('plant'))}"
+        if ended is None:
+            self._end_hanging()
+            for role, process in self.processes.items():
+                died = process.poll() not in (None, 0)  # who ends by itself says that the flight is over
+                if role in RESTARTED and died and self.restarts.get(role, 0) < ATTEMPTS:
+                    self._restart(role)
+            if self.processes["plant"].poll() is not None:
+                ended = self._lost_plant()
         alive = {role: process.poll() is None for role, process in self.processes.items()}
         if self._remote is not None:
             alive |= self._remote.alive()
@@ -185,32 +188,63 @@ class Supervisor:
         t, fallback = time.monotonic() - self.epoch, self.bus.latest("fallback")
         by_watchdog = last_sent(self.bus, "fallback") > last_sent(self.bus, "setpoint")
         ticks = 0 if fallback is None else fallback.version
-        said, stalls = self._rejections(), last_note(self.bus, "stalls")
+        said, stalls, excluded = (
+            self._rejections(),
+            last_note(self.bus, "stalls"),
+            last_note(self.bus, "learner.residual"),
+        )
         return Status(
             t, control, world, alive, dict(self.restarts), ended, said, by_watchdog, ticks, failed, stalls,
-            self._notes.look(), self._notes.count, last_note(self.bus, "learner.residual").get("excluded", []),
+            self._notes.look(), self._notes.count, excluded.get("excluded", []), dict(self.hangs), ticks_of(self.bus),
         )  # fmt: skip
 
     def finish(self, patience: float = 3.0) -> None:
-        """Wait until the log is written."""
-        until, flew = time.monotonic() + patience, time.monotonic()
-        while self.processes["recorder"].poll() is None and time.monotonic() < until:
+        """Wait until the log is written, and write what is missing of it if its process does not."""
+        until, flew, recorder = time.monotonic() + patience, time.monotonic(), self.processes["recorder"]
+        while recorder.poll() is None and time.monotonic() < until:
             if self._alive("plant"):
                 flew = time.monotonic()
             elif self._alive("control") and time.monotonic() > flew + LAST * self.spec.dt:
                 self.processes["control"].terminate()  # there is nothing left to fly
             time.sleep(0.02)
+        if recorder.poll() != 0:
+            self._end("recorder")
+            self._record()
 
-    def _part_from(self, remote: RemoteLearners) -> None:
-        """Wait until learners elsewhere have heard of the end, which they wait for, or are gone."""
-        base, began = self.spec.controller.base, time.monotonic()
-        while (waited := time.monotonic() - began) < PARTING:
-            said = last_note(self.bus, "ground")
-            if said.get("over") and said.get("base") == base:
-                return
-            if waited > FAREWELL and not any(remote.alive().values()):  # what they said last may be on its way
-                return
-            time.sleep(0.02)
+    def _end_hanging(self) -> None:
+        """End processes that are alive and silent."""
+        for role in self._pulses.hanging([role for role in self.processes if self._alive(role)]):
+            self.hangs[role] = self.hangs.get(role, 0) + 1
+            self._end(role)
+
+    def _end(self, role: str) -> None:
+        """End a process at once, also one that is suspended."""
+        self.processes[role].kill()
+        with contextlib.suppress(TimeoutExpired):  # a disk or a device may keep it for a while
+            self.processes[role].wait(1.0)
+
+    def _restart(self, role: str) -> None:
+        self.restarts[role] = self.restarts.get(role, 0) + 1
+        if role == "recorder":
+            self._record()  # until the new one is there, ticks may leave the reports
+        with contextlib.suppress(OSError):  # the flight goes on without it
+            self._start(role)
+            self._pulses.expect(role, READY_S)
+
+    def _record(self) -> None:
+        """Write down what is reported and not written yet; nobody else must be writing."""
+        Recorder(self.spec.folder / "flight.csv", self.bus).step()
+
+    def _lost_plant(self) -> str:
+        """Why a flight is over whose plant has ended."""
+        if said := last_note(self.bus, "ended").get("reason"):
+            return str(said)
+        if "plant" in self.hangs:
+            why = f"the plant process hung: it said nothing for {SILENCE:g} s and was ended"
+        else:
+            why = f"the plant process is gone: {last_words(self._complaints('plant'))}"
+        self.bus.publish("ended", pack_note("ended", reason=why))
+        return why
 
     def _not_ready(self) -> list[str]:
         waiting = [role for role in self.processes if self.bus.latest(f"ready.{role}") is None]

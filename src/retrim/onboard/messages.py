@@ -256,3 +256,16 @@ def last_sent(bus: Bus, topic: str) -> float:
         return float("-inf") if message is None else Setpoint.unpack(message.data).sent
     except MessageError:
         return float("-inf")
+
+
+def ticks_of(bus: Bus) -> int:
+    """Return how many ticks the plant has sent so far.
+
+    Args:
+        bus: Where it was published.
+    """
+    message = bus.latest("sample")
+    try:
+        return 0 if message is None else Stamp.unpack(message.data).tick + 1
+    except MessageError:
+        return 0

@@ -97,6 +97,7 @@ _time, _any = number(), number(finite=False)
 _vector = list_of(_any, length=3)
 FIELDS: Mapping[str, Mapping[str, Read]] = {
     "airborne": {},
+    "beat": {"count": whole()},
     "ended": {"reason": text},
     "followed": {"name": text},
     "ground": {"base": text, "alive": map_of(flag), "failed": text, "over": flag},

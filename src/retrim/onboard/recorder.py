@@ -15,6 +15,7 @@ from ..transport.bus import Bus
 from ..transport.shared_memory import SharedMemoryBus
 from .accounts import accounted
 from .guard import Mode
+from .heart import Heart
 from .messages import ACCOUNTS, COLUMNS, FlightRows, last_note, pack_note
 from .realtime import Lifeline
 
@@ -128,11 +129,12 @@ def record(plan: RecorderPlan) -> None:
     bus = SharedMemoryBus(plan.folder)
     recorder = Recorder(plan.path, bus)
     bus.publish("ready.recorder", pack_note("ready", failed=recorder.failed))
-    parent, heard, left = Lifeline(plan.parent), time.monotonic(), LINGER
+    parent, heard, left, heart = Lifeline(plan.parent), time.monotonic(), LINGER, Heart(bus, "recorder")
     while left and not (parent.gone() and time.monotonic() > heard + SILENCE):
         if recorder.step() or (bus.latest("sample") is None and not parent.gone()):
             heard = time.monotonic()
         left -= _over(bus)
+        heart.beat()
         time.sleep(plan.dt)
     recorder.step()
     if parent.gone():

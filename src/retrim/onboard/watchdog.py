@@ -11,6 +11,7 @@ from ..errors import MessageError
 from ..transport.bus import Bus
 from ..transport.shared_memory import SharedMemoryBus
 from .guard import Fallback, GeometricHover, Limits, Mode
+from .heart import Heart
 from .messages import COMMAND, FlightRows, Sample, Setpoint, Stamp, pack_note
 from .realtime import Lifeline, be_punctual
 from .stalls import Stalls
@@ -132,7 +133,9 @@ def watch(plan: WatchdogPlan) -> None:
     stalls = None if refused else Stalls(CHECK_EVERY)  # who comes behind others waits for them, not for the machine
     if stalls is not None:
         bus.publish("stalls", stalls.pack())
+    heart = Heart(bus, "watchdog")
     while not watchdog.done:
+        heart.beat()
         if stalls is not None and watchdog.heard is not None and stalls.woke(time.monotonic()):
             bus.publish("stalls", stalls.pack())
         gone = control.gone(CHECK_EVERY)

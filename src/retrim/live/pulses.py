@@ -1,0 +1,54 @@
+"""Which processes of a flight hang: alive, and silent."""
+
+import time
+from collections.abc import Callable, Iterable
+
+from ..onboard.heart import beat_topic
+from ..transport.bus import Bus
+
+SILENCE = 2.0  # [s] without a heartbeat, after which a process hangs
+LOOK = 0.25  # [s] that one look counts at most: a machine that stood still is no silence
+
+
+class Pulses:
+    """Counts for how long each process has been silent, look by look."""
+
+    def __init__(self, bus: Bus, clock: Callable[[], float] = time.monotonic) -> None:
+        """Begin with no process.
+
+        Args:
+            bus: Of the flight.
+            clock: The time [s].
+        """
+        self._bus, self._clock, self._last = bus, clock, clock()
+        self._versions, self._silent, self._allowed = dict[str, int](), dict[str, float](), dict[str, float]()
+
+    def expect(self, role: str, within: float = SILENCE) -> None:
+        """Count from now on.
+
+        Args:
+            role: Of the process.
+            within: Time for the first heartbeat [s]; a process that starts compiles before it.
+        """
+        self._versions[role], self._silent[role], self._allowed[role] = self._version(role), 0.0, within
+
+    def hanging(self, roles: Iterable[str]) -> list[str]:
+        """Return who has been silent for too long.
+
+        Args:
+            roles: Processes that are alive; others are not looked at, nor are those that nothing is expected of.
+        """
+        now = self._clock()
+        passed, self._last = min(now - self._last, LOOK), now
+        return [role for role in roles if role in self._versions and self._hangs(role, passed)]
+
+    def _hangs(self, role: str, passed: float) -> bool:
+        if self._version(role) != self._versions[role]:
+            self.expect(role)
+            return False
+        self._silent[role] += passed
+        return self._silent[role] > self._allowed[role]
+
+    def _version(self, role: str) -> int:
+        message = self._bus.latest(beat_topic(role))
+        return 0 if message is None else message.version
