@@ -103,10 +103,9 @@ def live(
             if run.interrupted:
                 console.print(f"interrupted while pretraining, after {len(losses)} steps; nothing has flown")
                 return INTERRUPTED
-        method = "base" if adapt == "none" else adapt
         request = LiveRequest(
-            setup, weights, scenario, method, seconds or LONGEST, seed, fence, run.folder, state, address, ground,
-            policy_age=policy_age or float("inf"), record=record, until_stopped=seconds is None,
+            setup, weights, scenario, "base" if adapt == "none" else adapt, seconds or LONGEST, seed, fence, run.folder,
+            state, address, ground, policy_age=policy_age or float("inf"), record=record, until_stopped=seconds is None,
         )  # fmt: skip
         with interrupts_only_set(run.stop):  # a Ctrl-C lands the vehicle; whoever is in the air is not dropped
             return _fly(request, run)
