@@ -14,12 +14,12 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from hostile import Maker, Watch
+from hostile import TEXTS, Maker, Watch
 from retrim import load_learnt, load_policy
 from retrim.config import read_vehicle
 from retrim.errors import CheckpointError, ConfigError, LogError, RetrimError
 from retrim.experiments import sweep
-from retrim.io.logs import npz_members, read_flight_log
+from retrim.io.logs import npz_members, read_flight_log, read_map
 from retrim.io.logs.npz_members import NpzMembers
 from retrim.live.page import free_port
 from retrim.tasks.trajectory_csv import from_csv
@@ -160,3 +160,42 @@ def test_a_host_that_cannot_be_is_one_line():
             free_port(host, 8080)
         assert str(caught.value).isprintable()
         assert len(str(caught.value)) < LONGEST
+
+
+# ---- formats whose reader makes code of what a file says of its messages
+
+
+@pytest.mark.parametrize("encoding", ["ros2msg", "ros2idl"])
+def test_types_of_messages_in_a_bag_are_no_code(folder, encoding):
+    writer, _ = pytest.importorskip("mcap.writer"), pytest.importorskip("rosbags")
+    run = "open('OWNED', 'w')"
+    names = [
+        f"a/msg/B:\n    pass\n{run}\nclass C",
+        f'a/msg/B"""\n{run}\n"""',
+        f"{run}/msg/B",
+        "a/msg/B",
+        *TEXTS.values(),
+    ]
+    texts = ["float64 x", f"float64 x\n{run}", f"float64 x = {run}", f"string X={run}\nfloat64 x", f"float64[{run}] x"]
+    for name, text in [*((name, texts[0]) for name in names), *(("a/msg/B", text) for text in texts)]:
+        with (folder / "log.mcap").open("wb") as file:
+            bag = writer.Writer(file)
+            bag.start(profile="ros2", library="")
+            idl = f"module a {{ module msg {{ struct B {{ double x; }}; const string Y = {text!r}; }}; }};"
+            data = (text if encoding == "ros2msg" else idl).encode("utf-8", "replace")
+            schema = bag.register_schema(name=name[:1000], encoding=encoding, data=data)
+            channel = bag.register_channel(topic="/t", message_encoding="cdr", schema_id=schema)
+            bag.add_message(channel, log_time=0, data=b"\0\1\0\0" + bytes(8), publish_time=0)
+            bag.finish()
+        with pytest.raises(LogError) as caught:
+            read_flight_log(folder / "log.mcap")
+        assert str(caught.value).isprintable()
+        assert len(str(caught.value)) < LONGEST
+        assert not (folder / "OWNED").exists(), name
+
+
+def test_true_is_no_number_of_a_map(folder):
+    for table in ("[part]\nstart = true", "[part]\nend = true", "thrust.mass = true"):
+        (folder / "map.toml").write_text(table)
+        with pytest.raises(ConfigError, match=r"(part|thrust).(start|end|mass): Input should be a valid number"):
+            read_map(folder / "map.toml")

@@ -31,7 +31,8 @@ Flag = Annotated[Name, AfterValidator(check_flag)]
 Flags = Annotated[tuple[Flag, ...], Field(max_length=9)]
 World = Annotated[str, AfterValidator(check_world)]
 Body = Annotated[str, AfterValidator(check_body)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Seconds = Annotated[float, Field(ge=-1e9, le=1e9, allow_inf_nan=False, strict=True)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 SPEEDS = {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3, "km/h": 1.0 / 3.6}
@@ -86,7 +87,7 @@ class Attitude:
     world: World | None = None
     """Axes of the world that the attitude refers to, if they are not those of [frames]."""
     body: Body | None = None
-    heading: Annotated[float, Field(ge=-360.0, le=360.0)] = 0.0
+    heading: Annotated[float, Field(ge=-360.0, le=360.0, strict=True)] = 0.0
     """By which it is turned about the vertical, counter-clockwise from above, to agree with the positions [deg]."""
     valid: Flags = ()
     resets: Flags = ()
@@ -176,8 +177,8 @@ class Frames:
 class Part:
     """Which part of the log is used [s] since its beginning."""
 
-    start: float = 0.0
-    end: float | None = None
+    start: Seconds = 0.0
+    end: Seconds | None = None
 
 
 @dataclass(frozen=True, config=STRICT)
