@@ -11,12 +11,9 @@ from .console import RichReporter, Trust, show_paths
 
 
 def export(
-    policy: tyro.conf.Positional[Path],
-    to: str = "npz",
-    delta: Path | None = None,
-    trust: Trust = (),
+    policy: tyro.conf.Positional[Path], to: str = "npz", delta: Path | None = None, trust: Trust = (),
     out: Path | None = None,
-) -> Callable[[threading.Event], int]:
+) -> Callable[[threading.Event], int]:  # fmt: skip
     """Write a policy for a computer without JAX, run it there, and compare it with JAX on 10,000 observations.
 
     Args:
