@@ -74,6 +74,19 @@ def test_times_that_shake_and_poses_that_are_missing(tmp_path):
     assert log.valid[~((log.t > 4.8) & (log.t < 5.6))][5:-5].all()
 
 
+@pytest.mark.parametrize("dt", [0.02, 0.005])
+def test_positions_that_jump_have_no_velocity(dt, tmp_path):
+    """As those of motion capture that swaps two markers, for a while or for one sample."""
+    flight = flown(12.0, dt=dt, wind=PUSH)
+    table = columns(flight)
+    table["py"] = table["py"] + 0.15 * ((flight.t > 5.0) & (flight.t < 6.0))
+    table["px"][round(8.0 / dt)] += 0.3
+    log = read(tmp_path, table, POSES)
+    np.testing.assert_allclose(missed(log), 0.0, atol=0.1)
+    assert log.seconds > 11.0
+    assert any("the position jumps 4 times, and what is around is left out" in note for note in log.notes)
+
+
 @pytest.mark.parametrize("axes", ["world", "body"])
 def test_velocities_alone(axes, tmp_path):
     flight = flown(8.0, wind=PUSH)

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import LogError
+from .jumps import LEAST_SPEED, stands_out
 from .resampling import GAP
 from .series import Series
 
@@ -32,28 +33,35 @@ def slope_of(path: Path, position: Series, metres: float) -> tuple[Series, str]:
     if len(t) < 4 * FEWEST + 2:
         raise LogError(f"{path}: {len(t)} positions are too few to differentiate")
     tick = float(np.median(np.diff(t)))
+    steps = metres * np.diff(p, axis=0) / np.diff(t)[:, None]
+    jumps = stands_out(steps, np.ones(len(steps), dtype=bool), LEAST_SPEED)
+    pieces = np.concatenate([[0], np.cumsum(jumps | (np.diff(t) >= GAP * tick))])
     most = min(max(FEWEST, int(WIDEST / tick)), (len(t) - 1) // 2)
     for half in sorted({min(most, round(FEWEST * 1.4**k)) for k in range(20)}):
         probes = np.linspace(half, len(t) - 1 - half, min(PROBES, len(t) - 2 * half)).astype(int)
-        noise, shake = (metres * each for each in _cubics(t, p, probes, half, tick)[1:])
+        noise, shake = (metres * each for each in _cubics(t, p, pieces, probes, half, tick)[1:])
         if shake <= QUIET:
             break
     v = np.full(p.shape, np.nan)
     for first in range(half, len(t) - half, CHUNK):
         rows = np.arange(first, min(first + CHUNK, len(t) - half))
-        v[rows] = _cubics(t, p, rows, half, tick)[0]
+        v[rows] = _cubics(t, p, pieces, rows, half, tick)[0]
     found = np.isfinite(v[:, 0])
     said = (
         f"velocity is the derivative of the position, smoothed over {2000 * half * tick:.0f} ms, centred, without a "
         f"lag; its noise is about {noise:.2g} m/s"
     )
+    if jumps.any():
+        said += f"; the position jumps {np.sum(jumps)} times, and what is around is left out"
     return Series(t[found], v[found]), said
 
 
-def _cubics(t: np.ndarray, p: np.ndarray, rows: np.ndarray, half: int, tick: float) -> tuple[np.ndarray, float, float]:
-    """Return the slope at each of some samples, NaN beside gaps, and the noise of slopes and second derivatives."""
+def _cubics(
+    t: np.ndarray, p: np.ndarray, pieces: np.ndarray, rows: np.ndarray, half: int, tick: float
+) -> tuple[np.ndarray, float, float]:
+    """Return slopes at some samples, NaN where a piece ends, and the noise of slopes and second derivatives."""
     k = rows[:, None] + np.arange(-half, half + 1)
-    whole = np.all(np.diff(t[k], axis=1) < GAP * tick, axis=1)
+    whole = pieces[k[:, 0]] == pieces[k[:, -1]]
     x = np.where(whole[:, None], (t[k] - t[rows][:, None]) / (half * tick), np.linspace(-1.0, 1.0, 2 * half + 1))
     X = np.stack([np.ones_like(x), x, x**2, x**3], axis=2)
     inverse = np.linalg.solve(np.swapaxes(X, 1, 2) @ X, np.swapaxes(X, 1, 2))
