@@ -72,7 +72,7 @@ def plant(plan: DrillPlan) -> None:
             if now:
                 accepted = now[0].u
                 if now[0].landed:
-                    bus.publish("ended", pack_note("ended", reason="landed"))
+                    bus.publish("ended", pack_note("ended", reason=now[0].ending(x[2])))
                     return
                 break
             time.sleep(5e-4)

@@ -93,3 +93,15 @@ def test_a_log_that_is_shorter_than_the_flight_is_a_fault_and_missed_ticks_are_n
     assert lost(holed) == [f"{said} 240 of 340 ticks, none from 2.00 to 4.00 s"]
     assert lost(holed, gaps=[(2.0, 4.0, 100)]) == []
     assert lost(rows[:0]) == [f"{said} 0 of 340 ticks, none from 0.00 to 6.80 s"]
+
+
+def test_a_vehicle_that_was_dropped_has_crashed_and_what_was_commanded_meanwhile_is_counted(asked):
+    rows = flown(asked)
+    rows[20:, -1], rows[20:, ACCOUNTS["step"]] = Mode.BLIND, 0.0
+    rows[-1, -1] = Mode.DROP
+    found = reported(asked, rows, "stopped without measurements at 0.87 m", reason="the newest measurement is old")
+    assert found["steady"]["crashes"] == 1
+    assert found["steady"]["value"] is None
+    assert found["fallback_ticks"]["value"] == 10
+    landing = reported(asked, rows, "stopped without measurements at 0.87 m", reason="landing")
+    assert landing["steady"]["crashes"] == 0

@@ -15,6 +15,7 @@ from live_processes import DT, HOME, level, moved
 from retrim import PlantError
 from retrim.adapt.learner import LearnerState
 from retrim.live.controllers import adaptive_source, plain_source
+from retrim.onboard.accounts import measured
 from retrim.onboard.control import ControlLoop
 from retrim.onboard.guard import Mode
 from retrim.onboard.messages import (
@@ -406,7 +407,8 @@ def test_a_measurement_that_is_refused_is_answered_by_level_and_sink():
             break
     assert modes[:4] == [Mode.POLICY] * 4
     assert 95 <= modes.count(Mode.BLIND) <= 105
-    assert modes[-1] == Mode.LANDED
+    assert modes[-1] == Mode.DROP
+    assert setpoint.ending(0.87) == "stopped without measurements at 0.87 m"
     assert flight.status["refused"] == {"sample": len(modes)}
     assert np.isfinite(FlightRows.unpack(flight.bus.latest("flight").data).rows).all()
 
@@ -452,8 +454,16 @@ def test_without_measurements_it_levels_then_lands_by_the_clock():
     found = [flight.loop.tick(now + 0.02 * i) for i in range(1, 140)]
     modes = [setpoint.landed for setpoint in found]
     assert flight.status["reason"].startswith("the newest measurement is")
-    assert flight.loop.mode == Mode.LANDED
+    assert flight.loop.mode == Mode.DROP
     assert 100 <= modes.index(True) <= 110
+    rows = FlightRows.unpack(flight.bus.latest("flight").data).rows
+    blind = rows[rows[:, 0] > 19]  # each command that nobody asked for has a row
+    assert (np.diff(blind[:, 0]) <= 2).all()
+    assert sorted(set(blind[:, -1])) == [Mode.BLIND, Mode.DROP]
+    assert not measured(blind).any()
+    assert measured(rows[rows[:, 0] <= 19]).all()
+    np.testing.assert_allclose(blind[:, 2], DT * (blind[:, 0] - 19), atol=DT)
+    np.testing.assert_array_equal(blind[-1, COMMAND], np.zeros(4))
 
 
 def test_a_lost_sample_holds_the_command():

@@ -102,7 +102,7 @@ def test_blind_it_levels_and_sinks_and_stops_after_two_seconds():
     x = state((0.0, 0.0, 3.0), (0.4, 0.2, 0.0))
     found = [fallback.step(x, False, x[:3], land=False) for _ in range(102)]
     assert {mode for _, mode in found[:99]} == {Mode.BLIND}
-    assert found[-1][1] == Mode.LANDED
+    assert found[-1][1] == Mode.DROP
     assert found[0][1] == Mode.BLIND
     R = rotation(np.array([0.4, 0.2, 0.0])) @ rotation(0.05 * found[0][0][1:])
     assert R[2, 2] > rotation(np.array([0.4, 0.2, 0.0]))[2, 2]

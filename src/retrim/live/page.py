@@ -38,6 +38,7 @@ FLOWN_BY = {
     "hold": " (the guard, which holds the vehicle, and lands it then)",
     "descend": " (the guard, which lands)",
     "blind": " (the guard, without a measurement)",
+    "drop": " (the guard, which stopped the motors after two seconds without a measurement)",
 }
 """What the names of who flies mean."""
 NO_ROTATION = 0.1  # error of R R^T, above which an attitude is not shown

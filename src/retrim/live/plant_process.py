@@ -102,7 +102,7 @@ def _flown(
             if unanswered * plan.dt > ALONE and parent.gone():
                 return "nobody commands, and the supervisor is gone"
         elif setpoint.landed:
-            return "landed"
+            return setpoint.ending(float(sample.truth[2]))
         else:
             u = setpoint.u
         if (asked := bus.latest("knobs", turned)) is not None:

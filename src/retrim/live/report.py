@@ -13,9 +13,9 @@ from ..experiments.flights import Flight
 from ..experiments.flying import scored, until_terminated
 from ..experiments.recovery import change_times, recoveries
 from ..io.trained import load_learnt
-from ..onboard.accounts import EDGES_MS, accounted, summary
+from ..onboard.accounts import EDGES_MS, accounted, measured, summary
 from ..onboard.guard import HOVER, Mode
-from ..onboard.messages import ACCOUNTS, COMMAND, MEASURED, TRUE
+from ..onboard.messages import ACCOUNTS, COMMAND, MEASURED, STOPPED, TRUE
 from ..onboard.recorder import read_log
 from ..onboard.stalls import lost_in
 from ..onboard.topics import LAYERS
@@ -47,7 +47,7 @@ def flight_of(
     """
     rows = read_log(request.folder / "flight.csv")
     dt = request.setup.preset.dt
-    shown = rows[rows[:, 1] < request.seconds - 0.5 * dt]
+    shown = rows[(rows[:, 1] < request.seconds - 0.5 * dt) & measured(rows)]
     if status.control.get("reason") == "landing":  # as ordered: what follows is not the policy's
         by_policy = np.flatnonzero(shown[:, -1] == Mode.POLICY)
         shown = shown[: by_policy[-1] + 1] if len(by_policy) else shown[:0]
@@ -83,9 +83,10 @@ def results(
     end = float(log.t[-1])
     changes = change_times(scenario.disturbance, request.setup.flown.home(), end)
     # The state of a crash may be none that is written down.
-    crashed = log.terminated or (status.ended == CRASHED and status.control.get("reason") != "landing")
+    lost = (status.ended or "").startswith((CRASHED, STOPPED)) and status.control.get("reason") != "landing"
+    crashed = log.terminated or lost
     back = recoveries(log.t, flight.error, changes, 0.05, terminated=crashed)
-    flown = rows[rows[:, 1] <= end]
+    flown = rows if lost else rows[rows[:, 1] <= end]
     by = {name: summary(flown[accounted(flown), column]) for name, column in ACCOUNTS.items()}
     policies = [swap for swap in events.swaps if swap[1] == "policy" and swap[0] <= end]
     given_up = status.control.get("given_up", [])

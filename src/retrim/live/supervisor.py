@@ -12,7 +12,7 @@ from typing import Any
 
 from ..errors import MessageError, PlantError
 from ..onboard.launch import last_words, launch
-from ..onboard.messages import last_note, last_sent, pack_note, ticks_of
+from ..onboard.messages import STOPPED, last_height, last_note, last_sent, pack_note, ticks_of
 from ..onboard.note_fields import plain
 from ..onboard.realtime import cores_of
 from ..onboard.recorder import Recorder
@@ -240,7 +240,10 @@ class Supervisor:
         if said := last_note(self.bus, "ended").get("reason"):
             return str(said)
         if "plant" in self.hangs:
+            flies_on = self.spec.scenario.entry.is_vehicle
+            what = "left to its autopilot" if flies_on else STOPPED
             why = f"the plant process hung: it said nothing for {SILENCE:g} s and was ended"
+            why = f"{what} at {last_height(self.bus):.2f} m: {why}"
         else:
             why = f"the plant process is gone: {last_words(self._complaints('plant'))}"
         self.bus.publish("ended", pack_note("ended", reason=why))

@@ -72,7 +72,7 @@ def _carried(plan: PlantPlan, plant: VehiclePlant, bus: Bus, parent: Lifeline, e
             if unanswered * plan.dt > ALONE and parent.gone():
                 return "nobody commands, and the supervisor is gone"
         elif setpoint.landed:
-            return "landed"
+            return setpoint.ending(float(now.p[2]))
         else:
             accepted = plant.send(setpoint.u)
         due = math.ceil((time.monotonic() - epoch) / plan.dt)

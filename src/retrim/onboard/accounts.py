@@ -4,7 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from .messages import ACCOUNTS
+from .guard import Mode
+from .messages import ACCOUNTS, Sample, Stamp
 
 EDGES_MS = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
 
@@ -30,4 +31,34 @@ def accounted(rows: np.ndarray) -> np.ndarray:
         rows: Columns as in :data:`retrim.onboard.messages.COLUMNS`.
     """
     found: np.ndarray = rows[:, ACCOUNTS["step"]] > 0.0
+    return found
+
+
+def blind_row(
+    sample: Sample, stamp: Stamp, now: float, start: float, dt: float, u: np.ndarray, mode: Mode
+) -> np.ndarray:
+    """Return the row of a command that answers no measurement: its state is the last one that is known, and its age.
+
+    Args:
+        sample: The last measurement.
+        stamp: That of the last message of the plant, whose state may have been refused.
+        now: Monotonic clock [s].
+        start: Time of the first measurement by the plant's clock [s].
+        dt: Control tick [s].
+        u: The command.
+        mode: Who flies.
+    """
+    after = max(stamp.tick - sample.tick, int((now - sample.sent) / dt), 1)
+    age = sample.age + now - sample.sent
+    head = [sample.tick + after, sample.t + after * dt - start, age]
+    return np.concatenate([head, sample.state, sample.truth, u, [0.0, 0.0, 0.0, age, 0.0, mode]])
+
+
+def measured(rows: np.ndarray) -> np.ndarray:
+    """Return which ticks answered a measurement; the state of others is an old one.
+
+    Args:
+        rows: Columns as in :data:`retrim.onboard.messages.COLUMNS`.
+    """
+    found: np.ndarray = accounted(rows) | ~np.isin(rows[:, -1], (Mode.BLIND, Mode.DROP))
     return found

@@ -9,7 +9,8 @@ import numpy as np
 
 from ..errors import MessageError, PlantError
 from ..transport.bus import Bus
-from .guard import UP, Fallback, G, GeometricHover, Mode
+from .accounts import blind_row
+from .guard import OVER, UP, Fallback, G, GeometricHover, Mode
 from .intake import Intake
 from .messages import ACCOUNTS, COMMAND, FlightRows, Sample, Setpoint, Stamp, pack_note, unpack_note
 from .pilot import LivePilot
@@ -95,14 +96,18 @@ class ControlLoop:
         u = self._policy(sample, t, age, new) if self.mode == Mode.POLICY else None
         if u is None:
             u, self.mode = self._fallback.step(sample.state, fresh, self._target, land=bool(self._landing))
-            self._issued = u if self.mode == Mode.LANDED else self.plan.limits.within(u)
-        setpoint = Setpoint(stamp.tick, time.monotonic(), self._issued, self._target, self.mode == Mode.LANDED)
+            self._issued = u if self.mode in OVER else self.plan.limits.within(u)
+        over, blind = self.mode in OVER, self.mode == Mode.DROP
+        setpoint = Setpoint(stamp.tick, time.monotonic(), self._issued, self._target, over, blind)
         if not setpoint.landed:
             self.bus.publish("setpoint", setpoint.pack())
         if new:
             accounts = [lateness, time.monotonic() - began, 0.0, age, t - self.intake.learnt, self.mode]
             head = [sample.tick, t, sample.age]
             self._row = np.concatenate([head, sample.state, sample.truth, self._issued, accounts])
+        elif self.mode in (Mode.BLIND, Mode.DROP):
+            self._finish_row(None)
+            self.rows.append(blind_row(sample, stamp, now, self._start, self.plan.dt, self._issued, self.mode))
         if setpoint.landed:  # the plant ends the flight at this command, and the recorder the log: the ticks go first
             self._finish_row(None)
             self._publish_rows()
@@ -130,7 +135,7 @@ class ControlLoop:
             self.intake.poll(t)
         self._ticks += 1
         ended = self.bus.latest("ended") is not None and not self.new_sample()
-        self.over = self.mode == Mode.LANDED or ended
+        self.over = self.mode in OVER or ended
         if self.over:  # no measurement will come that says what the plant took
             self._finish_row(None)
         self._publish_rows()  # each tick, so that the log has the last one, whenever this process dies

@@ -25,6 +25,12 @@ class Mode(IntEnum):
     LANDED = 4
     WATCHDOG = 5
     """The watchdog's fallback: the process that flew is dead."""
+    DROP = 6
+    """The motors stop wherever the vehicle is: nobody has known its state for too long."""
+
+
+OVER = Mode.LANDED, Mode.DROP
+"""After these nothing is commanded any more."""
 
 
 @dataclass(frozen=True)
@@ -158,7 +164,9 @@ class Fallback:
             self.place = target.copy()
         self.since += self.hover.dt
         self.blind_s = 0.0 if fresh else self.blind_s + self.hover.dt
-        if self.blind_s > BLIND_S or self._down(x, fresh):
+        if self.blind_s > BLIND_S:
+            return np.zeros(4), Mode.DROP
+        if self._down(x, fresh):
             return np.zeros(4), Mode.LANDED
         if not fresh:
             # Turned level within a quarter of a second of what was known; after that, straight on and gently down.

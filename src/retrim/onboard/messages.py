@@ -13,6 +13,8 @@ from ..transport.message import ArrayLike, describe, pack_arrays, unpack_arrays
 from .note_fields import plain, read_fields
 
 STATE = 15  # p, R by rows, v
+STOPPED = "stopped without measurements"
+"""How the reason begins why a flight ended whose vehicle was dropped."""
 
 
 class StaleError(MessageError):
@@ -99,11 +101,13 @@ class Setpoint:
     target: np.ndarray
     """Where the vehicle should be now, world [m]; who takes over holds it there."""
     landed: bool = False
-    """The vehicle has landed, or fallen: the plant shall stop."""
+    """The vehicle has landed, or shall fall: the plant stops."""
+    blind: bool = False
+    """It shall fall, since nobody knows its state."""
 
     def pack(self) -> bytes:
         """Return the bytes; the inverse of :meth:`unpack`."""
-        row = np.concatenate([[self.tick, self.sent, self.landed], self.u, self.target])
+        row = np.concatenate([[self.tick, self.sent, self.landed], self.u, self.target, [self.blind]])
         return pack_arrays({"row": row}, kind="setpoint", about={})
 
     @classmethod
@@ -113,8 +117,16 @@ class Setpoint:
         Raises:
             MessageError: The bytes are not one, or a number is not finite.
         """
-        row = unpack_arrays(data, {"row": np.empty(10)}, kind="setpoint", source="setpoint")["row"]
-        return cls(int(row[0]), float(row[1]), row[3:7], row[7:], bool(row[2]))
+        row = unpack_arrays(data, {"row": np.empty(11)}, kind="setpoint", source="setpoint")["row"]
+        return cls(int(row[0]), float(row[1]), row[3:7], row[7:10], bool(row[2]), bool(row[10]))
+
+    def ending(self, height: float) -> str:
+        """Return why the flight is over, for its last command.
+
+        Args:
+            height: Last one that is known [m].
+        """
+        return f"{STOPPED} at {height:.2f} m" if self.blind else "landed"
 
 
 COLUMNS = (
@@ -269,3 +281,16 @@ def ticks_of(bus: Bus) -> int:
         return 0 if message is None else Stamp.unpack(message.data).tick + 1
     except MessageError:
         return 0
+
+
+def last_height(bus: Bus) -> float:
+    """Return the height that the plant said last [m]; NaN if it has said none.
+
+    Args:
+        bus: Where it was published.
+    """
+    message = bus.latest("sample")
+    try:
+        return float("nan") if message is None else float(Sample.unpack(message.data).truth[2])
+    except MessageError:
+        return float("nan")

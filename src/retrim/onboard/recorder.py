@@ -14,12 +14,13 @@ from ..errors import MessageError
 from ..transport.bus import Bus
 from ..transport.shared_memory import SharedMemoryBus
 from .accounts import accounted
-from .guard import Mode
+from .guard import OVER, Mode
 from .heart import Heart
 from .messages import ACCOUNTS, COLUMNS, FlightRows, last_note, pack_note
 from .realtime import Lifeline
 
 SILENCE = 2.0  # [s] without a tick, after which a flight without a supervisor is over
+ENDS = tuple(mode.name.lower() for mode in OVER)
 LINGER = 5  # ticks after the end of a flight, in which those who flew may still report their last ones
 
 
@@ -142,4 +143,4 @@ def record(plan: RecorderPlan) -> None:
 
 
 def _over(bus: Bus) -> bool:
-    return last_note(bus, "status").get("mode") == "landed" or bus.latest("ended") is not None
+    return last_note(bus, "status").get("mode") in ENDS or bus.latest("ended") is not None

@@ -10,7 +10,8 @@ import numpy as np
 from ..errors import MessageError
 from ..transport.bus import Bus
 from ..transport.shared_memory import SharedMemoryBus
-from .guard import Fallback, GeometricHover, Limits, Mode
+from .accounts import blind_row
+from .guard import OVER, Fallback, GeometricHover, Limits, Mode
 from .heart import Heart
 from .messages import COMMAND, FlightRows, Sample, Setpoint, Stamp, pack_note
 from .realtime import Lifeline, be_punctual
@@ -76,10 +77,13 @@ class Watchdog:
         self._next = now + 1.5 * self.plan.dt  # at the latest, should no sample come
         fresh = self._sample.age + now - self._sample.sent <= self.plan.limits.state_age
         u, mode = self._fallback.step(self._sample.state, fresh, self._target, land=False)
-        self.done = mode == Mode.LANDED
-        setpoint = Setpoint(self._stamp.tick, now, u, self._target, self.done)
+        self.done = mode in OVER
+        setpoint = Setpoint(self._stamp.tick, now, u, self._target, self.done, mode == Mode.DROP)
         self.bus.publish("fallback", setpoint.pack())
-        if self._sample.tick == self._stamp.tick:  # a tick whose state was refused has no row
+        if mode in (Mode.BLIND, Mode.DROP) and not new:
+            row = blind_row(self._sample, self._stamp, now, self._start, self.plan.dt, u, mode)
+            self._rows.append(row)
+        elif self._sample.tick == self._stamp.tick:  # a tick whose state was refused has no row
             self._rows[-1][COMMAND], self._rows[-1][-1] = u, Mode.WATCHDOG
         self.bus.publish("fallback.flight", FlightRows(np.stack(self._rows)).pack())
         return setpoint
