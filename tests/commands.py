@@ -69,6 +69,7 @@ def results(folder, name="results.json"):
 def started(words, cwd, setup=""):
     """Start a command in a process of its own, whose Ctrl-C works whoever runs the tests."""
     listening = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
+    listening += "; signal.signal(signal.SIGHUP, signal.SIG_DFL)"
     code = f"{listening}\nfrom retrim.cli.main import main\n{setup}\nmain({[str(word) for word in words]!r})"
     return subprocess.Popen(
         [sys.executable, "-u", "-c", code],

@@ -1,4 +1,4 @@
-"""Ctrl-C or SIGTERM at any moment: exit code 130, no traceback, and what is done is kept."""
+"""Ctrl-C, SIGTERM or SIGHUP at any moment: exit code 130, no traceback, and what is done is kept."""
 
 import re
 import signal
@@ -76,7 +76,7 @@ def test_between_training_and_flights_the_demo_keeps_the_policy_with_results(fol
 def test_while_flying_keeps_what_was_flown(folder):
     words = "fly", "--policy", "p", "--seconds", "20", "--starts", "60", "--adapt", "none", "--plant", "simple"
     one_by_one = "--latency", "measured"  # flights of one program land at once
-    by = signal.SIGTERM  # as a scheduler of a cluster does
+    by = signal.SIGHUP  # as a terminal that is closed does
     code, out = interrupted((*words, *one_by_one, "--out", "half"), folder, after=b" of 60 flights", by=by)
     assert code == 130, out
     assert "Traceback" not in out

@@ -9,6 +9,7 @@ import tyro
 
 from ..errors import printable
 from ..live.ground import learn_for
+from ..signals import ending_signals
 from ..transport.remote import flights_at
 from .console import RichReporter, Trust, console
 
@@ -27,7 +28,8 @@ def learn(
     """
 
     def ordered(stop: threading.Event) -> int:
-        signal.signal(signal.SIGTERM, lambda *_: stop.set())
+        for number in ending_signals()[1:]:
+            signal.signal(number, lambda *_: stop.set())
         found = flights_at(addresses, key)
         with RichReporter().progress(", ".join(addresses)) as advance:
             last = learn_for(found, stop, lambda text: advance(0.5, text), trust)

@@ -118,8 +118,8 @@ def _fly(request: LiveRequest, run: Run) -> int:
     done = fly_live(request, run, RichReporter(), _display, lambda url: _open_page(url, run.folder))
     if done is None:
         return INTERRUPTED
-    show_table(TableSection(("figure", "unit", "value"), figures(done.rows), f"live, {done.flight.log.t[-1]:.1f} s"))
     drawn = picture([done.flight], done.request.setup, request.scenario, run.folder, stem="live")
+    show_table(TableSection(("figure", "unit", "value"), figures(done.rows), f"live, {done.flight.log.t[-1]:.1f} s"))
     show_paths([*drawn[:1], *done.paths])
     codes = [refuse(fault) for fault in done.faults]
     return run.exit_code or max(codes, default=int(not done.landed))

@@ -8,6 +8,8 @@ import sys
 import threading
 from collections.abc import Sequence
 
+from ..signals import stopped_by
+
 PACKAGE = __name__.rpartition(".")[0]
 COMMANDS = {
     "pretrain": "Train a policy from scratch in the nominal model and save it.",
@@ -34,7 +36,7 @@ HELP = "\n".join(
         "",
         "  --version, --help",
         "",
-        "Ctrl-C, or SIGTERM, stops a command and keeps what is done.",
+        "Ctrl-C, SIGTERM or a closed terminal (SIGHUP) stops a command and keeps what is done.",
     ]
 )
 
@@ -70,9 +72,7 @@ def _run(words: list[str]) -> int:
         return 2
     stop = threading.Event()
     try:
-        from ..experiments.interrupts import stop_on_interrupt
-
-        with stop_on_interrupt(stop):
+        with stopped_by(stop):
             return _command(words[0], words[1:], stop)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)

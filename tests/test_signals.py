@@ -1,0 +1,71 @@
+"""Ctrl-C, SIGTERM and a terminal that was closed end a command in the same way, and what is done is kept."""
+
+import os
+import pty
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import pytest
+
+from retrim.signals import handled_by, stopped_by
+
+WORK = """
+import signal, sys, threading, time
+from pathlib import Path
+from retrim.signals import handled_by, stopped_by
+
+for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):  # whoever runs the tests may ignore them
+    signal.signal(number, signal.SIG_DFL)
+stop, out = threading.Event(), Path(sys.argv[1])
+with stopped_by(stop):
+    try:
+        out.with_suffix(".begun").touch()
+        time.sleep(60.0)
+    except KeyboardInterrupt:
+        with handled_by(lambda *_: stop.set()):
+            print("what is said now may have nobody to hear it", flush=True)
+            out.write_text(f"kept, {stop.is_set()}")
+"""
+
+
+def begun(path):
+    until = time.monotonic() + 60.0
+    while not path.with_suffix(".begun").exists() and time.monotonic() < until:
+        time.sleep(0.01)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_each_signal_stops_and_raises(number):
+    before, stop = signal.signal(number, signal.SIG_DFL), threading.Event()
+    try:
+        with pytest.raises(KeyboardInterrupt), stopped_by(stop):
+            signal.raise_signal(number)
+        assert signal.getsignal(number) is signal.SIG_DFL
+    finally:
+        signal.signal(number, before)
+    assert stop.is_set()
+
+
+def test_what_a_closed_terminal_interrupts_is_kept(tmp_path):
+    out, (ours, theirs) = tmp_path / "out", pty.openpty()
+    words = [sys.executable, "-c", WORK, str(out)]
+    process = subprocess.Popen(words, stdin=theirs, stdout=theirs, stderr=theirs, start_new_session=True)
+    os.close(theirs)
+    begun(out)
+    os.close(ours)  # what is written there is an error from now on
+    process.send_signal(signal.SIGHUP)
+    assert process.wait(60.0) == 0
+    assert out.read_text() == "kept, True"
+
+
+def test_a_hangup_that_nohup_ignores_stays_ignored():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with handled_by(lambda *_: pytest.fail("it was answered")):
+            signal.raise_signal(signal.SIGHUP)
+            assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
