@@ -8,6 +8,7 @@ from jax import random
 
 from helpers import CheapModel
 from retrim.config import Setup, changed, load
+from retrim.config.faults import measurement_fault
 from retrim.io.trained import load_learnt, save_learnt
 from retrim.physics import Push
 from retrim.plants import SensorModel, SimPlant
@@ -29,14 +30,17 @@ def flights(trained):
     step = Push(lambda t, x: jnp.where(t < 3.0, 0.0, 2.0) * jnp.ones(3))
     setup, policy = trained
 
-    def flight(method, sensors=None):
+    def flight(method, sensors=None, fault=None):
         pilot = setup.pilot(policy, method, random.key(1))
-        plant = SimPlant(CheapModel(0.02), step, sensors=sensors, seed=3)
+        plant = SimPlant(CheapModel(0.02), step, sensors=sensors, fault=fault, seed=3)
         log = fly(plant, pilot, setup.flight_starts(1, 4)[0], ticks=300)
         return log, np.linalg.norm(log.p - np.array(setup.preset.goal), axis=1), pilot
 
     rough = SensorModel.of(position=1e-3, velocity=1e-2, attitude=3e-3, latency=10, dropout=0.05)
-    return {name: flight(name) for name in ("base", "base-do", "full")} | {"rough": flight("full", rough)}
+    return {name: flight(name) for name in ("base", "base-do", "full")} | {
+        "rough": flight("full", rough),
+        "spikes": flight("full", fault=measurement_fault("velocity-spikes")),
+    }
 
 
 @pytest.mark.parametrize("layers", ["base-do", "full", "rough"])
@@ -47,6 +51,16 @@ def test_a_step_is_answered_within_two_seconds(flights, layers):
     assert error[(log.t > 2.0) & (log.t < 3.0)].max() < 0.03
     assert error[log.t > 5.0].max() < 0.05
     assert error[log.t > 5.2].mean() < 0.1 * base[log.t > 5.2].mean()
+
+
+def test_wrong_velocities_are_excluded_and_reported(flights):
+    """One velocity in 25 is wrong by 2 m/s."""
+    log, error, pilot = flights["spikes"]
+    assert error[log.t > 2.0].max() < 0.2  # the step at 3 s and the wrong velocities, which the policy sees, included
+    assert error[log.t > 5.2].mean() < 0.3 * flights["base"][1][log.t > 5.2].mean()
+    notes = [event.note for event in pilot.events if event.kind == "residual"]
+    assert "velocity is not the derivative of position" in notes[-1]
+    np.testing.assert_allclose(pilot.state.residual.mean[:3], 2.0, atol=0.4)
 
 
 def test_learning_does_not_harm_the_layer_below(flights):
