@@ -1,11 +1,11 @@
-"""The trust boundary: which Python names may come from a file or a message.
+"""The trust boundary: Python names of files and messages.
 
-A name that is registered is always allowed. ``module:name`` imports a module and calls what it holds. It is accepted
-from who types it, on the command line and in Python. In a file and in a message it is data, and refused, unless the
-user names it as well: ``--trust mine:task``, or ``trust=("mine:task",)``.
+Registered names are always allowed. ``module:name`` imports a module and calls an object of it. Such a name is accepted
+on the command line and in Python. In a file or a message it is refused, unless the user names it as well: ``--trust
+mine:task``, or ``trust=("mine:task",)``.
 
-Whoever reads a policy, a learner's state, a preset, a sweep or a network message calls :func:`check_trust` before
-anything of it is built. Whoever starts a process of its own hands on :func:`python_names` of what the user named.
+Readers of policies, learner states, presets, sweeps and network messages call :func:`check_trust` before they build
+anything. Starters of processes pass :func:`python_names` of the names that the user gave.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ from ..errors import ConfigError, excerpt
 CSV_FILE = re.compile(r"[^:]*\.csv(:(laps|once))?", re.IGNORECASE)
 """A trajectory, which is no Python name: its colon says how it is flown."""
 FREE = "options"
-"""The table of a task of one's own: this package looks up nothing in it."""
+"""The table of a user's own task, in which this package looks up no name."""
 
 
 def python_names(values: Any) -> tuple[str, ...]:
@@ -31,10 +31,10 @@ def python_names(values: Any) -> tuple[str, ...]:
 
 
 def check_trust(values: Any, trust: Collection[str], *, source: str) -> None:
-    """Refuse the Python names of a file or message, but for those that the user named.
+    """Refuse the Python names of a file or message, except those that the user trusts.
 
     Args:
-        values: What was read, before anything of it is built.
+        values: Content of the file or message, before anything is built from it.
         trust: Names as ``mine:task``.
         source: Where it comes from; the message begins with it.
 

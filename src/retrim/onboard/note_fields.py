@@ -1,4 +1,4 @@
-"""What the fields of notes between processes may be: type and range, checked before anything is done with them."""
+"""Types and ranges of the fields of notes between processes, checked before use."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -7,7 +7,7 @@ from typing import Any
 from ..errors import MessageError
 
 Read = Callable[[Any], Any]
-"""From a value of JSON to the same value, or ``ValueError`` with what it must be."""
+"""From a value of JSON to the same value, or ``ValueError`` with the requirement."""
 MANY, MOST, LONG = 2**53, 1e300, 1000
 """The largest whole number and the largest number that every reader takes, and the longest text."""
 
@@ -25,7 +25,7 @@ def plain(text: str) -> str:
 
 
 def number(low: float = -math.inf, high: float = math.inf, *, finite: bool = True) -> Read:
-    """Return what reads a number of a range; ``finite=False`` takes what is none, which a flight may report."""
+    """Return a reader of numbers of a range; ``finite=False`` accepts NaN and infinity, which a flight may report."""
 
     def read(value: Any) -> float:
         if not isinstance(value, int | float) or isinstance(value, bool):
@@ -40,7 +40,7 @@ def number(low: float = -math.inf, high: float = math.inf, *, finite: bool = Tru
 
 
 def whole(low: int = 0, high: int = MANY) -> Read:
-    """Return what reads a whole number of a range."""
+    """Return a reader of whole numbers of a range."""
 
     def read(value: Any) -> int:
         if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
@@ -58,19 +58,19 @@ def flag(value: Any) -> bool:
 
 
 def text(value: Any) -> str:
-    """Read a text; control characters are written out, and what is too long is cut."""
+    """Read a text; control characters are escaped, and a long text is shortened."""
     if not isinstance(value, str):
         raise ValueError("a text")
     return plain(value)
 
 
 def maybe(read: Read) -> Read:
-    """Return what reads nothing, too."""
+    """Return a reader that accepts null, too."""
     return lambda value: None if value is None else read(value)
 
 
 def list_of(*reads: Read, length: int | None = None) -> Read:
-    """Return what reads a list: of one kind and any length or a given one, or of several kinds in their order."""
+    """Return a reader of lists: of one kind with any length or a given one, or of several kinds in their order."""
     exact = length if len(reads) == 1 else len(reads)
 
     def read(value: Any) -> list[Any]:
@@ -83,7 +83,7 @@ def list_of(*reads: Read, length: int | None = None) -> Read:
 
 
 def map_of(read: Read) -> Read:
-    """Return what reads a table of names and values of one kind."""
+    """Return a reader of tables with names and values of one kind."""
 
     def read_all(value: Any) -> dict[str, Any]:
         if not isinstance(value, dict):

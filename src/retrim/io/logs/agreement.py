@@ -1,7 +1,7 @@
-"""How well the quantities of a log agree with each other.
+"""Agreement of the quantities of a log with each other.
 
-Positions move as velocities say; a vehicle accelerates along its thrust axis, and as its thrust says; it turns as it is
-told and as its gyroscope says. Wind, drag and lags leave something unexplained in every log.
+The velocity is the derivative of the position, the acceleration is along the thrust axis and follows the thrust, and the
+rotation follows the commanded rates and equals the measured ones. Wind, drag and lags leave a rest in every log.
 """
 
 import math
@@ -14,7 +14,7 @@ from .on_one_clock import UP, Ticks, turning
 from .resampling import smoothed
 
 SMOOTH = 0.2  # [s] over which differences are taken
-MOVES, TILTS, TURNS, CLIMBS = 0.15, 0.03, 0.1, 0.25  # [m/s], [rad], [rad/s], [m/s^2]: nothing can be told below
+MOVES, TILTS, TURNS, CLIMBS = 0.15, 0.03, 0.1, 0.25  # [m/s], [rad], [rad/s], [m/s^2]: least motion that is compared
 AGAINST = -0.3  # agreement of one axis below which it has the other sign, however little it counts
 SLOW = 3.0  # [s]: slower changes, as those of a battery, explain nothing
 LATE = 0.2  # [s] by which an acceleration may follow the thrust
@@ -27,11 +27,11 @@ CLAIMS: Mapping[str, str] = {
     "turning": "commanded rates explain {} % of the turning",
     "gyroscope": "measured rates explain {} % of the turning",
 }
-"""What each figure says."""
+"""Meaning of each figure."""
 
 
 def agreement(chosen: LogMap, ticks: Ticks, valid: np.ndarray) -> dict[str, float]:
-    """Return how well a log agrees with itself, 1 for entirely; what cannot be told is not in it."""
+    """Return the figures of agreement, 1 for complete; a figure without enough motion is absent."""
     k = max(1, round(SMOOTH / ticks.dt))
     both = np.convolve(valid, np.ones(k + 1), mode="valid") > k
     if both.sum() < 2 * k:

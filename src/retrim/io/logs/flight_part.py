@@ -1,4 +1,4 @@
-"""Which ticks of a log are flight, with everything known: what is left out, and why."""
+"""Selection of the ticks of a log that are flight with complete data, and the reasons for excluding the others."""
 
 from pathlib import Path
 
@@ -18,7 +18,7 @@ FROZEN = 0.3  # [s] for which the position of a vehicle in the air has not chang
 
 
 def flight_part(path: Path, ticks: Ticks, marks: Marks, *, measured_position: bool) -> tuple[np.ndarray, list[str]]:
-    """Return where the vehicle flies and everything is known, with notes on what is left out.
+    """Return the ticks at which the vehicle flies with complete data, and notes on the excluded ones.
 
     Args:
         path: For messages.

@@ -1,4 +1,4 @@
-"""What an autopilot says of its own estimates: where they hold, where they are reset, and whether it has landed."""
+"""Marks of an autopilot in its log: validity of the estimates, resets of the estimator, and landing."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
