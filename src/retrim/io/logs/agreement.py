@@ -1,7 +1,7 @@
 """Agreement of the quantities of a log with each other.
 
-The velocity is the derivative of the position, the acceleration is along the thrust axis and follows the thrust, and the
-rotation follows the commanded rates and equals the measured ones. Wind, drag and lags leave a rest in every log.
+The velocity is the derivative of the position. Acceleration lies along the thrust axis and follows the thrust.
+Rotation follows the commanded rates and equals the measured ones. Wind, drag and lags leave a rest in every log.
 """
 
 import math
