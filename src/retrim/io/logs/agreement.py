@@ -72,7 +72,7 @@ def heading_between(ticks: Ticks, valid: np.ndarray) -> float:
     """Return by how much attitudes must be turned about the vertical to lean as the vehicle accelerates [deg]."""
     felt, axis = (x - x.mean(axis=0) for x in ((ticks.a + UP)[valid, :2], ticks.R[valid, :2, 2]))
     cross = np.sum(axis[:, 0] * felt[:, 1] - axis[:, 1] * felt[:, 0])
-    return float(np.degrees(np.arctan2(cross, np.sum(axis * felt))))
+    return float(np.nan_to_num(np.degrees(np.arctan2(cross, np.sum(axis * felt)))))
 
 
 def _lift(felt: np.ndarray, axis: np.ndarray) -> float:

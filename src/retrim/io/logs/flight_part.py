@@ -29,7 +29,7 @@ def flight_part(path: Path, ticks: Ticks, marks: Marks, *, measured_position: bo
     Raises:
         LogError: Hardly anything is left.
     """
-    notes, dt, valid = list[str](), ticks.dt, ticks.known.copy()
+    notes, dt, valid = list[str](), ticks.dt, ticks.known & _finite(ticks)
     most, least = ticks.thrust[ticks.known].max(initial=-np.inf), ticks.thrust[ticks.known].min(initial=np.inf)
     if most == least == 0.0:
         raise LogError(f"{path}: thrust is 0 throughout; thrust.fields must name the command that is in use")
@@ -61,6 +61,14 @@ def flight_part(path: Path, ticks: Ticks, marks: Marks, *, measured_position: bo
         why = f" ({'; '.join(notes)})" if notes else ""
         raise LogError(f"{path}: {np.sum(valid) * dt:.2f} s of flight are left, at least {LEAST:g} s are needed{why}")
     return valid, notes
+
+
+def _finite(ticks: Ticks) -> np.ndarray:
+    """Return where all quantities are finite: differences of damaged times need not be."""
+    columns = [ticks.p, ticks.v, ticks.a, ticks.rates, ticks.thrust[:, None], ticks.R.reshape(-1, 9)]
+    if ticks.command is not None:
+        columns.append(ticks.command)
+    return np.asarray(np.all(np.isfinite(np.concatenate(columns, axis=1)), axis=1))
 
 
 def _moves(path: Path, ticks: Ticks, airborne: np.ndarray, marks: Marks) -> tuple[np.ndarray, list[str]]:

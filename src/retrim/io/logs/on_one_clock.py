@@ -17,6 +17,7 @@ from .series import Series
 UP = np.array([0.0, 0.0, STANDARD_GRAVITY])
 STATES = ("position", "velocity", "attitude")
 SLOWEST = 0.1  # [s]: states that come more rarely say nothing of accelerations, and no preset has such a tick
+SHORTEST = 2e-5  # [s]: no state comes so often
 ROUNDING = 0.045  # share by which a logger that is set to ten samples a second may miss them
 LONGEST = 5_000_000  # ticks of a log: times that are this far apart are no times of one flight
 ALIKE = 0.02  # share by which the periods of a log and of the control differ that count as the same
@@ -69,7 +70,7 @@ def grid_of(path: Path, series: dict[str, Series], part: maps.Part, dt: float) -
             f"{path}: {slowest} comes every {own:.3g} s; accelerations need a sample every {SLOWEST:g} s at least; "
             + remedy
         )
-    if own < 2e-5:
+    if own < SHORTEST:
         raise LogError(f"{path}: {slowest} comes every {own:.3g} s; is time in ms, us or ns?")
     needed = {name: each for name, each in series.items() if " " not in name}  # marks hold before and after
     zero = min(each.t[0] for each in needed.values())

@@ -6,6 +6,7 @@ import numpy as np
 
 from ...errors import LogError
 from .jumps import LEAST_SPEED, stands_out
+from .on_one_clock import SHORTEST
 from .resampling import GAP
 from .series import Series
 
@@ -33,6 +34,8 @@ def slope_of(path: Path, position: Series, metres: float) -> tuple[Series, str]:
     if len(t) < 4 * FEWEST + 2:
         raise LogError(f"{path}: {len(t)} positions are too few to differentiate")
     tick = float(np.median(np.diff(t)))
+    if tick < SHORTEST:
+        raise LogError(f"{path}: position comes every {tick:.3g} s; is time in ms, us or ns?")
     steps = metres * np.diff(p, axis=0) / np.diff(t)[:, None]
     jumps = stands_out(steps, np.ones(len(steps), dtype=bool), LEAST_SPEED)
     pieces = np.concatenate([[0], np.cumsum(jumps | (np.diff(t) >= GAP * tick))])

@@ -9,6 +9,8 @@ from ...physics.state import STANDARD_GRAVITY
 from .log_map import Thrust
 from .on_one_clock import UP, Ticks
 
+LEAST = 1e-9  # of any share: what is smaller is no command
+
 
 def mass_normalised(
     path: Path, spec: Thrust, ticks: Ticks, valid: np.ndarray
@@ -23,6 +25,11 @@ def mass_normalised(
     if spec.hover is None:
         felt = ticks.a[valid] + UP
         along, share = np.sum(felt * ticks.R[valid, :, 2], axis=1), ticks.thrust[valid]
+        largest = float(np.max(share))
+        if largest < LEAST:
+            raise LogError(
+                f"{path}: thrust is {largest:.3g} at most; thrust.fields must name the command that is in use"
+            )
         full = float(np.sum(share * along) / np.sum(share**2))
         if full <= 0.0:
             raise LogError(f"{path}: the more thrust, the less acceleration along its axis; is it the right field?")

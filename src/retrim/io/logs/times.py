@@ -11,6 +11,7 @@ from ...errors import LogError
 from .series import Series
 
 LATE_S = 0.5  # [s] by which a sample may be older than the one before; more is of another flight
+LARGEST = 1e15  # of any unit: what is larger is damaged
 RARE = 0.05  # share of samples whose time may be impossible
 FAR_S, FAR = 60.0, 3.0  # [s], and lengths of the log, by which such a time is before or after all others at least
 FEWEST = 50  # samples, at least, of which one may be
@@ -26,7 +27,7 @@ def in_order(series: Series, what: str, path: Path) -> tuple[Series, list[str]]:
         LogError: Times go back or stand still, or nothing is left.
     """
     notes, count = list[str](), len(series.t)
-    finite = np.isfinite(series.t) & np.all(np.isfinite(series.values), axis=1)
+    finite = np.isfinite(series.t) & np.all(np.abs(series.values) < LARGEST, axis=1)
     if not finite.any():
         raise LogError(f"{path}: {what} has no finite sample among {count}")
     rules: tuple[tuple[Callable[[np.ndarray], np.ndarray], str], ...] = (
