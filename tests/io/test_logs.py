@@ -441,20 +441,21 @@ DAMAGED = (0.0, np.nan, np.inf, 1e308, -1e308, 1e-308, 1e30, -1.0, 1e9)
 @pytest.mark.parametrize("missing", ["nothing", "velocity", "position"])
 def test_damaged_numbers_are_one_line_or_a_flight_that_is_finite(missing, tmp_path):
     """Any number in any column, once, for a while or throughout."""
-    rng, short = np.random.default_rng(1), columns(flown(4.0))
+    rng, short = np.random.default_rng(1), columns(flown(3.0))
     text = MAP if missing == "nothing" else re.sub(rf"\[{missing}\]\n.*\n", "", MAP)
     maps = [read_map(write_map(tmp_path / "map.toml", text, thrust__unit=unit)) for unit in ('"m/s^2"', '"share"')]
-    for k in range(40):
+    for k in range(24):
         table = {name: x.copy() for name, x in short.items()}
         for name in rng.choice(list(table), 2):
             first = rng.integers(0, len(table["t"]))
             table[name][first : first + rng.choice([1, 30, 500])] = rng.choice(DAMAGED)
         path = write_csv(tmp_path / "log.csv", table)
+        said = ""
         try:
             log = read_flight_log(path, maps[k % 2])
         except RetrimError as error:
-            assert "\n" not in str(error)
-            assert len(str(error)) < 1000
-        else:
-            for column in (log.p, log.v, log.a, log.R, log.rates, log.c):
-                assert np.isfinite(column[log.valid]).all()
+            said = str(error)
+        assert "\n" not in said
+        assert len(said) < 1000
+        for column in () if said else (log.p, log.v, log.a, log.R, log.rates, log.c):
+            assert np.isfinite(column[log.valid]).all()
