@@ -1,7 +1,10 @@
 """Commands as a user runs them, at reduced size: what they print, write and return."""
 
+import errno
 import json
+import os
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -74,6 +77,27 @@ def test_what_was_learnt_is_kept_and_goes_on(folder):
     retrim("fly", "--resume", "f/learnt.safetensors", *ROUGH, "--seconds", "2", "--out", "r", cwd=folder)
     went_on = results(folder / "r")["rows"]
     assert [row["method"] for row in went_on] == ["base", "full"]
+
+
+def test_a_full_disk_loses_no_flight(folder, monkeypatch):
+    sync = os.fsync
+
+    def full(file):
+        if "/full/" in os.readlink(f"/proc/self/fd/{file}"):
+            raise OSError(errno.ENOSPC, "No space left on device")
+        sync(file)
+
+    monkeypatch.setattr(os, "fsync", full)
+    words = "fly", "--policy", "p", *ROUGH, "--seconds", "2", "--starts", "2", "--out", "full"
+    out = retrim(*words, cwd=folder, code=1)
+    assert "hover error [m], last 2 s of 2 s, 2 starts" in out
+    (place,) = {Path(found) for found in re.findall(r"\(No space left on device\); it is in (\S+)", out)}
+    for name in ("what was learnt", "events.jsonl", "the logs", "results.json"):
+        assert f"retrim: {name} cannot be written to full (No space left on device); it is in {place}" in out
+    assert results(place)["rows"] == results(folder / "f")["rows"]
+    assert load_learnt(place / "learnt.safetensors")[1].name == "hover/retrim"
+    assert len(list((place / "logs").glob("*.npz"))) == 4
+    shutil.rmtree(place)
 
 
 def test_a_flight_repeats_bit_for_bit_and_another_seed_flies_otherwise(folder):

@@ -41,7 +41,7 @@ def reported(asked, rows, ended, stalls=None, **control):
     lines = [",".join(COLUMNS), *(",".join(map(repr, row)) for row in rows.tolist())]
     (asked.folder / "flight.csv").write_text("\n".join(lines) + "\n")
     status, events = Status(1.0, control, {}, {}, {}, ended, [], False, 0, None, stalls or {}), LiveEvents()
-    flight, found = flight_of(asked, (), status, None)
+    flight, found = flight_of(asked, (), status, None, asked.folder / "flight.csv")
     return {row["metric"]: row for row in results(asked, flight, found, status, events)}
 
 

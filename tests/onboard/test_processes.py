@@ -1,6 +1,8 @@
 """The clock of the process that flies, the watchdog, the recorder and the accounts, without a clock."""
 
+import errno
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -17,7 +19,18 @@ from retrim.onboard.accounts import accounted, summary
 from retrim.onboard.control_process import PATIENCE, Schedule
 from retrim.onboard.guard import G, Limits, Mode
 from retrim.onboard.launch import launch
-from retrim.onboard.messages import ACCOUNTS, COLUMNS, COMMAND, FlightRows, Sample, Setpoint, Stamp, pack_note
+from retrim.onboard.log_file import log_path
+from retrim.onboard.messages import (
+    ACCOUNTS,
+    COLUMNS,
+    COMMAND,
+    FlightRows,
+    Sample,
+    Setpoint,
+    Stamp,
+    last_note,
+    pack_note,
+)
 from retrim.onboard.realtime import Lifeline, cores_of
 from retrim.onboard.recorder import Recorder, RecorderPlan, read_log, record
 from retrim.onboard.shares import MARGIN, PHASE, ROOM, SHARE
@@ -269,12 +282,66 @@ def test_what_is_reported_just_after_the_end_is_written(tmp_path):
     np.testing.assert_array_equal(read_log(tmp_path / "flight.csv")[:, 0], np.arange(3))
 
 
-def test_a_full_disk_ends_the_log_and_nothing_else(tmp_path):
+def test_a_log_that_can_be_written_nowhere_ends_and_nothing_else(tmp_path):
     bus = InProcessBus(TOPICS | {"ready.recorder": 4096})
-    recorder = Recorder(tmp_path / "gone" / "flight.csv", bus)
-    assert recorder.failed
+    (tmp_path / "file").touch()
+    recorder = Recorder(tmp_path / "file" / "flight.csv", bus)
+    assert recorder.failed == f"{tmp_path}/file/flight.csv: Not a directory"
     bus.publish("flight", rows(0, 3))
     assert recorder.step() == 0
+
+
+def removed(folder):
+    shutil.rmtree(folder)
+
+
+def renamed(folder):
+    folder.rename(folder.with_name("renamed"))
+
+
+def replaced(folder):
+    shutil.rmtree(folder)
+    folder.write_text("a file of the same name")
+
+
+@pytest.mark.parametrize("change", [removed, renamed, replaced])
+def test_a_log_whose_folder_is_gone_goes_on_elsewhere_with_all_that_was_written(tmp_path, change):
+    bus, folder, spare = InProcessBus(TOPICS | {"ready.recorder": 4096}), tmp_path / "out", tmp_path / "spare"
+    path = folder / "flight.csv"
+    recorder = Recorder(path, bus, (spare,))
+    bus.publish("flight", rows(0, 10))
+    assert recorder.step() == 10
+    change(folder)
+    bus.publish("flight", rows(5, 20))
+    assert recorder.step() == 15
+    found = log_path(path, (spare,))
+    assert found == (spare / "flight.csv" if change is replaced else path)
+    assert last_note(bus, "ready.recorder", "ready")["moved"].startswith(f"{path}: ")
+    bus.publish("flight", rows(10, 30))  # of a recorder that was started again
+    assert Recorder(path, bus, (spare,)).step() == 15
+    np.testing.assert_array_equal(read_log(found)[:, 0], np.arange(40))
+
+
+def test_a_log_on_a_full_disk_goes_on_in_the_first_temporary_folder_with_room(tmp_path, monkeypatch):
+    bus, spare = InProcessBus(TOPICS | {"ready.recorder": 4096}), (tmp_path / "full", tmp_path / "spare")
+    path, write = tmp_path / "out" / "flight.csv", os.write
+    recorder = Recorder(path, bus, spare)
+    bus.publish("flight", rows(0, 10))
+    recorder.step()
+
+    def full(file, data):
+        if "spare" in os.readlink(f"/proc/self/fd/{file}"):
+            return write(file, data)
+        if len(data) > 1:
+            return write(file, data[: len(data) // 2])  # what fits is written all the same
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "write", full)
+    bus.publish("flight", rows(5, 20))
+    assert recorder.step() == 15
+    np.testing.assert_array_equal(read_log(path)[:, 0], np.arange(10))  # no half lines
+    np.testing.assert_array_equal(read_log(log_path(path, spare))[:, 0], np.arange(25))
+    assert recorder.moved == f"{path}: No space left on device; the log goes on in {tmp_path}/spare/flight.csv"
 
 
 def test_a_lifeline_tells_at_once():

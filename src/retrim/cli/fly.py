@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import tyro
@@ -17,10 +18,10 @@ from ..experiments.flights import Flight
 from ..experiments.gathering import told_by
 from ..experiments.interrupts import interrupts_only_set
 from ..experiments.metrics import cell, notes, rows
-from ..experiments.outputs import write_flights
+from ..experiments.outlet import Outlet
 from ..experiments.run import INTERRUPTED, Run
 from ..experiments.tables.document import TableSection
-from .console import RichReporter, Trust, console, show_paths, show_table, started
+from .console import RichReporter, Trust, console, refuse, show_paths, show_table, started
 
 
 def fly(
@@ -102,18 +103,19 @@ def _fly(fleet: Fleet, setup: Setup, scenario: Scenario, run: Run) -> int:
     if not flights:
         console.print("interrupted before the first flight was over; nothing was saved")
         return INTERRUPTED
-    found, preset = rows(flights), setup.preset
+    found, preset, outlet = rows(flights), setup.preset, Outlet(run.folder)
     with interrupts_only_set(run.stop):
-        run.write_results(found, seeds=list(fleet.policies), preset=preset.name)
-        write_flights(flights, preset, run.folder)
+        outlet.write_flights(flights, preset)
+        drawn = outlet.write("the picture", partial(picture, flights, setup, scenario)) or []
+        results = outlet.write_results(run, found, seeds=list(fleet.policies), preset=preset.name)
     n, steady = found[0]["n"], min(flights[0].steady_seconds, fleet.seconds)
     title = f"{preset.task} error [m], last {steady:g} s of {fleet.seconds:g} s, {n} start{'s' * (n > 1)}"
     lines = tuple((row["disturbance"], row["method"], cell(row)) for row in found)
     show_table(TableSection(("disturbance", "method", "error"), lines, title))
     for note in notes(flights, preset):
         console.print(note, markup=False, soft_wrap=True)
-    show_paths([*picture(flights, setup, scenario, run.folder), run.folder / "results.json"])
-    return run.exit_code
+    show_paths([*drawn, *([] if results is None else [results])])
+    return run.exit_code or max((refuse(fault) for fault in outlet.faults), default=0)
 
 
 def _warn(setup: Setup, scenario: Scenario) -> None:

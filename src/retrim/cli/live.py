@@ -3,6 +3,7 @@
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import tyro
@@ -118,10 +119,11 @@ def _fly(request: LiveRequest, run: Run) -> int:
     done = fly_live(request, run, RichReporter(), _display, lambda url: _open_page(url, run.folder))
     if done is None:
         return INTERRUPTED
-    drawn = picture([done.flight], done.request.setup, request.scenario, run.folder, stem="live")
+    draw = partial(picture, [done.flight], done.request.setup, request.scenario, stem="live")
+    drawn = done.outlet.write("the picture", draw) or []
     show_table(TableSection(("figure", "unit", "value"), figures(done.rows), f"live, {done.flight.log.t[-1]:.1f} s"))
     show_paths([*drawn[:1], *done.paths])
-    codes = [refuse(fault) for fault in done.faults]
+    codes = [refuse(fault) for fault in done.outlet.faults]
     return run.exit_code or max(codes, default=int(not done.landed))
 
 

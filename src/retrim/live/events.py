@@ -27,7 +27,7 @@ class LiveEvents:
         """Time [s], half, version, and how old the flight was that it was learnt from [s]."""
         self._newest: dict[str, int] = {}
         self._mode, self._watchdog, self._log_failed = "policy", False, False
-        self._watchdog_ticks = 0
+        self._log_moved, self._watchdog_ticks = "", 0
         self._restarts: dict[str, int] = {}
         self._hangs: dict[str, int] = {}
         self._given_up: set[int] = set()
@@ -74,6 +74,9 @@ class LiveEvents:
         if status.log_failed and not self._log_failed:
             self._log_failed = True
             new.append(Event(t, "guard", f"log: the flight is no longer written down, {status.log_failed}"))
+        if status.log_moved != self._log_moved:
+            self._log_moved = status.log_moved
+            new.append(Event(t, "log", status.log_moved))
         if status.watchdog_flies and not self._watchdog:
             new.append(Event(t, "guard", WATCHDOG))
         if not status.watchdog_flies and (ticks := status.watchdog_ticks - self._watchdog_ticks):

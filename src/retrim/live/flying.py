@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from contextlib import AbstractContextManager, ExitStack, closing
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,13 +11,16 @@ import jax
 import numpy as np
 
 from ..adapt.learner import LearnerState
+from ..errors import PlantError
 from ..experiments.flights import Flight
-from ..experiments.outputs import clear_outputs, write_events, write_learnt
+from ..experiments.outlet import Outlet
+from ..experiments.outputs import clear_outputs, write_events, write_learnt, write_state
 from ..experiments.reporter import Reporter
 from ..experiments.run import Run
 from ..io.logs.recording import Recording, write_npz
 from ..io.logs.viewers import can_record, record
 from ..onboard.guard import Mode
+from ..onboard.log_file import log_path
 from ..onboard.messages import ACCOUNTS, COMMAND, MEASURED, TRUE
 from ..runtime.events import Event
 from ..tasks.transition import spliced
@@ -45,8 +49,8 @@ class LiveFlight(NamedTuple):
     """The request, on all that was followed."""
     landed: bool
     """Whether the vehicle came down by this flight's own doing: it was not lost, and did not crash."""
-    faults: list[str]
-    """What is missing of its files, each in a line."""
+    outlet: Outlet
+    """Where its files are, and what is missing of them."""
 
 
 def fly_live(
@@ -70,11 +74,12 @@ def fly_live(
     """
     run.folder.mkdir(parents=True, exist_ok=True)
     clear_outputs(run.folder)
-    for old in (*run.folder.glob("*.log"), run.folder / "flight.csv"):
+    names = "flight.csv", "flight.npz", "flight.mcap", "results.json"
+    for old in (*run.folder.glob("*.log"), *(run.folder / name for name in names)):
         old.unlink(missing_ok=True)
-    events = LiveEvents()
+    events, outlet = LiveEvents(), Outlet(run.folder)
     with ExitStack() as screen:  # it closes last, since a terminal that stands still would keep everything else waiting
-        with Supervisor(live_spec(request)) as supervisor:
+        with Supervisor(replace(live_spec(request), spare=outlet.spare)) as supervisor:
             if not _warmed_up(supervisor, run, reporter):
                 return None
             page = supervisor.spec.page
@@ -89,36 +94,41 @@ def fly_live(
             learnt = learnt_in(supervisor.bus, status, start, trust) if request.method in LEARNING else None
         if len(pieces := wishes.following.pieces) > 1:  # errors and pictures are of all that was followed
             request = replace(request, setup=request.setup.on(spliced(pieces)))
-        done = _written(request, run, status, events, learnt, supervisor.refused)
+        done = _written(request, run, outlet, status, events, learnt, supervisor.refused)
     reporter.say(f"flight over: {status.ended}")
     return done
 
 
 def _written(
-    request: LiveRequest,
-    run: Run,
-    status: Status,
-    events: LiveEvents,
-    learnt: LearnerState | None,
+    request: LiveRequest, run: Run, outlet: Outlet, status: Status, events: LiveEvents, learnt: LearnerState | None,
     refused: dict[str, list[str]],
-) -> LiveFlight:
-    """Write what a flight leaves."""
-    flight, rows = flight_of(request, events.all, status, learnt)
-    found, faults = results(request, flight, rows, status, events), missing(rows, status, request.setup.preset.dt)
-    run.write_results(
-        found, seeds=[request.seed], preset=request.setup.preset.name, seconds=float(flight.log.t[-1]),
-        ended=status.ended, faults=faults, scheduling=refused, histograms_ms=histograms(rows),
+) -> LiveFlight:  # fmt: skip
+    """Write what a flight leaves, what it learnt first."""
+    preset, log = request.setup.preset, log_path(run.folder / "flight.csv", outlet.spare)
+    try:
+        flight, rows = flight_of(request, events.all, status, learnt, log)
+    except (PlantError, OSError):
+        if learnt is not None:
+            outlet.write("what was learnt", partial(write_state, learnt, preset))
+        raise
+    outlet.faults += missing(rows, status, preset.dt)
+    if log.parent != run.folder:
+        outlet.faults.append(status.log_moved or f"flight.csv cannot be written to {run.folder}; it is in {log.parent}")
+    outlet.write("what was learnt", partial(write_learnt, [flight], preset))
+    outlet.write("events.jsonl", partial(write_events, [flight]))
+    recorded = _recorded(request, rows, events, outlet)
+    found = results(request, flight, rows, status, events)
+    path = outlet.write_results(
+        run, found, seeds=[request.seed], preset=preset.name, seconds=float(flight.log.t[-1]),
+        ended=status.ended, scheduling=refused, histograms_ms=histograms(rows),
     )  # fmt: skip
-    write_events([flight], run.folder)
-    write_learnt([flight], request.setup.preset, run.folder)
-    recorded = _recorded(request, rows, events)
     for start in run.folder.glob("start*.safetensors"):  # what learners went on from; it is in what they learnt
-        start.unlink()
-    paths = [*recorded, run.folder / "results.json", run.folder / "flight.csv", *complaints(run.folder)]
-    return LiveFlight(flight, found, paths, request, status.ended == "landed", faults)
+        start.unlink(missing_ok=True)
+    paths = [*recorded, *([] if path is None else [path]), log, *complaints(run.folder)]
+    return LiveFlight(flight, found, paths, request, status.ended == "landed", outlet)
 
 
-def _recorded(request: LiveRequest, rows: np.ndarray, events: LiveEvents) -> list[Path]:
+def _recorded(request: LiveRequest, rows: np.ndarray, events: LiveEvents, outlet: Outlet) -> list[Path]:
     """Write the flight, the landing too, as NPZ and for viewers; return where the recording is that was asked for."""
     target = np.asarray(jax.jit(jax.vmap(request.setup.flown.target))(rows[:, 1]), dtype=float)
     recording = Recording(
@@ -127,13 +137,18 @@ def _recorded(request: LiveRequest, rows: np.ndarray, events: LiveEvents) -> lis
         flown_by=[Mode(int(row[-1])).name.lower() for row in rows], policy_age=rows[:, ACCOUNTS["policy_age"]],
         events=events.all,
     )  # fmt: skip
-    write_npz(request.folder / "flight.npz", recording)
+    outlet.write("flight.npz", lambda folder: write_npz(folder / "flight.npz", recording))
     paths = {".mcap": request.folder / "flight.mcap"}
     if request.record is not None:
         paths[request.record.suffix] = request.record
-    for path in filter(can_record, paths.values()):
-        record(path, recording)
-    return [] if request.record is None else [request.record]
+
+    def put(path: Path, folder: Path) -> Path:
+        place = path if folder == outlet.folder else folder / path.name
+        record(place, recording)
+        return place
+
+    found = {path: outlet.write(path.name, partial(put, path)) for path in filter(can_record, paths.values())}
+    return [place for path, place in found.items() if path == request.record and place is not None]
 
 
 def _warmed_up(supervisor: Supervisor, run: Run, reporter: Reporter) -> bool:

@@ -2,9 +2,11 @@
 
 import contextlib
 import os
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +23,8 @@ from ..config.presets import Preset
 from ..config.setup import Setup
 from ..errors import MessageError
 from ..experiments.compile_cache import enable_compile_cache
+from ..experiments.outlet import Outlet
+from ..experiments.outputs import write_state
 from ..io.trained import load_learnt
 from ..learn.window import Window
 from ..onboard.heart import Pacemaker
@@ -32,7 +36,7 @@ from ..transport import wire
 from ..transport.bus import Bus
 from ..transport.shared_memory import SharedMemoryBus
 from .controllers import flown
-from .published import flown_update, keep, newest_update
+from .published import flown_update, keep, learnt_from, newest_update
 from .states import state_of
 
 CHECK_EVERY = 0.005  # [s]
@@ -59,6 +63,8 @@ class LearnerPlan:
     """Version of the policy up to which updates on the bus are older than ``start``."""
     trust: tuple[str, ...] = ()
     """Python names that ``start`` may hold, since the user named them to the process that wrote this plan."""
+    out: Path | None = None
+    """Where what was learnt goes if the supervisor is not there to write it; None for nowhere."""
 
 
 class LearnerLoop:
@@ -254,6 +260,17 @@ class LearnerLoop:
         self._known[topic] = message.version
         return message.data
 
+    def leave(self, folder: Path, patience: float = 3.0) -> None:
+        """Write down what was learnt and flown last, once no policy flies any more, or after a while [s]."""
+        until = self._clock() + patience
+        while self._wanted() and self.bus.latest("ended") is None and self._clock() < until:
+            time.sleep(CHECK_EVERY)
+        learnt, outlet = learnt_from(self.bus, self.state, self._status()), Outlet(folder)
+        if learnt is not None:
+            outlet.write("what was learnt", partial(write_state, learnt, self.setup.preset))
+        for fault in outlet.faults:
+            print(fault, file=sys.stderr)
+
 
 def _start(state: LearnerState) -> PolicyUpdate:
     return PolicyUpdate(0.0, 0.0, 0.0, state.policy)
@@ -278,3 +295,5 @@ def learn(plan: LearnerPlan) -> None:
                 continue
             heart.touch(COMPUTING)
             loop.learnt(loop.worker.learn(window))
+    if parent.gone() and plan.layer == "policy" and plan.out is not None:
+        loop.leave(plan.out)  # nobody else will

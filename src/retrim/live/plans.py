@@ -39,7 +39,7 @@ def plan_of(role: str, spec: LiveSpec, start: Path, floor: int, bus: Path, cores
     if role == "watchdog":
         return WatchdogPlan(bus, s.limits, s.dt, s.home, cores, PRIORITIES[role], control, parent)
     if role == "recorder":
-        return RecorderPlan(bus, s.folder / "flight.csv", s.dt, parent)
+        return RecorderPlan(bus, s.folder / "flight.csv", s.dt, parent, s.spare)
     if role == "page":
         assert s.page is not None
         return PagePlan(bus, s.page, parent)
@@ -47,4 +47,4 @@ def plan_of(role: str, spec: LiveSpec, start: Path, floor: int, bus: Path, cores
         assert s.learners is not None
         return BridgePlan(bus, s.learners, parent)
     layer: Layer = "residual" if role == "residual" else "policy"
-    return LearnerPlan(bus, layer, start, s.reference, s.seed, s.controller.base, parent, floor, s.trust)
+    return LearnerPlan(bus, layer, start, s.reference, s.seed, s.controller.base, parent, floor, s.trust, s.folder)

@@ -8,9 +8,9 @@ from collections.abc import Callable
 from typing import Any
 
 from ..adapt.learner import LearnerState
-from ..adapt.updates import Update, pack_update, unpack_update
+from ..adapt.updates import PolicyUpdate, ResidualUpdate, Update, pack_update, unpack_update
 from ..errors import MessageError
-from ..onboard.topics import SLOTS, slot
+from ..onboard.topics import LAYERS, SLOTS, slot
 from ..transport.bus import Bus
 
 PREFIX = 8  # bytes of the version before an update
@@ -38,6 +38,23 @@ def flown_update(bus: Bus, state: LearnerState, layer: str, status: dict[str, An
     newest = status.get("newest", {}).get(layer, 0)
     given_up = status.get("given_up", []) if layer == "policy" else []
     return _newest(bus, state, layer, lambda version: version <= newest and version not in given_up)
+
+
+def learnt_from(bus: Bus, state: LearnerState, status: dict[str, Any]) -> LearnerState | None:
+    """Return what was learnt and flown last; None if nothing was.
+
+    Args:
+        bus: Of the flight.
+        state: What the learners went on from.
+        status: Last report of the process that flies.
+    """
+    fit, policy = (flown_update(bus, state, layer, status) for layer in LAYERS)
+    found = state
+    if fit is not None and isinstance(fit[1], ResidualUpdate):
+        found = LearnerState(found.policy, fit[1].state)
+    if policy is not None and isinstance(policy[1], PolicyUpdate):
+        found = LearnerState(policy[1].state, found.residual)
+    return None if fit is None and policy is None else found
 
 
 def _newest(bus: Bus, state: LearnerState, layer: str, wanted: Callable[[int], bool]) -> tuple[int, Update] | None:

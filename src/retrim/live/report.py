@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from ..adapt.learner import LearnerState
-from ..adapt.updates import PolicyUpdate, ResidualUpdate
 from ..errors import PlantError
 from ..experiments.flights import Flight
 from ..experiments.flying import scored, until_terminated
@@ -18,13 +17,12 @@ from ..onboard.guard import HOVER, Mode
 from ..onboard.messages import ACCOUNTS, COMMAND, MEASURED, STOPPED, TRUE
 from ..onboard.recorder import read_log
 from ..onboard.stalls import lost_in
-from ..onboard.topics import LAYERS
 from ..runtime.events import Event
 from ..runtime.flight import Log, States
 from ..transport.bus import Bus
 from .events import LiveEvents
 from .plant_process import CRASHED
-from .published import flown_update
+from .published import learnt_from
 from .session import LiveRequest
 from .status import Status
 
@@ -32,7 +30,7 @@ GAP_S = 0.5  # [s] of a log that may be missing: a machine that stands still sen
 
 
 def flight_of(
-    request: LiveRequest, events: Sequence[Event], status: Status, learnt: LearnerState | None
+    request: LiveRequest, events: Sequence[Event], status: Status, learnt: LearnerState | None, path: Path
 ) -> tuple[Flight, np.ndarray]:
     """Return the flight that a log holds, up to its landing, and the rows of the log.
 
@@ -41,18 +39,19 @@ def flight_of(
         events: What happened.
         status: The last one.
         learnt: What the learners knew at the end.
+        path: The log.
 
     Raises:
         PlantError: The log holds no flight.
     """
-    rows = read_log(request.folder / "flight.csv")
+    rows = read_log(path)
     dt = request.setup.preset.dt
     shown = rows[(rows[:, 1] < request.seconds - 0.5 * dt) & measured(rows)]
     if status.control.get("reason") == "landing":  # as ordered: what follows is not the policy's
         by_policy = np.flatnonzero(shown[:, -1] == Mode.POLICY)
         shown = shown[: by_policy[-1] + 1] if len(by_policy) else shown[:0]
     if len(shown) < 2:
-        raise PlantError(f"{request.folder / 'flight.csv'} holds {len(shown)} ticks: there was no flight")
+        raise PlantError(f"{path} holds {len(shown)} ticks: there was no flight")
     u = np.concatenate([HOVER[None], shown[:-1, COMMAND]])
     log = Log(
         shown[:, 1],
@@ -166,13 +165,7 @@ def learnt_in(bus: Bus, status: Status, start: Path, trust: Collection[str] = ()
         start: File with what the learners went on from.
         trust: Python names that it may hold.
     """
-    state = load_learnt(start, trust=trust)[0]
-    fit, policy = (flown_update(bus, state, layer, status.control) for layer in LAYERS)
-    if fit is not None and isinstance(fit[1], ResidualUpdate):
-        state = LearnerState(state.policy, fit[1].state)
-    if policy is not None and isinstance(policy[1], PolicyUpdate):
-        state = LearnerState(policy[1].state, state.residual)
-    return None if fit is None and policy is None else state
+    return learnt_from(bus, load_learnt(start, trust=trust)[0], status.control)
 
 
 def complaints(folder: Path) -> list[Path]:

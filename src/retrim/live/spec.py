@@ -78,6 +78,8 @@ class LiveSpec:
     seed: int
     folder: Path
     """Where the log goes, and what the processes write to their standard outputs."""
+    spare: tuple[Path, ...] = ()
+    """Where files go that cannot be written there."""
     page: PageSpec | None = None
     learners: Address | None = None
     """Where learners on another machine are reached; None: they are processes of this one."""

@@ -34,5 +34,7 @@ class Status:
     """Numbers of measurements that the last fit excluded, by reason."""
     hangs: dict[str, int] = field(default_factory=dict)
     """How often each process was ended because it was silent."""
+    log_moved: str = ""
+    """Why the log is another file than it was, and which; empty while it is not."""
     ticks: int = 0
     """Ticks that the plant has sent so far."""

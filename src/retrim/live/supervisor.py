@@ -5,7 +5,7 @@ import json
 import os
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from subprocess import Popen, TimeoutExpired
 from typing import Any
@@ -48,13 +48,16 @@ class Supervisor:
     """What the operating system refused to which process."""
     epoch: float | None = None
     _landing: bool = False
+    _moved: str = ""
     _airborne_ordered: bool = False
     _said: dict[str, int] = field(default_factory=dict)
     _remote: RemoteLearners | None = None
 
     def __enter__(self) -> "Supervisor":
         """Make the bus."""
-        self.bus, self.start, self.floor = SharedMemoryBus.create(topics(self.spec)), self.spec.start, 0
+        self.bus, self.floor = SharedMemoryBus.create(topics(self.spec)), 0
+        self.start = self.bus.take_in(self.spec.start)  # the folder of the results may go away
+        self.spec = replace(self.spec, start=self.start)
         self._notes, self._pulses = RefusedNotes(self.bus, topics(self.spec)), Pulses(self.bus)
         self._remote = None if self.spec.learners is None else RemoteLearners(self.spec, self.bus)
         self._cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else None
@@ -184,7 +187,8 @@ class Supervisor:
         if self._remote is not None:
             alive |= self._remote.alive()
         control, world = last_note(self.bus, "status"), last_note(self.bus, "world")
-        failed = last_note(self.bus, "ready.recorder", "ready").get("failed")
+        log = last_note(self.bus, "ready.recorder", "ready")
+        self._moved = log.get("moved") or self._moved
         t, fallback = time.monotonic() - self.epoch, self.bus.latest("fallback")
         by_watchdog = last_sent(self.bus, "fallback") > last_sent(self.bus, "setpoint")
         ticks = 0 if fallback is None else fallback.version
@@ -194,8 +198,9 @@ class Supervisor:
             last_note(self.bus, "learner.residual"),
         )
         return Status(
-            t, control, world, alive, dict(self.restarts), ended, said, by_watchdog, ticks, failed, stalls,
-            self._notes.look(), self._notes.count, excluded.get("excluded", []), dict(self.hangs), ticks_of(self.bus),
+            t, control, world, alive, dict(self.restarts), ended, said, by_watchdog, ticks, log.get("failed"), stalls,
+            self._notes.look(), self._notes.count, excluded.get("excluded", []), dict(self.hangs), self._moved,
+            ticks_of(self.bus),
         )  # fmt: skip
 
     def finish(self, patience: float = 3.0) -> None:
@@ -233,7 +238,7 @@ class Supervisor:
 
     def _record(self) -> None:
         """Write down what is reported and not written yet; nobody else must be writing."""
-        Recorder(self.spec.folder / "flight.csv", self.bus).step()
+        Recorder(self.spec.folder / "flight.csv", self.bus, self.spec.spare).step()
 
     def _lost_plant(self) -> str:
         """Why a flight is over whose plant has ended."""

@@ -72,7 +72,7 @@ class Wishes:
         start, trust = self._supervisor.start, self._supervisor.spec.trust
         state = learnt_in(self._supervisor.bus, status, start, trust) or load_learnt(start, trust=trust)[0]
         self._starts += 1
-        path = self._request.folder / f"start-{self._starts}.safetensors"
+        path = self._supervisor.start.parent / f"start-{self._starts}.safetensors"
         merged = state.policy.policy.merged()
         save_learnt(path, learner_state(self._request, merged, method, state.residual), self._request.setup.preset)
         return path

@@ -7,7 +7,7 @@ import pickle
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 PYTHON = (sys.executable, "-P", "-m")
 """Runs a module of this package: what lies in the current folder has no part in it."""
@@ -37,7 +37,7 @@ def launch(main: str, plan: Any, complaints: Path, cores: set[int] | None = None
     """
     # One thread: the arrays are small, and a pool of threads is late.
     quiet = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-    with complaints.open("ab") as file:
+    with _opened(complaints) as file:
         process = subprocess.Popen(
             [*PYTHON, "retrim.onboard.launch", main],
             stdin=subprocess.PIPE,
@@ -53,6 +53,15 @@ def launch(main: str, plan: Any, complaints: Path, cores: set[int] | None = None
     with contextlib.suppress(BrokenPipeError), process.stdin as pipe:  # it has died already; whoever waits will see
         pickle.dump(plan, pipe)
     return process
+
+
+def _opened(complaints: Path) -> BinaryIO:
+    """Open a file to append to it; where its folder cannot be written any more, what is said is lost."""
+    try:
+        complaints.parent.mkdir(parents=True, exist_ok=True)
+        return complaints.open("ab")
+    except OSError:
+        return Path(os.devnull).open("ab")
 
 
 def last_words(complaints: Path) -> str:

@@ -110,7 +110,7 @@ FIELDS: Mapping[str, Mapping[str, Read]] = {
     "order": {"epoch": maybe(number(0.0)), "order": text},
     "ready": {
         **dict.fromkeys(("base", "device"), text),
-        **{"failed": maybe(text), "refused": list_of(text), "stands": flag, "port": whole(1, 65535)},
+        **{"failed": maybe(text), "moved": text, "refused": list_of(text), "stands": flag, "port": whole(1, 65535)},
     },
     "refusals": {"count": whole(), "last": text, "fault": text},
     "stalls": {"count": whole(), "longest": number(0.0), "newest": list_of(list_of(_time, _time))},

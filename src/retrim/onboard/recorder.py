@@ -4,7 +4,9 @@ Two processes report ticks: the one that flies, and the watchdog when it takes o
 written late, and a tick that both of them have flown is written twice; :func:`read_log` puts it in order.
 """
 
+import contextlib
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +18,7 @@ from ..transport.shared_memory import SharedMemoryBus
 from .accounts import accounted
 from .guard import OVER, Mode
 from .heart import Heart
+from .log_file import HEADER, LogFile, log_path
 from .messages import ACCOUNTS, COLUMNS, FlightRows, last_note, pack_note
 from .realtime import Lifeline
 
@@ -35,24 +38,47 @@ class RecorderPlan:
     dt: float
     parent: int
     """Who takes the bus away; if it is gone, the recorder does."""
+    spare: tuple[Path, ...] = ()
+    """Folders for a log that cannot be written there."""
 
 
 class Recorder:
     """Appends the ticks that are new. A gap is filled from the last seconds of flight, which every report holds."""
 
-    def __init__(self, path: Path, bus: Bus) -> None:
-        self._path, self._bus = path, bus
+    def __init__(self, path: Path, bus: Bus, spare: Sequence[Path] = ()) -> None:
+        """Go on with a log, or begin one.
+
+        Args:
+            path: Of the log.
+            bus: Of the flight.
+            spare: Folders for a log that cannot be written there; see :func:`log_path`.
+        """
+        self._bus, self._paths = bus, (path, *(folder / path.name for folder in spare))
         self._versions = {"flight": 0, "fallback.flight": 0}
         self.failed: str | None = None
+        """Why the log has ended; None while it has not."""
+        self.moved = ""
+        """Why the log is another file, and which; empty while it is not."""
         self._written: set[tuple[int, bool, bool]] = set()
+        self._file: LogFile | None = None
         try:
-            self._note(_mended(path))
+            self._file = LogFile(log_path(path, spare))
+            self._note(_rows(self._file.tail()))
         except OSError as error:
-            self.failed = str(error)
+            self._move(error)
 
     def step(self) -> int:
         """Write what is new; return how many ticks that were. A full disk ends the log and not the flight."""
         return self._take("flight") + self._take("fallback.flight")
+
+    def tell(self) -> None:
+        """Say that the log is ready, and how it stands."""
+        self._bus.publish("ready.recorder", pack_note("ready", failed=self.failed, moved=self.moved))
+
+    def close(self) -> None:
+        """Close the log."""
+        if self._file is not None:
+            self._file.close()
 
     def _take(self, topic: str) -> int:
         message = self._bus.latest(topic, self._versions[topic])
@@ -66,15 +92,37 @@ class Recorder:
         return self._append(rows[[each not in self._written for each in _authors(rows)]])
 
     def _append(self, new: np.ndarray) -> int:
-        try:
-            with self._path.open("a") as file:
-                file.write("".join(",".join(f"{value:.9g}" for value in row) + "\n" for row in new))
-        except OSError as error:
-            self.failed = str(error)
-            self._bus.publish("ready.recorder", pack_note("ready", failed=self.failed))
-            return 0
-        self._note(new)
-        return len(new)
+        lines = "".join(",".join(f"{value:.9g}" for value in row) + "\n" for row in new).encode()
+        while self._file is not None and not self.failed:
+            try:
+                self._file.append(lines)
+            except OSError as error:
+                self._move(error)
+            else:
+                self._note(new)
+                return len(new)
+        return 0
+
+    def _move(self, why: OSError) -> None:
+        """Go on elsewhere with all that is written; if that cannot be, the log has failed."""
+        reason = f"{self._paths[0]}: {why.strerror or why}"
+        for path in self._paths:
+            with contextlib.suppress(OSError):
+                path.parent.mkdir(parents=True, exist_ok=True, mode=0o777 if path == self._paths[0] else 0o700)
+                moved = LogFile(path, new=True)
+                try:
+                    moved.append(HEADER if self._file is None else self._file.all())
+                except OSError:
+                    path.unlink()
+                    raise
+                self.close()
+                self._file = moved
+                where = "is written anew" if path == self._paths[0] else f"goes on in {path}"
+                self.moved = f"{reason}; the log {where}"
+                break
+        else:
+            self.failed = reason
+        self.tell()
 
     def _note(self, rows: np.ndarray) -> None:
         """Take note of what is written; after any row of a tick nobody needs what the watchdog has only seen of it."""
@@ -103,9 +151,13 @@ def read_log(path: Path) -> np.ndarray:
 
 def _lines(path: Path) -> np.ndarray:
     """Return the whole lines of a log as they were written."""
-    lines = path.read_text().splitlines(keepends=True)[1:]
+    return _rows(path.read_bytes())
+
+
+def _rows(data: bytes) -> np.ndarray:
+    lines = data.decode().splitlines(keepends=True)
     whole = [line.split(",") for line in lines if line.endswith("\n") and line.count(",") == len(COLUMNS) - 1]
-    return np.array(whole, dtype=float).reshape(-1, len(COLUMNS))
+    return np.array([line for line in whole if line[0] != COLUMNS[0]], dtype=float).reshape(-1, len(COLUMNS))
 
 
 def _authors(rows: np.ndarray) -> list[tuple[int, bool, bool]]:
@@ -114,22 +166,11 @@ def _authors(rows: np.ndarray) -> list[tuple[int, bool, bool]]:
     return list(zip(rows[:, 0].astype(int).tolist(), accounted(rows).tolist(), flew.tolist(), strict=True))
 
 
-def _mended(path: Path) -> np.ndarray:
-    """Write the header, or take away a torn last line; return the rows that are written."""
-    if not path.exists() or path.stat().st_size == 0:
-        path.write_text(",".join(COLUMNS) + "\n")
-        return _lines(path)
-    with path.open("r+b") as file:
-        data = file.read()
-        file.truncate(data.rfind(b"\n") + 1)
-    return _lines(path)
-
-
 def record(plan: RecorderPlan) -> None:
     """Write until the flight is over: the main function of the process."""
     bus = SharedMemoryBus(plan.folder)
-    recorder = Recorder(plan.path, bus)
-    bus.publish("ready.recorder", pack_note("ready", failed=recorder.failed))
+    recorder = Recorder(plan.path, bus, plan.spare)
+    recorder.tell()
     parent, heard, left, heart = Lifeline(plan.parent), time.monotonic(), LINGER, Heart(bus, "recorder")
     while left and not (parent.gone() and time.monotonic() > heard + SILENCE):
         if recorder.step() or (bus.latest("sample") is None and not parent.gone()):
@@ -138,6 +179,7 @@ def record(plan: RecorderPlan) -> None:
         heart.beat()
         time.sleep(plan.dt)
     recorder.step()
+    recorder.close()
     if parent.gone():
         bus.remove()
 

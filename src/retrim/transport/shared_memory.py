@@ -5,7 +5,6 @@ only then says that it is: a writer that is killed on the way leaves the last me
 checks that its version and its checksum belong together; if the writer came by twice in that time, it tries again.
 """
 
-import contextlib
 import json
 import mmap
 import os
@@ -69,6 +68,18 @@ class SharedMemoryBus(Bus):
             shutil.rmtree(folder, ignore_errors=True)
             raise
 
+    def take_in(self, file: Path) -> Path:
+        """Copy a file beside the topics, where it stays as long as they do; return the copy.
+
+        Raises:
+            OSError: It cannot be read, or there is no room for it; the bus is taken away.
+        """
+        try:
+            return Path(shutil.copy(file, self.folder / file.name))
+        except BaseException:
+            self.remove()
+            raise
+
     def publish(self, topic: str, data: bytes) -> None:
         """Replace the last message of ``topic``."""
         check_fits(topic, data, self._capacities)
@@ -107,11 +118,7 @@ class SharedMemoryBus(Bus):
     def remove(self) -> None:
         """Take the bus away; processes that have joined keep what they have mapped."""
         self.close()
-        for topic in (*self._capacities, PLAN):
-            with contextlib.suppress(OSError):
-                (self.folder / topic).unlink()
-        with contextlib.suppress(OSError):
-            self.folder.rmdir()
+        shutil.rmtree(self.folder, ignore_errors=True)
 
     def _slot(self, topic: str, version: int) -> tuple[int, int]:
         """Where the bytes of a version begin, and which word its slot begins with."""

@@ -1,0 +1,84 @@
+"""Where the files of a run go when its folder cannot be written any more: nothing that was flown or learnt is lost."""
+
+import contextlib
+import copy
+import secrets
+import tempfile
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeVar
+
+from ..config.presets import Preset
+from .flights import Flight
+from .outputs import clear_outputs, write_events, write_learnt, write_logs
+from .run import Run
+
+T = TypeVar("T")
+SHARED_MEMORY = Path("/dev/shm")
+
+
+def spare_folders(folder: Path) -> tuple[Path, ...]:
+    """Return temporary folders for what cannot be written to a folder, the first choice first; none is made yet.
+
+    Args:
+        folder: It gives them their name.
+    """
+    bases = dict.fromkeys((Path(tempfile.gettempdir()), *([SHARED_MEMORY] if SHARED_MEMORY.is_dir() else [])))
+    name = f"kept-{folder.resolve().name[:80]}-{secrets.token_hex(4)}"
+    return tuple(base / name for base in bases)
+
+
+class Outlet:
+    """Writes file by file, each into the folder of its run, or into a temporary one where that cannot be."""
+
+    def __init__(self, folder: Path) -> None:
+        """Build it for the folder of a run."""
+        self.folder, self.spare = folder, spare_folders(folder)
+        self.faults: list[str] = []
+        """What is not where it should be, each in a line."""
+
+    def write(self, name: str, put: Callable[[Path], T]) -> T | None:
+        """Write something.
+
+        Args:
+            name: What it is called if it cannot be written.
+            put: Writes it into the folder that it is given.
+
+        Returns:
+            What ``put`` returned; None if it can be written nowhere.
+        """
+        reason = ""
+        for folder in (self.folder, *self.spare):
+            try:
+                folder.mkdir(parents=True, exist_ok=True, mode=0o777 if folder == self.folder else 0o700)
+                found = put(folder)
+            except OSError as error:
+                reason = reason or error.strerror or str(error)
+                if folder != self.folder:
+                    with contextlib.suppress(OSError):
+                        folder.rmdir()
+                continue
+            if folder != self.folder:
+                self.faults.append(f"{name} cannot be written to {self.folder} ({reason}); it is in {folder}")
+            return found
+        self.faults.append(f"{name} cannot be written to {self.folder} ({reason}), nor to any temporary folder")
+        return None
+
+    def write_results(self, run: Run, rows: Sequence[dict[str, Any]], **more: Any) -> Path | None:
+        """Write the results of a run, as :meth:`Run.write_results` does, with all faults so far; return their path."""
+
+        def put(folder: Path) -> Path:
+            elsewhere = copy.copy(run)
+            elsewhere.folder = folder
+            return elsewhere.write_results(rows, faults=self.faults, **more)
+
+        return self.write("results.json", put)
+
+    def write_flights(self, flights: Sequence[Flight], preset: Preset) -> None:
+        """Write what flights learnt, their events and their logs, in the place of those of earlier ones."""
+        with contextlib.suppress(OSError):
+            clear_outputs(self.folder)
+        self.write("what was learnt", partial(write_learnt, flights, preset))
+        self.write("events.jsonl", partial(write_events, flights))
+        self.write("the logs", partial(write_logs, flights))

@@ -1,0 +1,179 @@
+"""Whole flights that lose their terminal, their folder or their supervisor: what was learnt is there, and it is told.
+
+`make drill` flies them, each at several times.
+"""
+
+import contextlib
+import os
+import re
+import shutil
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from commands import SMALL, results, retrim, started
+from retrim import load_learnt, load_policy
+from retrim.onboard.guard import Mode
+from retrim.onboard.recorder import read_log
+
+pytestmark = [pytest.mark.usefixtures("as_a_user"), pytest.mark.slow]
+DRILLS = range(int(os.environ.get("RETRIM_DRILLS", "1")))
+SECONDS = 7.0
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, as_a_user):
+    """A folder with a small policy in p/."""
+    here = tmp_path_factory.mktemp("user")
+    (here / "small.toml").write_text(
+        SMALL.replace("num_updates = 150", "num_updates = 150\nnum_envs = 8\nhorizon = 60")
+    )
+    retrim("pretrain", "hover", "--config", "small.toml", "--out", "p", cwd=here)
+    return here
+
+
+def processes_of(supervisor):
+    """Return the processes of a flight by the function that each of them runs."""
+    found = {}
+    for pid in Path(f"/proc/{supervisor}/task/{supervisor}/children").read_text().split():
+        words = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
+        found[words[-2].decode().rpartition(":")[2]] = int(pid)
+    return found
+
+
+def wait_for(condition, seconds=120.0):
+    until = time.monotonic() + seconds
+    while not condition() and time.monotonic() < until:
+        time.sleep(0.02)
+    assert condition()
+
+
+def flown(folder, out, what, seed, *, learns=True):
+    """Fly, and do something once the flight has learnt; return exit code and output."""
+    words = "live", "--policy", "p", "--disturbance", "small", "--seconds", SECONDS, "--no-page", "--out", out
+    process, log = started((*words, *([] if learns else ["--adapt", "none"])), folder), folder / out / "flight.csv"
+    at = 50.0 * np.random.default_rng(seed).uniform(3.0, SECONDS - 2.0)  # ticks
+    wait_for(lambda: process.poll() is not None or (log.exists() and log.read_text().count("\n") > at))
+    what(process)
+    said, _ = process.communicate(timeout=120)
+    text = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", said.decode())
+    assert "Traceback" not in text, text
+    return process.returncode, text
+
+
+def whole(path):
+    """Return a log, which begins with the flight and ends with its landing."""
+    rows = read_log(path)
+    assert rows[0, 0] == 0
+    assert np.diff(rows[:, 0]).max() < 25
+    assert rows[-1, -1] == Mode.LANDED
+    return rows
+
+
+def kept(folder):
+    """Assert that what was learnt can be gone on from, and flown."""
+    state, _ = load_learnt(folder / "learnt.safetensors")
+    adapted, _ = load_policy(folder / "adapted.safetensors")
+    np.testing.assert_array_equal(adapted.layers[0].weight, state.policy.policy.layers[0].weight)
+
+
+@pytest.mark.parametrize("seed", DRILLS)
+def test_a_terminal_that_is_closed_lands_the_vehicle_and_all_is_written(folder, seed):
+    out = f"hangup{seed}"
+    code, _ = flown(folder, out, lambda process: process.send_signal(signal.SIGHUP), seed)
+    found = results(folder / out)
+    assert (code, found["interrupted"], found["ended"], found["faults"]) == (130, True, "landed", [])
+    assert found["seconds"] < SECONDS - 0.5
+    whole(folder / out / "flight.csv")
+    kept(folder / out)
+
+
+@pytest.mark.parametrize("seed", DRILLS)
+@pytest.mark.parametrize("how", ["removed", "renamed"])
+def test_a_folder_that_is_gone_is_made_again_with_all_that_was_flown_and_learnt(folder, how, seed):
+    out = folder / f"{how}{seed}"
+    gone = (lambda: shutil.rmtree(out)) if how == "removed" else (lambda: out.rename(f"{out}-elsewhere"))
+    code, said = flown(folder, out.name, lambda process: gone(), seed)
+    assert code == 0, said
+    assert f"log: {out.name}/flight.csv: No such file or directory; the log is written anew" in said
+    found = results(out)
+    assert (found["ended"], found["faults"]) == ("landed", [])
+    assert len(whole(out / "flight.csv")) > 50 * SECONDS - 25
+    kept(out)
+
+
+def elsewhere(said, name, reason):
+    """Return the temporary folder of a file that the output names."""
+    line = rf"retrim: {re.escape(name)} cannot be written to \S+ \({reason}\); it is in (\S+)"
+    return Path(re.search(line, said)[1])
+
+
+@pytest.mark.parametrize("seed", DRILLS)
+def test_a_folder_in_whose_place_is_something_else_loses_nothing(folder, seed):
+    out = folder / f"replaced{seed}"
+
+    def replace(process):
+        shutil.rmtree(out)
+        out.write_text("somebody's file")
+
+    code, said = flown(folder, out.name, replace, seed)
+    assert code == 1, said
+    place = elsewhere(said, "what was learnt", "File exists")
+    found = results(elsewhere(said, "results.json", "File exists"))
+    assert found["ended"] == "landed"
+    assert any(fault.startswith(f"{out.name}/flight.csv: ") for fault in found["faults"])
+    assert len(whole(place / "flight.csv")) > 50 * SECONDS - 25
+    kept(place)
+    shutil.rmtree(place)
+
+
+@pytest.fixture
+def small_disk(folder, tmp_path):
+    """A folder on a disk of its own, which the log of a few seconds fills."""
+    disk = folder / tmp_path.name
+    disk.mkdir()
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=260k", "none", disk], check=False).returncode:
+        pytest.skip("a disk that is full takes the right to mount one")
+    yield disk
+    subprocess.run(["umount", "--lazy", disk], check=True)
+
+
+@pytest.mark.parametrize("seed", DRILLS)
+def test_a_full_disk_loses_nothing(folder, small_disk, seed):
+    full = "No space left on device"
+    code, said = flown(folder, small_disk.name, lambda process: fill(small_disk), seed)
+    assert code == 1, said
+    place = elsewhere(said, "what was learnt", full)
+    assert f"retrim: {small_disk.name}/flight.csv: {full}; the log goes on in {place}/flight.csv" in said
+    found = results(elsewhere(said, "results.json", full))
+    assert found["ended"] == "landed"
+    assert len(found["faults"]) >= 4
+    assert len(whole(place / "flight.csv")) > 50 * SECONDS - 25
+    kept(place)
+    shutil.rmtree(place)
+
+
+def fill(disk):
+    with (disk / "filler").open("wb", buffering=0) as file, contextlib.suppress(OSError):
+        while file.write(bytes(1024)):
+            pass
+
+
+@pytest.mark.parametrize("seed", DRILLS)
+def test_without_supervisor_and_recorder_what_was_learnt_is_kept(folder, seed):
+    out, flight = folder / f"alone{seed}", {}
+
+    def kill(process):
+        flight.update(processes_of(process.pid))
+        os.kill(process.pid, signal.SIGKILL)
+        os.kill(flight["record"], signal.SIGKILL)
+
+    code, _ = flown(folder, out.name, kill, seed)
+    assert code == -signal.SIGKILL
+    wait_for(lambda: not any(Path(f"/proc/{pid}").exists() for pid in flight.values()))
+    kept(out)
+    assert not (out / "results.json").exists()
