@@ -115,8 +115,8 @@ def whole_log(folder, status=None, until=None):
         last = answers[answers[:, -1] == Mode.POLICY][-1, 1] if until is None else until  # no landing is counted
         counted = ticks[: np.searchsorted(answers[:, 1], last)]
         assert np.sum(np.diff(counted) - 1) <= status.control["missed"] + 1
-    if status is None or until is not None or answers[-1, -1] != Mode.POLICY:
-        assert ticks[-1] + 1 - len(ticks) <= max(2, ticks[-1] // 20)
+    missed = 0 if status is None else status.control["missed"]
+    assert ticks[-1] + 1 - len(ticks) <= missed + max(2, ticks[-1] // 20)
     assert np.isfinite(rows).all()
     return rows
 

@@ -19,6 +19,7 @@ from commands import SMALL, results, retrim, started
 from retrim import load_learnt, load_policy
 from retrim.onboard.guard import Mode
 from retrim.onboard.recorder import read_log
+from retrim.transport.shared_memory import SharedMemoryBus
 
 pytestmark = [pytest.mark.usefixtures("as_a_user"), pytest.mark.slow]
 DRILLS = range(int(os.environ.get("RETRIM_DRILLS", "1")))
@@ -43,6 +44,12 @@ def processes_of(supervisor):
         words = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
         found[words[-2].decode().rpartition(":")[2]] = int(pid)
     return found
+
+
+def bus_of(process):
+    """Return the folder of the bus that a process has mapped."""
+    mapped = re.findall(r"(/dev/shm/retrim-\w+)/sample$", Path(f"/proc/{process}/maps").read_text(), re.M)
+    return sorted(set(mapped))
 
 
 def wait_for(condition, seconds=120.0):
@@ -165,9 +172,10 @@ def fill(disk):
 
 @pytest.mark.parametrize("seed", DRILLS)
 def test_without_supervisor_and_recorder_what_was_learnt_is_kept(folder, seed):
-    out, flight = folder / f"alone{seed}", {}
+    out, flight, bus = folder / f"alone{seed}", {}, []
 
     def kill(process):
+        bus.extend(bus_of(process.pid))
         flight.update(processes_of(process.pid))
         os.kill(process.pid, signal.SIGKILL)
         os.kill(flight["record"], signal.SIGKILL)
@@ -177,3 +185,7 @@ def test_without_supervisor_and_recorder_what_was_learnt_is_kept(folder, seed):
     wait_for(lambda: not any(Path(f"/proc/{pid}").exists() for pid in flight.values()))
     kept(out)
     assert not (out / "results.json").exists()
+    left = Path(bus[0])
+    assert left.exists()
+    SharedMemoryBus.create({}).remove()  # the next flight
+    assert not left.exists()

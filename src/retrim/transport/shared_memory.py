@@ -17,12 +17,14 @@ from pathlib import Path
 from ..errors import MessageError
 from .bus import Bus, Message
 from .in_process import check_fits, check_topic
+from .leftovers import begin, clear, hold
 
 WORD = 8
 HEADER = 8 * WORD  # version of the last message; then version, length, checksum of each slot
 VERSION, SLOTS = 0, (1, 4)
 TRIES = 100
 PLAN = "topics.json"
+PREFIX = "retrim-"
 
 
 class SharedMemoryBus(Bus):
@@ -36,7 +38,9 @@ class SharedMemoryBus(Bus):
         """
         self.folder = folder
         self._maps: dict[str, tuple[mmap.mmap, memoryview]] = {}
+        self._lock: int | None = None
         try:
+            self._lock = hold(folder)
             self._capacities: dict[str, int] = json.loads((folder / PLAN).read_text())
             for topic in self._capacities:
                 with (folder / topic).open("r+b") as file:
@@ -50,14 +54,22 @@ class SharedMemoryBus(Bus):
     def create(cls, capacities: Mapping[str, int]) -> "SharedMemoryBus":
         """Make a bus in a new folder that only this user can read; :meth:`remove` takes it away.
 
+        Buses that are left over from processes that were killed are removed.
+
         Args:
             capacities: Longest message of each topic [bytes].
 
         Raises:
             OSError: There is no room for it.
         """
-        base = Path("/dev/shm")
-        folder = Path(tempfile.mkdtemp(prefix="retrim-", dir=base if os.access(base, os.W_OK) else None))
+        base = Path("/dev/shm") if os.access("/dev/shm", os.W_OK) else Path(tempfile.gettempdir())
+        clear(base, PREFIX)
+        folder = Path(tempfile.mkdtemp(prefix=PREFIX, dir=base))
+        try:
+            lock = begin(folder)
+        except BaseException:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
         try:
             for topic, capacity in capacities.items():
                 with (folder / topic).open("wb") as file:  # all of it now: memory that is missing in flight is a signal
@@ -67,6 +79,8 @@ class SharedMemoryBus(Bus):
         except BaseException:
             shutil.rmtree(folder, ignore_errors=True)
             raise
+        finally:
+            os.close(lock)
 
     def take_in(self, file: Path) -> Path:
         """Copy a file beside the topics, where it stays as long as they do; return the copy.
@@ -114,11 +128,14 @@ class SharedMemoryBus(Bus):
             words.release()
             memory.close()
         self._maps = {}
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None
 
     def remove(self) -> None:
         """Take the bus away; processes that have joined keep what they have mapped."""
-        self.close()
         shutil.rmtree(self.folder, ignore_errors=True)
+        self.close()
 
     def _slot(self, topic: str, version: int) -> tuple[int, int]:
         """Where the bytes of a version begin, and which word its slot begins with."""
