@@ -2,7 +2,6 @@
 
 import threading
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
 import tyro
@@ -106,7 +105,7 @@ def _fly(fleet: Fleet, setup: Setup, scenario: Scenario, run: Run) -> int:
     found, preset, outlet = rows(flights), setup.preset, Outlet(run.folder)
     with interrupts_only_set(run.stop):
         outlet.write_flights(flights, preset)
-        drawn = outlet.write("the picture", partial(picture, flights, setup, scenario)) or []
+        drawn = outlet.write("the picture", lambda folder: picture(flights, setup, scenario, folder)) or []
         results = outlet.write_results(run, found, seeds=list(fleet.policies), preset=preset.name)
     n, steady = found[0]["n"], min(flights[0].steady_seconds, fleet.seconds)
     title = f"{preset.task} error [m], last {steady:g} s of {fleet.seconds:g} s, {n} start{'s' * (n > 1)}"

@@ -3,7 +3,6 @@
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 
 import tyro
@@ -85,8 +84,7 @@ def live(
 
     def ordered(stop: threading.Event) -> int:
         check_seeds([seed])
-        if record is not None:
-            check_recording(record)
+        check_recording(record)
         if page and no_page:
             raise ConfigError("--page and --no-page: choose one")
         check_limits(fence, seconds, policy_age)
@@ -119,10 +117,10 @@ def _fly(request: LiveRequest, run: Run) -> int:
     done = fly_live(request, run, RichReporter(), _display, lambda url: _open_page(url, run.folder))
     if done is None:
         return INTERRUPTED
-    draw = partial(picture, [done.flight], done.request.setup, request.scenario, stem="live")
-    drawn = done.outlet.write("the picture", draw) or []
+    flights, setup = [done.flight], done.request.setup
+    drawn = done.outlet.write("the picture", lambda out: picture(flights, setup, request.scenario, out, stem="live"))
     show_table(TableSection(("figure", "unit", "value"), figures(done.rows), f"live, {done.flight.log.t[-1]:.1f} s"))
-    show_paths([*drawn[:1], *done.paths])
+    show_paths([*(drawn or [])[:1], *done.paths])
     codes = [refuse(fault) for fault in done.outlet.faults]
     return run.exit_code or max(codes, default=int(not done.landed))
 

@@ -27,12 +27,14 @@ VIEWERS: Mapping[str, Viewer] = {
 }
 
 
-def check_recording(path: Path) -> Path:
-    """Return where a recording goes, before anything is flown.
+def check_recording(path: Path | None) -> None:
+    """Check the file of a recording before anything is flown; None for no recording.
 
     Raises:
-        ConfigError: It cannot be written there, or what writes it is not installed.
+        ConfigError: The file cannot be written, or the package that writes it is not installed.
     """
+    if path is None:
+        return
     viewer = VIEWERS.get(path.suffix)
     if viewer is None:
         raise ConfigError(f"--record {path}: the name must end with {' or '.join(VIEWERS)}")
@@ -42,7 +44,6 @@ def check_recording(path: Path) -> Path:
         raise ConfigError(f"--record {path}: it is a folder")
     if not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
         raise ConfigError(f"--record {path}: nothing can be written in {path.parent}")
-    return path
 
 
 def can_record(path: Path) -> bool:
