@@ -48,9 +48,11 @@ wheel: | $(UV)
 mutants: dev
 	$(BIN)/python tools/mutants.py
 
-# Live flights in which each process is killed at random times, seven times each.
+# Sixty live flights, in which processes are killed or suspended for ever at random times, the terminal is closed, the
+# output folder is removed, renamed, replaced or full (which takes the rights of root), or the supervisor is killed with
+# its recorder: fifteen kinds, four times each.
 drill: dev
-	RETRIM_DRILLS=7 $(BIN)/pytest tests/live/test_faults.py
+	RETRIM_DRILLS=4 $(BIN)/pytest -m "slow or not slow" tests/live/test_faults.py tests/live/test_outcomes.py
 
 # The page of a live flight in a browser without a screen, and recordings for rerun; Debian's Chromium is installed if
 # there is none.

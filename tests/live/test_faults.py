@@ -132,7 +132,7 @@ def test_a_flight_without_faults(tmp_path, controller):
     assert np.linalg.norm(rows[rows[:, 1] > 1.2][0, 3:6] - HOME) < 0.2
 
 
-@pytest.mark.parametrize("seed", range(int(os.environ.get("RETRIM_DRILLS", "1"))))  # `make drill` flies seven
+@pytest.mark.parametrize("seed", range(int(os.environ.get("RETRIM_DRILLS", "1"))))  # `make drill` flies four
 @pytest.mark.parametrize("roles", ["control", "plant", "watchdog recorder residual policy"])
 def test_each_process_is_killed_at_a_random_time(tmp_path, controller, roles, seed):
     """What nobody flies by is killed in one flight, each at its own time, and comes back."""
@@ -182,17 +182,19 @@ def test_each_process_is_suspended_for_ever_at_a_random_time(tmp_path, controlle
     assert status.restarts == ({} if roles == "control" else dict.fromkeys(stops, 1))
 
 
-def test_without_its_supervisor_the_vehicle_lands_and_the_log_is_whole(tmp_path, controller):
-    spec = spec_in(tmp_path, controller)
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+def test_without_its_supervisor_the_vehicle_lands_and_the_log_is_whole(tmp_path, controller, number):
+    spec = spec_in(tmp_path, controller, seconds=1.5 if number == signal.SIGKILL else 60.0)
     process: Popen[bytes] = launch("live.test_faults:supervise", spec, tmp_path / "supervisor.log")
     log = tmp_path / "flight.csv"
     until = time.monotonic() + 30.0
     while (not log.exists() or len(log.read_text().splitlines()) < 20) and time.monotonic() < until:
         time.sleep(0.05)
-    process.kill()
-    process.wait()
+    process.send_signal(number)
     while time.monotonic() < until and (not len(read_log(log)) or read_log(log)[-1, -1] != Mode.LANDED):
         time.sleep(0.1)
+    process.send_signal(signal.SIGCONT)  # who was suspended goes on, and sees the end
+    assert process.wait(30.0) == (0 if number == signal.SIGSTOP else -number)
     rows = whole_log(tmp_path)
     assert rows[-1, -1] == Mode.LANDED
     assert Mode.DESCEND in rows[:, -1]

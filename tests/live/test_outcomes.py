@@ -17,7 +17,9 @@ import pytest
 
 from commands import SMALL, results, retrim, started
 from retrim import load_learnt, load_policy
+from retrim.onboard.accounts import measured
 from retrim.onboard.guard import Mode
+from retrim.onboard.messages import TRUE
 from retrim.onboard.recorder import read_log
 from retrim.transport.shared_memory import SharedMemoryBus
 
@@ -38,11 +40,11 @@ def folder(tmp_path_factory, as_a_user):
 
 
 def processes_of(supervisor):
-    """Return the processes of a flight by the function that each of them runs."""
+    """Return the processes of a flight, and the function that each of them runs."""
     found = {}
     for pid in Path(f"/proc/{supervisor}/task/{supervisor}/children").read_text().split():
         words = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
-        found[words[-2].decode().rpartition(":")[2]] = int(pid)
+        found[int(pid)] = words[-2].decode().rpartition(":")[2]
     return found
 
 
@@ -59,10 +61,10 @@ def wait_for(condition, seconds=120.0):
     assert condition()
 
 
-def flown(folder, out, what, seed, *, learns=True):
+def flown(folder, out, what, seed, page=("--no-page",), seconds=SECONDS):
     """Fly, and do something once the flight has learnt; return exit code and output."""
-    words = "live", "--policy", "p", "--disturbance", "small", "--seconds", SECONDS, "--no-page", "--out", out
-    process, log = started((*words, *([] if learns else ["--adapt", "none"])), folder), folder / out / "flight.csv"
+    words = "live", "--policy", "p", "--disturbance", "small", "--seconds", seconds, *page, "--out", out
+    process, log = started(words, folder), folder / out / "flight.csv"
     at = 50.0 * np.random.default_rng(seed).uniform(3.0, SECONDS - 2.0)  # ticks
     wait_for(lambda: process.poll() is not None or (log.exists() and log.read_text().count("\n") > at))
     what(process)
@@ -86,6 +88,50 @@ def kept(folder):
     state, _ = load_learnt(folder / "learnt.safetensors")
     adapted, _ = load_policy(folder / "adapted.safetensors")
     np.testing.assert_array_equal(adapted.layers[0].weight, state.policy.policy.layers[0].weight)
+
+
+@pytest.mark.parametrize("seed", DRILLS)
+def test_processes_that_are_suspended_for_ever_come_back_and_the_log_is_whole(folder, seed):
+    out, roles = f"suspended{seed}", {"record": "recorder", "show": "page", "watch": "watchdog"}
+
+    def suspend(process):
+        for pid, function in processes_of(process.pid).items():
+            if function in (*roles, "learn"):
+                os.kill(pid, signal.SIGSTOP)
+
+    code, said = flown(folder, out, suspend, seed, ("--page", "--page-port", "18380"), seconds=14.0)
+    found = results(folder / out)
+    assert (code, found["ended"], found["faults"]) == (0, "landed", []), said
+    for role in (*roles.values(), "residual", "policy"):
+        assert f"restarted: the {role} process hung: it said nothing for 2 s and was ended" in said
+    assert {row["metric"]: row["value"] for row in found["rows"]}["restarts"] == 5
+    assert len(whole(folder / out / "flight.csv")) > 50 * 14.0 - 25
+    kept(folder / out)
+
+
+@pytest.mark.parametrize("seed", DRILLS)
+@pytest.mark.parametrize("role", ["plant", "control"])
+def test_what_a_flight_cannot_do_without_ends_it_in_a_defined_way(folder, role, seed):
+    out, function = f"{role}{seed}", {"plant": "simulate", "control": "fly"}[role]
+
+    def suspend(process):
+        (pid,) = (pid for pid, runs in processes_of(process.pid).items() if runs == function)
+        os.kill(pid, signal.SIGSTOP)
+
+    code, said = flown(folder, out, suspend, seed)
+    found, rows = results(folder / out), read_log(folder / out / "flight.csv")
+    steady = next(row for row in found["rows"] if row["metric"] == "steady")
+    assert found["faults"] == []
+    assert f"guard: the {role} process hung: it said nothing for 2 s and was ended" in said
+    kept(folder / out)
+    if role == "plant":
+        height = rows[measured(rows)][-1, TRUE][2]
+        assert found["ended"].startswith(f"stopped without measurements at {height:.2f} m: the plant process hung")
+        assert (code, steady["crashes"], steady["value"]) == (1, 1, None)
+        assert np.isin(rows[~measured(rows), -1], (Mode.BLIND, Mode.DROP)).all()
+    else:
+        assert (code, found["ended"], steady["crashes"]) == (0, "landed", 0)
+        assert rows[-1, -1] == Mode.WATCHDOG
 
 
 @pytest.mark.parametrize("seed", DRILLS)
@@ -178,11 +224,12 @@ def test_without_supervisor_and_recorder_what_was_learnt_is_kept(folder, seed):
         bus.extend(bus_of(process.pid))
         flight.update(processes_of(process.pid))
         os.kill(process.pid, signal.SIGKILL)
-        os.kill(flight["record"], signal.SIGKILL)
+        (recorder,) = (pid for pid, function in flight.items() if function == "record")
+        os.kill(recorder, signal.SIGKILL)
 
     code, _ = flown(folder, out.name, kill, seed)
     assert code == -signal.SIGKILL
-    wait_for(lambda: not any(Path(f"/proc/{pid}").exists() for pid in flight.values()))
+    wait_for(lambda: not any(Path(f"/proc/{pid}").exists() for pid in flight))
     kept(out)
     assert not (out / "results.json").exists()
     left = Path(bus[0])

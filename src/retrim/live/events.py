@@ -4,8 +4,8 @@ from collections.abc import Iterable
 
 from ..control.condition import describe_condition
 from ..learn.screening import describe_counts
+from ..onboard.pulses import SILENCE
 from ..runtime.events import Event
-from .pulses import SILENCE
 from .status import Status
 
 EXCLUDED_EVERY = 5.0  # [s] between two events about excluded measurements: a window is as long

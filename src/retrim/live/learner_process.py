@@ -295,5 +295,7 @@ def learn(plan: LearnerPlan) -> None:
                 continue
             heart.touch(COMPUTING)
             loop.learnt(loop.worker.learn(window))
-    if parent.gone() and plan.layer == "policy" and plan.out is not None:
-        loop.leave(plan.out)  # nobody else will
+    if plan.layer == "policy" and plan.out is not None:
+        while not parent.gone(LOOKING):  # it writes down what was learnt, and ends this process
+            pass
+        loop.leave(plan.out)

@@ -11,15 +11,16 @@ from subprocess import Popen, TimeoutExpired
 from typing import Any
 
 from ..errors import MessageError, PlantError
+from ..onboard.heart import Heart
 from ..onboard.launch import last_words, launch
 from ..onboard.messages import STOPPED, last_height, last_note, last_sent, pack_note, ticks_of
 from ..onboard.note_fields import plain
+from ..onboard.pulses import SILENCE, Pulses
 from ..onboard.realtime import cores_of
 from ..onboard.recorder import Recorder
 from ..transport.message import describe
 from ..transport.shared_memory import SharedMemoryBus
 from .plans import plan_of
-from .pulses import SILENCE, Pulses
 from .refused_notes import RefusedNotes
 from .remote_learners import RemoteLearners
 from .spec import LiveSpec
@@ -59,6 +60,7 @@ class Supervisor:
         self.start = self.bus.take_in(self.spec.start)  # the folder of the results may go away
         self.spec = replace(self.spec, start=self.start)
         self._notes, self._pulses = RefusedNotes(self.bus, topics(self.spec)), Pulses(self.bus)
+        self._heart = Heart(self.bus, "supervisor")
         self._remote = None if self.spec.learners is None else RemoteLearners(self.spec, self.bus)
         self._cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else None
         if self._cores:
@@ -174,6 +176,7 @@ class Supervisor:
     def watch(self) -> Status:
         """Bring back processes that have died or hang, and may; return how the flight stands."""
         assert self.epoch is not None
+        self._heart.beat()
         ended = last_note(self.bus, "ended").get("reason")
         if ended is None:
             self._end_hanging()

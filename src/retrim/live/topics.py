@@ -19,7 +19,7 @@ def topics(spec: LiveSpec) -> dict[str, int]:
         dict.fromkeys(SMALL, 4096)
         | {"status": 65536, "stalls": 16384, "flight": rows, "fallback.flight": rows}
         | {f"ready.{role}": 8192 for role in ROLES}
-        | {f"beat.{role}": 1024 for role in ROLES if role not in ("plant", "control")}
+        | {f"beat.{role}": 1024 for role in ("supervisor", *ROLES) if role not in ("plant", "control")}
         | {f"parameters.{name}": size + 100_000 for name, size in ({REFERENCE: 0} | half).items()}
         | {"mission": learnt}
         | {slot(layer, i): learnt for layer in LAYERS for i in range(SLOTS)}

@@ -8,10 +8,12 @@ from .control import ControlLoop
 from .messages import Stamp, pack_note
 from .orders import wait_for_take_off
 from .plan import ControlPlan
+from .pulses import Pulses
 from .realtime import Lifeline, be_punctual, sleep_until, wait_until
 from .shares import PHASE, ROOM
 
 PATIENCE = ROOM  # of a tick, for which a late sample is waited for: then its sender still waits for the answer
+ALONE = 5.0  # [s] without a heartbeat of the supervisor, which shares its cores with those who learn
 AHEAD = 0.75 * PHASE  # of a tick, by which the process is awake before a step is due
 LATE = 0.5  # of a tick, after which a step is left out
 
@@ -64,7 +66,8 @@ def fly(plan: ControlPlan) -> None:
     epoch = wait_for_take_off(bus, parent)
     if epoch is None:
         return
-    schedule = Schedule(epoch, plan.dt)
+    schedule, pulses = Schedule(epoch, plan.dt), Pulses(bus, silence=ALONE)
+    pulses.expect("supervisor", within=float("inf"))  # nobody else may be there to beat
     while not loop.over:
         scheduled = schedule.next()
         woke = _ready(loop, scheduled, AHEAD * plan.dt)
@@ -76,6 +79,8 @@ def fly(plan: ControlPlan) -> None:
         loop.tick(now, (woke if late else now) - scheduled)  # what the step waits for is not its own lateness
         if parent.gone():
             loop.land("the supervisor is gone")
+        elif pulses.hanging(["supervisor"]):
+            loop.land(f"the supervisor hangs: it said nothing for {ALONE:g} s")
         loop.idle()
         schedule.done(time.monotonic(), loop.stamp)
     time.sleep(2 * plan.dt)  # the last command is taken

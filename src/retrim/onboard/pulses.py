@@ -3,8 +3,8 @@
 import time
 from collections.abc import Callable, Iterable
 
-from ..onboard.heart import beat_topic
 from ..transport.bus import Bus
+from .heart import beat_topic
 
 SILENCE = 2.0  # [s] without a heartbeat, after which a process hangs
 LOOK = 0.25  # [s] that one look counts at most: a machine that stood still is no silence
@@ -13,24 +13,27 @@ LOOK = 0.25  # [s] that one look counts at most: a machine that stood still is n
 class Pulses:
     """Counts for how long each process has been silent, look by look."""
 
-    def __init__(self, bus: Bus, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, bus: Bus, clock: Callable[[], float] = time.monotonic, silence: float = SILENCE) -> None:
         """Begin with no process.
 
         Args:
             bus: Of the flight.
             clock: The time [s].
+            silence: Time without a heartbeat, after which a process hangs [s].
         """
-        self._bus, self._clock, self._last = bus, clock, clock()
+        self._bus, self._clock, self._last, self._silence = bus, clock, clock(), silence
         self._versions, self._silent, self._allowed = dict[str, int](), dict[str, float](), dict[str, float]()
 
-    def expect(self, role: str, within: float = SILENCE) -> None:
+    def expect(self, role: str, within: float | None = None) -> None:
         """Count from now on.
 
         Args:
             role: Of the process.
-            within: Time for the first heartbeat [s]; a process that starts compiles before it.
+            within: Time for the first heartbeat [s], since a process that starts compiles before it; None: as long as
+                for any other.
         """
-        self._versions[role], self._silent[role], self._allowed[role] = self._version(role), 0.0, within
+        self._versions[role], self._silent[role] = self._version(role), 0.0
+        self._allowed[role] = self._silence if within is None else within
 
     def hanging(self, roles: Iterable[str]) -> list[str]:
         """Return who has been silent for too long.

@@ -4,9 +4,9 @@ import time
 
 import pytest
 
-from retrim.live.pulses import LOOK, SILENCE, Pulses
 from retrim.onboard.heart import EVERY, Heart, Pacemaker
 from retrim.onboard.messages import last_note
+from retrim.onboard.pulses import LOOK, SILENCE, Pulses
 from retrim.transport.in_process import InProcessBus
 
 
