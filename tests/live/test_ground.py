@@ -109,7 +109,8 @@ def test_a_flight_with_learners_elsewhere(tmp_path, controller, lost):  # noqa: 
         assert not status.alive["policy"]
     else:
         assert swaps[-1] > 2.0
-        assert status.restarts == {"bridge": 1}
+        assert status.restarts == {"bridge": 1, "page": 1}
+        assert status.hangs == {"page": 1}
 
 
 @pytest.mark.parametrize(
@@ -191,6 +192,24 @@ def test_a_new_flight_has_new_learners_and_an_old_one_none(tmp_path, monkeypatch
         assert "compiling" in next(ground.learn())
         last = ground._bus.folder
     assert not last.exists()
+
+
+def test_a_learner_that_is_suspended_for_ever_is_started_again(tmp_path, monkeypatch):
+    network = InProcessBus(dict.fromkeys((*OUT, *INTO), 100_000))
+    monkeypatch.setattr(Address, "join", lambda *_, **__: network)
+    with DrillGround(Address("zenoh", "127.0.0.1", 1)) as ground:
+        network.publish("mission", mission_in(tmp_path, "first"))
+        assert ground._look()
+        suspended, until = ground.processes["policy"], time.monotonic() + 30.0
+        while ground._bus.latest("beat.policy") is None and time.monotonic() < until:
+            time.sleep(0.01)
+        os.kill(suspended.pid, signal.SIGSTOP)
+        while not ground.restarts and time.monotonic() < until:
+            ground._beat()
+            time.sleep(0.1)
+        assert ground.restarts == {"policy": 1}
+        assert suspended.poll() == -signal.SIGKILL
+        assert ground.processes["policy"].poll() is None
 
 
 @pytest.fixture

@@ -12,8 +12,10 @@ from subprocess import Popen
 from typing import Any
 
 from ..errors import ConfigError, MessageError, RetrimError, one_line
+from ..onboard.heart import beat_topic
 from ..onboard.launch import last_words, launch
 from ..onboard.messages import last_note, pack_note
+from ..onboard.pulses import Pulses
 from ..onboard.topics import INTO, MOST, OUT
 from ..transport.bridge import Bridge
 from ..transport.network import DISTRUST, FAREWELL
@@ -27,7 +29,7 @@ from .spec import MAINS
 IDLE, SELDOM = 0.002, 0.05  # [s] between two looks at a bus, while a flight goes on and before it begins
 BEAT_EVERY = TOLD_EVERY = 0.25  # [s]
 SILENCE = 5.0  # [s] without a word of the flight, after which it is told
-ATTEMPTS = 5  # to bring a learner back
+STARTING, ATTEMPTS = 300.0, 5  # [s] until a learner that compiles first beats; times to bring one back
 
 
 class Ground:
@@ -107,12 +109,12 @@ class Ground:
     def _look(self) -> bool:
         """Take a new mission, if there is one; return whether there is any."""
         message = self._network.latest("mission", self._known)
-        if message is None:
-            return self._mission is not None
-        self._known = message.version
         try:
-            mission = Mission.unpack(message.data)
+            mission = None if message is None else Mission.unpack(message.data)
         except MessageError:
+            mission = None
+        self._known = self._known if message is None else message.version
+        if mission is None:
             return self._mission is not None
         try:
             mission.check(self._trust)
@@ -129,13 +131,13 @@ class Ground:
             self._mission = mission
             self.processes["policy"].kill()
             self.processes["policy"].wait()
-            self._start("policy")
+            self._begin_with("policy")
         return True
 
     def _begin(self, mission: Mission) -> None:
         """Learn for a flight that is new."""
         self._end()
-        self._bus = SharedMemoryBus.create(mission.capacities)
+        self._bus = SharedMemoryBus.create({**mission.capacities, **{beat_topic(x): 1024 for x in mission.layers}})
         topics = mission.capacities  # a controller without a fitted half has no topic for it
         out, into = ([topic for topic in carried if topic in topics] for carried in (OUT, INTO))
         # The network remembers the flight before this one, whose ticks, orders and reference are foreign here.
@@ -143,8 +145,9 @@ class Ground:
         known = {topic: before.get(topic, 0) for topic in out}
         self._bridge = Bridge(self._network, self._bus, out=out, into=into, known=known)
         self._mission, self.restarts = mission, {}
+        self._pulses = Pulses(self._bus)
         for layer in mission.layers:
-            self._start(layer)
+            self._begin_with(layer)
 
     def _end(self) -> None:
         """End the learners of a flight."""
@@ -155,6 +158,11 @@ class Ground:
         if self._bus is not None:
             self._bus.remove()
             self._bus = None
+
+    def _begin_with(self, layer: Any) -> None:
+        self._start(layer)
+        if self._fleet is None:  # who learns for all of several flights has no heartbeat for each
+            self._pulses.expect(layer, STARTING)
 
     def _start(self, layer: Any) -> None:
         m = self._mission
@@ -176,12 +184,15 @@ class Ground:
         """Tell the flight who is alive, bring back who is not, and return how it stands."""
         assert self._mission is not None
         failed = ""
+        for layer in self._pulses.hanging([each for each in self.processes if self.processes[each].poll() is None]):
+            self.processes[layer].kill()
+            self.processes[layer].wait()
         for layer, process in self.processes.items():
             if process.poll() in (None, 0):
                 continue
             if self.restarts.get(layer, 0) < ATTEMPTS:
                 self.restarts[layer] = self.restarts.get(layer, 0) + 1
-                self._start(layer)
+                self._begin_with(layer)
             else:
                 failed = f"the {layer} learner on the ground died: {last_words(self.folder / f'{layer}.log')}"
         self._tell(failed)
