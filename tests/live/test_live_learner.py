@@ -14,6 +14,7 @@ from retrim.io.trained import save_learnt
 from retrim.learn.bptt import PolicyState
 from retrim.live.controllers import adaptive_source
 from retrim.live.learner_process import LearnerLoop, LearnerPlan
+from retrim.live.published import flown_update, keep
 from retrim.onboard.messages import COLUMNS, COMMAND, MEASURED, FlightRows, Parameters, pack_note
 from retrim.onboard.topics import slot
 from retrim.transport.in_process import InProcessBus
@@ -240,3 +241,17 @@ def test_one_that_was_started_again_goes_on_from_what_is_flown(start):
     beside.fly()
     assert improving(again).step()
     assert beside.parameters("policy", after=1).parent == 1
+
+
+@pytest.mark.parametrize("given_up", [[], [5]])
+def test_what_is_flown_stays_on_the_bus_however_much_is_learnt_that_nobody_takes(start, given_up):
+    """A process that flew and hangs takes nothing any more."""
+    beside = Beside(start)
+    update = PolicyUpdate(0.0, 0.0, 0.0, beside.state.policy)
+    for version in range(1, 10):
+        newest = min(version - 1, 5)
+        keep(
+            beside.bus, "policy", version, update, {"newest": {"policy": newest}, "given_up": given_up * (version > 5)}
+        )
+    found, _ = flown_update(beside.bus, beside.state, "policy", {"newest": {"policy": 5}, "given_up": given_up})
+    assert found == (4 if given_up else 5)

@@ -88,7 +88,7 @@ def test_another_way_of_learning_goes_on_from_what_is_flown(asked):
     supervisor = asked._supervisor
     state = load_learnt(supervisor.start)[0]
     nudged = state.policy.policy.with_params(jax.tree.map(lambda leaf: leaf + 0.01, state.policy.policy.params))
-    keep(supervisor.bus, "policy", 3, PolicyUpdate(1.0, 1.0, 2.0, PolicyState(nudged, state.policy.optimiser)))
+    keep(supervisor.bus, "policy", 3, PolicyUpdate(1.0, 1.0, 2.0, PolicyState(nudged, state.policy.optimiser)), {})
     flying = status(newest={"policy": 3}, given_up=[])
     supervisor.bus.publish("wish", pack_note("wish", method="lora", paused=False))
     assert [event.note for event in asked.obey(flying)] == ["method lora"]

@@ -201,7 +201,7 @@ class LearnerLoop:
         parent = self._flown[-1][0] if self._flown else 0
         whole = self._learnt_by(update)
         arrays = wire.names(flown(whole.policy.policy.merged(), whole.residual)[layer])
-        keep(self.bus, layer, version, update)
+        keep(self.bus, layer, version, update, self._status())
         found = Parameters(layer, version, self.plan.base, update.computed_from, arrays, parent)
         self.bus.publish(topic, found.pack())
         if isinstance(update, PolicyUpdate):
