@@ -89,6 +89,15 @@ def test_invalid_ticks_are_not_judged(window):
     assert found.trusted
 
 
+def test_a_step_of_several_ticks_is_not_judged(window):
+    """Five measurements are lost; the vehicle flies on."""
+    left = jnp.concatenate([jnp.arange(25), jnp.arange(30, N)])
+    found = screened(jax.tree.map(lambda leaf: leaf[left], window))
+    assert int(found.counts.sum()) == 0
+    assert found.steps.all()
+    assert found.samples.all()
+
+
 def test_counts_in_words():
     assert describe_counts(jnp.zeros(5, int)) == ""
     assert describe_counts([3, 0, 1, 0, 0]) == "repeated: 3, acceleration out of range: 1"

@@ -29,7 +29,8 @@ def write_whole(path: Path, data: bytes | str) -> None:
             os.fsync(file.fileno())
         partial.replace(path)
     except OSError as error:
-        error.filename = error.filename or str(path)  # a full disk names no file
+        if error.errno is not None:
+            error.filename = error.filename or str(path)  # a full disk names no file
         raise
     finally:
         with contextlib.suppress(OSError):

@@ -17,7 +17,8 @@ class Screening(eqx.Module):
     """Result of a screening. A window of n measurements has n - 1 steps."""
 
     steps: Bool[Array, " steps"]
-    """Steps from one measurement to the next that no test contradicts; those of invalid ticks are not tested."""
+    """Steps from one measurement to the next that no test contradicts; those of invalid ticks, and steps
+    that are not one tick long, are not tested."""
     samples: Bool[Array, " n"]
     """Measurements at one end of such a step at least."""
     counts: Int[Array, "5"]
@@ -56,7 +57,9 @@ def screen(window: Window, dt: float) -> Screening:
         dt: Control tick [s].
     """
     before, after = (_rows(window.x, part) for part in (slice(None, -1), slice(1, None)))
-    valid = window.valid[:-1] & window.valid[1:]
+    taken = window.t if window.age is None else window.t - window.age
+    successive = jnp.abs(jnp.diff(taken) - dt) < 0.25 * dt
+    valid = window.valid[:-1] & window.valid[1:] & successive
     gaps = jax.vmap(lambda a, b: gap(a, b, dt))(before, after)
     noise = _median(jax.vmap(gap_noise)(gaps[:-1], gaps[1:]), valid[:-1] & valid[1:])
     found: Findings = jax.vmap(lambda a, b: contradictions(a, b, dt, noise))(before, after)
