@@ -152,12 +152,10 @@ class LearnerLoop:
     def learnt(self, update: Update) -> None:
         """Publish what was learnt from the window of :meth:`due`, if it is still wanted."""
         self._learnt += 1
-        took = self._clock() - self._began
-        note = pack_note(
-            f"learner.{self.plan.layer}", learnt=self._learnt, took=took, until=update.computed_from,
-            excluded=list(update.excluded if isinstance(update, ResidualUpdate) else NOTHING),
-        )  # fmt: skip
-        self.bus.publish(f"learner.{self.plan.layer}", note)
+        topic, took = f"learner.{self.plan.layer}", self._clock() - self._began
+        excluded = list(update.excluded if isinstance(update, ResidualUpdate) else NOTHING)
+        note = pack_note(topic, learnt=self._learnt, took=took, until=update.computed_from, excluded=excluded)
+        self.bus.publish(topic, note)
         if self.plan.layer == "policy" and self._judge():
             return  # the policy that it was trained from was taken back meanwhile
         if self._wanted():

@@ -47,7 +47,18 @@ def _escaped(text: str) -> str:
     return re.sub(r"<(?=[A-Za-z/!?])", "&lt;", text).replace("](", "]\\(")
 
 
+class Link(str):
+    """A cell that links to a page of the run. It is Markdown, so both parts must be names of this package."""
+
+    @classmethod
+    def to(cls, page: str, name: str) -> "Link":
+        """Return the cell with the text ``name`` and the path ``page``."""
+        return cls(f"[{name}]({page})")
+
+
 def _cell(text: str) -> str:
+    if isinstance(text, Link):
+        return text
     return re.sub(r"(?<!\\)\|", r"\\|", as_text(text))
 
 

@@ -9,7 +9,7 @@ from ..provenance import section_key
 from ..reporter import Reporter
 from ..run import PARTS, Run
 from .design import design
-from .document import Document, TableSection
+from .document import Document, Link, TableSection
 from .efficiency import efficiency
 from .hover import hover
 from .kept import digest_of
@@ -102,7 +102,7 @@ def everything(run: Run, reporter: Reporter, *, quick: bool = False) -> None:
     lines = [
         (row["what"], f"{row['table']}, left out: {row['left_out']}", "-")
         if "left_out" in row
-        else (row["what"], f"[{row['table']}]({row['page']})", _minutes([row]))
+        else (row["what"], Link.to(row["page"], row["table"]), _minutes([row]))
         for row in rows
     ]
     lines.append(("", "together", _minutes([row for row in rows if "left_out" not in row])))
