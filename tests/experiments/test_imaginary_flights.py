@@ -1,13 +1,14 @@
 """What pages ask to be trained and flown, and what they lay out of it; a test gives every flight its error."""
 
 import importlib
+import json
 
 import numpy as np
 import pytest
 
 from commands import results
 from helpers import brief_preset
-from retrim import PlantError, Scenario
+from retrim import ConfigError, PlantError, Scenario
 from retrim.config.levers import CONTROL, OFF, ON
 from retrim.experiments import Run
 from retrim.experiments.gathering import Flights
@@ -82,6 +83,27 @@ def test_the_gauntlet_flies_every_condition_and_shows_means_and_the_worst(
     assert [curve.label for curve in best.curves] == ["indi", "base"]
     np.testing.assert_allclose(best.curves[1].y, 100.0)  # [mm]
     np.testing.assert_allclose(worst.curves[1].y[-1], 3000.0)
+
+
+def test_the_gauntlet_of_faults_compares_adapting_with_not_adapting(tmp_path, imagine, drawn, monkeypatch):
+    """Adapted flights crash where the base policy survives in one condition, and are as good as it in the other."""
+    drawn(gauntlet, "heat_map", "panel_figure")
+    monkeypatch.setattr(gauntlet.plots, "save", lambda figure, folder, stem: (folder / f"{stem}.png", folder / stem))
+    done = imagine(gauntlet, lambda spec: None if (spec.scenario.fault, spec.method) == ("late", "full") else 0.1)
+    run, methods = Run("test", tmp_path), ("base", "base-do", "full")
+    gauntlet.gauntlet(
+        run, Silent(), only=("late", "gaps"), methods=methods, starts=STARTS, seconds=SECONDS, faults=True
+    )
+    assert [tuple(each.fault for each in s) for _, s, *_ in done.flown] in ([("late",), ("gaps",)], [("late", "gaps")])
+    kept = json.loads((tmp_path / "results.json").read_text())["promise"]
+    assert [(row["scenario"], row["crashed_although_base_survived"], row["holds"]) for row in kept] == [
+        ("late", STARTS, False), ("gaps", 0, True),
+    ]  # fmt: skip
+    text = (tmp_path / "faults.md").read_text()
+    assert text.startswith("# Faults of measurements and vehicle\n")
+    assert "![faults](faults.png)" in text
+    with pytest.raises(ConfigError, match="--faults needs a preset for hover and ideal sensors"):
+        gauntlet.gauntlet(run, Silent(), sensors="rough", faults=True)
 
 
 def test_a_gauntlet_of_plants_that_are_not_installed_is_refused_before_training(tmp_path, imagine, monkeypatch):

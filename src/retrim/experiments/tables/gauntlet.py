@@ -119,7 +119,7 @@ def gauntlet(
         if faults:
             document.more["promise"] = promise_rows(flown)
             document.add(promise_section(document.more["promise"]))
-        document.add(_section(found, methods, flown, run, study.about(), left_out), found)
+        document.add(_section(found, methods, flown, document, study.about(), left_out), found)
     document.write()
     if not run.interrupted:
         forget_flights(run)
@@ -195,7 +195,7 @@ def _section(
     found: Sequence[dict[str, Any]],
     methods: Sequence[str],
     flown: dict[str, list[Flight]],
-    run: Run,
+    document: Document,
     about: str,
     left_out: Sequence[str],
 ) -> TableSection:
@@ -211,8 +211,8 @@ def _section(
     shown = ("late", "peak", "recovery_2cm")
     values = [[[_value(by.get((name, m, metric))) for m in methods] for name in names] for metric in shown]
     titles = [f"{metric} {METRICS[metric]}" for metric in shown]
-    drawn = plots.save(heat_map(titles, names, methods, np.array(values)), run.folder, "gauntlet")
-    plots.save(_best_and_worst(flown), run.folder, "gauntlet_flights")
+    drawn = plots.save(heat_map(titles, names, methods, np.array(values)), document.run.folder, document.name)
+    plots.save(_best_and_worst(flown), document.run.folder, f"{document.name}_flights")
     notes = "".join(f" Left out: {line}" for line in left_out)
     return TableSection(("condition", "method", *columns, "crashed"), tuple(lines), "", about + notes, drawn[0])
 
