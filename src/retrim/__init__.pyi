@@ -24,6 +24,7 @@ from .config import load as load
 from .config import overlaid as overlaid
 from .config import read_vehicle as read_vehicle
 from .config import register_disturbance as register_disturbance
+from .config import register_fault as register_fault
 from .config import register_method as register_method
 from .config import register_plant as register_plant
 from .config import register_reference as register_reference

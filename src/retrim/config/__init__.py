@@ -2,6 +2,7 @@
 
 from .disturbances import disturbance as disturbance
 from .disturbances import register_disturbance as register_disturbance
+from .faults import register_fault as register_fault
 from .loading import changed as changed
 from .loading import load as load
 from .loading import overlaid as overlaid
