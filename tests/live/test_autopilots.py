@@ -134,7 +134,8 @@ def test_a_bridge_that_is_killed_leaves_the_vehicle_to_its_autopilot(small, tmp_
         listener = MavlinkLink(UdpEndpoint("127.0.0.1", PORT))
         try:
             until = time.monotonic() + 10.0
-            while listener.mode != (4, 3) and time.monotonic() < until:  # hold: PX4's answer where setpoints stop
+            # hold: PX4's answer where setpoints stop; mode and state come in messages of their own
+            while (listener.mode != (4, 3) or listener.reading is None) and time.monotonic() < until:
                 listener.pump(time.monotonic() + 0.1)
             assert listener.mode == (4, 3)
             assert listener.armed
