@@ -1,4 +1,4 @@
-"""Whatever a browser or another process sends, the page goes on, says what it refused, and its *Land* button lands."""
+"""The page survives any input of a browser or another process, reports refusals, and keeps its *Land* button."""
 
 import asyncio
 import contextlib
@@ -56,7 +56,7 @@ def bus():
 
 
 def sent(server, handle, **updates):
-    """Send what a browser sends if somebody changes a control, and wait until it is dealt with."""
+    """Send the message of a changed control, and wait until the page has handled it."""
     from viser._messages import GuiUpdateMessage
 
     connection = server._websock_server

@@ -1,4 +1,4 @@
-"""Of two ends with a key each takes what the other says to it, once, and nothing that anybody else says."""
+"""Two ends with a key accept each message of the other end once, and no message of anybody else."""
 
 import os
 import pickle
@@ -37,7 +37,7 @@ class Wire:
         self.ends, self.carried, self.record = [], [], []
 
     def settle(self):
-        """Carry until nobody has anything to say."""
+        """Carry messages until none is left."""
         for _ in range(20):
             for end in self.ends:
                 end._attend()
@@ -102,7 +102,7 @@ def test_an_end_that_is_started_again_goes_on_and_the_one_before_is_not_heard_an
 
 
 def test_nothing_that_was_said_before_is_taken_again_by_anybody(wire):
-    """Neither by the ends that heard it, nor by ends that have just been started, alone or with each other."""
+    """The receivers refuse it, and so do ends that have just been started, alone or with each other."""
     flight, ground = End(wire, 0), End(wire, 1)
     flight.publish("out", b"old")
     ground.publish("into", b"old")

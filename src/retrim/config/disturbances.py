@@ -11,6 +11,7 @@ from ..physics.disturbance import Constant, Disturbance, Kick, RandomWalk, Rever
 from ..physics.faults import BatterySag, Payload, WeakRotor
 from ..physics.wind import Dryden, Fan, SteadyWind
 from .registry import Registry
+from .sizes import name_and_size
 
 DisturbanceFactory = Callable[[Key[Array, ""], float | None], Disturbance]
 """From a key, for what is random, and a size (None for the default) to a disturbance."""
@@ -33,13 +34,7 @@ def disturbance(names: str, seed: int = 0) -> Disturbance:
     """
     parts = list[Disturbance]()
     for i, part in enumerate(names.split("+")):
-        name, equals, text = part.partition("=")
-        size = None
-        if equals:
-            try:
-                size = float(text)
-            except ValueError as error:
-                raise ConfigError(f"disturbance {part!r}: {text!r} is not a number") from error
+        name, size = name_and_size(part, "disturbance")
         factory = DISTURBANCES.find(name)
         key = random.fold_in(random.fold_in(random.key(seed), SEED_TAG), i)
         try:

@@ -21,6 +21,7 @@ from ..plants.measurement_faults import (
     VelocitySpikes,
 )
 from .registry import Registry
+from .sizes import name_and_size
 
 NO_FAULT = "none"
 
@@ -40,13 +41,7 @@ def measurement_fault(name: str) -> AbstractMeasurementFault | None:
     Raises:
         ConfigError: There is no such fault, or it has no such size.
     """
-    kind, equals, text = name.partition("=")
-    size = None
-    if equals:
-        try:
-            size = float(text)
-        except ValueError as error:
-            raise ConfigError(f"fault {name!r}: {text!r} is not a number") from error
+    kind, size = name_and_size(name, "fault")
     try:
         fault = FAULTS.find(kind)(size)
     except (TypeError, ValueError) as error:

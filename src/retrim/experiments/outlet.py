@@ -1,4 +1,4 @@
-"""Where the files of a run go when its folder cannot be written any more: nothing that was flown or learnt is lost."""
+"""Output of a run, with temporary folders in case that its own folder cannot be written."""
 
 import contextlib
 import copy
@@ -19,10 +19,10 @@ SHARED_MEMORY = Path("/dev/shm")
 
 
 def spare_folders(folder: Path) -> tuple[Path, ...]:
-    """Return temporary folders for what cannot be written to a folder, the first choice first; none is made yet.
+    """Return temporary folders as substitutes for a folder, the first choice first. They are not created yet.
 
     Args:
-        folder: It gives them their name.
+        folder: Its name is part of theirs.
     """
     bases = dict.fromkeys((Path(tempfile.gettempdir()), *([SHARED_MEMORY] if SHARED_MEMORY.is_dir() else [])))
     name = f"kept-{folder.resolve().name[:80]}-{secrets.token_hex(4)}"
@@ -30,23 +30,23 @@ def spare_folders(folder: Path) -> tuple[Path, ...]:
 
 
 class Outlet:
-    """Writes file by file, each into the folder of its run, or into a temporary one where that cannot be."""
+    """Writes each file into the folder of its run, or into a temporary folder if that fails."""
 
     def __init__(self, folder: Path) -> None:
-        """Build it for the folder of a run."""
+        """Create the outlet of the folder of a run."""
         self.folder, self.spare = folder, spare_folders(folder)
         self.faults: list[str] = []
-        """What is not where it should be, each in a line."""
+        """One line for each file that is in another folder, or nowhere."""
 
     def write(self, name: str, put: Callable[[Path], T]) -> T | None:
-        """Write something.
+        """Write one output.
 
         Args:
-            name: What it is called if it cannot be written.
-            put: Writes it into the folder that it is given.
+            name: Name of the output in a fault.
+            put: Function that writes the output into a given folder.
 
         Returns:
-            What ``put`` returned; None if it can be written nowhere.
+            The result of ``put``; None if no folder can be written.
         """
         reason = ""
         for folder in (self.folder, *self.spare):
