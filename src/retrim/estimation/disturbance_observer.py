@@ -15,7 +15,7 @@ While a command at a limit acts, what the vehicle does is no disturbance: d and 
 So it is at the first measurement and after a tick that was missed, since what changed then is not of one tick.
 
 Measurements that contradict each other (:mod:`retrim.estimation.consistency`) say nothing of the disturbance: d is held
-during such a tick and the next one. The more of the last ticks were such, the faster d decays, since an estimate
+and v is predicted during such a tick and the next one. The more of the last ticks were such, the faster d decays, since an estimate
 without measurements is a push of its own. A correction within one tick is limited, so that a wrong velocity that no
 test finds has little effect.
 """
@@ -37,6 +37,7 @@ from .latency import follows
 NOISE_TAU = 1.0  # [s], memory of the estimated noise
 DECAY_TAU = 0.1  # [s], decay of the estimate if all of them do
 CORRECTION, SPREADS = 0.08, 6.0  # [m/s] and standard deviations of the noise: largest innovation of a tick
+COAST = 0.5  # share of the last ticks with contradictions up to which the model predicts the velocity meanwhile
 SECOND_DIFFERENCE = 1.954  # mean magnitude of the second difference of white noise, in standard deviations
 
 
@@ -123,7 +124,10 @@ class DisturbanceObserver(eqx.Module):
         )
         doubted = jnp.exp(-dt / DECAY_TAU * consistency.doubt**2)
         decay = jnp.where(consistency.certain, 1.0, doubted).astype(x.p.dtype)
-        held = dataclasses.replace(after, v=x.v, d_hat=decay * s.d_hat, missed=s.missed, noise=s.noise)
+        # A few such ticks, as dropped frames, are bridged by the model; measured velocities have all of the noise.
+        coasts = comparable & ~consistency.certain & (consistency.doubt < COAST)
+        v = jnp.where(coasts, predicted, x.v)
+        held = dataclasses.replace(after, v=v, d_hat=decay * s.d_hat, missed=s.missed, noise=s.noise)
         comparable &= consistency.certain
         if self.limits is not None:
             comparable &= is_followed(given, self.limits)
