@@ -146,7 +146,12 @@ OURS = {
     },
     "track/paper": {
         "task": "track",
-        "track": {"reference": "circle", "observation": "state", "start_spread": 0.3},
+        "track": {"reference": "circle", "observation": "both", "start_spread": 0.3},
+        "adapt": {"window": 250},
+    },
+    "track/blind": {
+        "task": "track",
+        "track": {"reference": "circle", "observation": "blind", "start_spread": 0.3},
         "adapt": {"window": 250},
     },
     "vision/paper": {

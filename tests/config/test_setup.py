@@ -26,10 +26,13 @@ from retrim.learn import policy_loss
 from retrim.physics.actuators import Lagged
 from retrim.physics.dynamics import PointMass
 from retrim.runtime import fly
-from retrim.tasks import Hover, Keypoints, L2Hover, L2Track, OccludedKeypoints, Preview, SharpTrack, StateObs, Track
+from retrim.tasks import (
+    Hover, Keypoints, L2Hover, L2Track, OccludedKeypoints, Preview, SharpTrack, StateAndErrorObs, StateObs, Track,
+)  # fmt: skip
 from retrim.tasks.view import ViewHover
 
 pytestmark = pytest.mark.usefixtures("optax_promotion")
+UNCLIPPED = ("hover/paper", "hover/released", "track/paper", "track/blind", "vision/paper")
 
 
 @pytest.fixture(scope="module", params=PRESETS)
@@ -53,9 +56,8 @@ def test_every_clock_ticks_alike(built):
 
 def test_the_model_has_the_presets_delay_and_lag(built):
     preset, made = built
-    assert preset.delay_ticks == {"hover/paper": 0, "track/paper": 0, "hover/released": 2, "hover/100hz": 2}.get(
-        preset.name, 1
-    )
+    delays = {"hover/paper": 0, "track/paper": 0, "track/blind": 0, "hover/released": 2, "hover/100hz": 2}
+    assert preset.delay_ticks == delays.get(preset.name, 1)
     for env in (made.env, made.learner.env):
         assert env.delay_ticks == preset.delay_ticks
         if preset.name in ("track/preview", "track/retrim", "track/fast", "vision/retrim"):
@@ -94,17 +96,20 @@ def test_the_observation_has_the_presets_numbers(built):
     preset, made = built
     seen = made.env.task.observation
     vehicle = make_vehicle(preset.vehicle)
-    np.testing.assert_array_equal(seen.omega_max, vehicle.omega_max)
+    scales = seen.state if isinstance(seen, StateAndErrorObs) else seen
+    np.testing.assert_array_equal(scales.omega_max, vehicle.omega_max)
     if preset.task == "vision":
         assert isinstance(seen, Keypoints)
         assert float(seen.noise) == preset.vision.pixel_noise
         assert bool(jnp.all(seen.whiten == jnp.eye(70))) == (not preset.vision.whiten_pixels)
         assert seen.dt == preset.dt
     else:
-        assert type(seen) is (Preview if preset.name in ("track/preview", "track/retrim", "track/fast") else StateObs)
-        if preset.task == "track" and preset.track.observation != "state":
-            assert seen.accelerations == ((0.04,) if preset.track.observation == "flat" else ())
-        assert seen.history == preset.command_history
+        kind = preset.track.observation if preset.task == "track" else "state"
+        kinds = {"both": StateAndErrorObs, "preview": Preview, "flat": Preview}
+        assert type(seen) is kinds.get(kind, StateObs)
+        if isinstance(seen, Preview):
+            assert seen.accelerations == ((0.04,) if kind == "flat" else ())
+        assert scales.history == preset.command_history
 
 
 def test_occlusion_is_switched_on_in_flight_alone(built):
@@ -143,9 +148,7 @@ def test_the_learner_has_the_presets_numbers(built):
     assert learner.num_envs == a.num_envs
     assert float(learner.optimiser.rate) == a.learning_rate
     assert float(learner.optimiser.max_grad_norm) == (math.inf if a.max_grad_norm is None else a.max_grad_norm)
-    assert (a.max_grad_norm is None) == (
-        preset.name in ("hover/paper", "hover/released", "track/paper", "vision/paper")
-    )
+    assert (a.max_grad_norm is None) == (preset.name in UNCLIPPED)
     assert isinstance(learner.optimiser, CarriedAdam if a.optimiser == "carried" else FreshAdam)
     if a.task_starts is None:
         assert isinstance(learner.starts, TaskStarts)
@@ -253,7 +256,7 @@ def test_pretraining_clips_if_the_preset_says_so(built):
     preset, made = built
     limit = preset.pretrain.max_grad_norm
     assert limit in (None, 1.0)
-    assert (limit is None) == (preset.name in ("hover/paper", "hover/released", "track/paper", "vision/paper"))
+    assert (limit is None) == (preset.name in UNCLIPPED)
     at_limit, beyond = (moves(made.optimiser, [0.01, 0.01, huge])[-1] for huge in (0.5, 5.0))
     assert (at_limit == pytest.approx(beyond)) == (limit is not None)
 

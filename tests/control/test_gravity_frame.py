@@ -20,7 +20,9 @@ from retrim.learn.residuals import RegressionModel
 from retrim.physics import Command, Hybrid, PointMass, State, small, so3
 from retrim.physics.actuators import Lagged, RateBiased
 from retrim.physics.felt_frame import FeltFrame
-from retrim.tasks import Keypoints, L2Track, OccludedKeypoints, Preview, Start, Track
+from retrim.tasks import (
+    Keypoints, L2Track, OccludedKeypoints, Preview, RelativeObs, Start, StateAndErrorObs, StateObs, Track,
+)  # fmt: skip
 from retrim.tasks.shapes import circle, figure8, star
 
 HOME = jnp.array(GOAL)
@@ -299,7 +301,7 @@ def test_training_on_keypoints_sees_one_frame(key):
 
 
 @pytest.mark.parametrize("d", [(1.0, 0.5, -1.0), (-2.0, 2.0, 2.0)])
-@pytest.mark.parametrize("tracking", [False, True])
+@pytest.mark.parametrize("tracking", [None, "preview", "relative", "both"])
 def test_a_flight_under_a_known_push_is_the_calm_flight_turned(d, tracking):
     """With a perfect estimate, a controller flies under a push as without one, in the frame."""
     env, d = hover_env(horizon=40), jnp.array(d)
@@ -307,9 +309,14 @@ def test_a_flight_under_a_known_push_is_the_calm_flight_turned(d, tracking):
         FeltFrame.of(d),
         State(HOME + jnp.array([0.2, -0.1, 0.3]), so3.exp(jnp.array([0.1, 0.2, 0.0])), jnp.zeros(3)),
     )
-    if tracking:
-        reference = circle()
-        task = Track(reference, Preview(reference, small().omega_max), jnp.array(1.0), jnp.array(5.0), 0.02, 40)
+    if tracking is not None:
+        reference, limits = circle(), small().omega_max
+        observation = {
+            "preview": Preview(reference, limits),
+            "relative": RelativeObs(reference, limits, 2),
+            "both": StateAndErrorObs(reference, StateObs(HOME, limits, 2)),
+        }[tracking]
+        task = Track(reference, observation, jnp.array(1.0), jnp.array(5.0), 0.02, 40)
         env = Env(PointMass(0.02), task)
     policy = fresh(env.task.observation.size, random.key(3))
     inner = PolicyController(env.task.observation, policy)

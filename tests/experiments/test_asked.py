@@ -32,7 +32,7 @@ def test_a_preset_is_that_of_the_task_with_what_was_asked_on_top(tmp_path):
 
 
 def test_the_reference_of_a_flight_is_one_that_the_policy_can_follow():
-    family, blind = load("track/preview"), changed(load("track/paper"), track={"reference": "circle"})
+    family, blind = load("track/preview"), changed(load("track/blind"), track={"reference": "circle"})
     one = changed(family, track={"reference": "star"})
     assert flown_reference(load("hover/fast"), None) is None
     assert [flown_reference(one, name) for name in (None, "star", "figure8")] == ["star", "star", "figure8"]
@@ -56,7 +56,7 @@ def test_a_flight_changes_nothing_that_the_weights_were_trained_for():
         ({"dt": 0.01}, "dt = 0.01, but the policy was trained with 0.02"),
         ({"command_history": 1}, "command_history = 1, but the policy was trained with 2"),
         ({"pretrain": {"num_updates": 3}}, r"\[pretrain\] cannot change for a policy that is trained"),
-        ({"track": {"observation": "state"}}, "track.observation = 'state', but the policy was trained with 'flat'"),
+        ({"track": {"observation": "both"}}, "track.observation = 'both', but the policy was trained with 'flat'"),
     ):
         with pytest.raises(ConfigError, match=rf"a\.toml: {said}"):
             same_policy(trained, dataclasses.replace(trained, **_whole(trained, changes)), Path("a.toml"))

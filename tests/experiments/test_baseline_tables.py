@@ -15,7 +15,7 @@ from jax import random
 
 from commands import results, retrim
 from helpers import brief_preset, random_command, random_state, tiny_preset
-from retrim import ConfigError, PlantError, Setup, changed
+from retrim import ConfigError, PlantError, Setup
 from retrim.cli.reproduce import COMMANDS
 from retrim.config import load, named_presets
 from retrim.config.baselines import BASELINES
@@ -216,11 +216,12 @@ def test_readings_of_the_papers_formulation_differ_as_they_say(tmp_path, monkeyp
     sections = []
     monkeypatch.setattr(phase_table, "fly_levels", lambda document, found, **_: sections.extend(found))
     phase_table.phase(Run("test", tmp_path), Silent(), references=("circle",))
-    printed, released, flown = (section.preset for section in sections)
-    assert {section.scenario.reference for section in sections} == {printed.track.reference} == {"circle"}
-    assert (printed.delay_ticks, printed.command_history, printed.track.start_spread) == (0, 0, 0.3)
-    assert (released.delay_ticks, released.command_history, released.track.start_spread) == (2, 3, 0.1)
-    assert flown == changed(released, adapt={"task_starts": 0, "start_noise": 0.05})
+    presets = [section.preset for section in sections]
+    assert {section.scenario.reference for section in sections} == {presets[0].track.reference} == {"circle"}
+    assert [preset.track.observation for preset in presets] == ["blind", "relative", "relative", "both"]
+    assert [(preset.delay_ticks, preset.command_history) for preset in presets] == [(0, 0), (0, 0), (1, 2), (0, 0)]
+    assert [Setup.of(preset).env.task.observation.size for preset in presets] == [15, 15, 23, 21]
+    assert presets[3] == load("track/paper")
     for wrong in ({"readings": ("printd",)}, {"references": ("line",)}):
         with pytest.raises(ConfigError, match="there are"):
             phase_table.phase(Run("test", tmp_path), Silent(), **wrong)

@@ -198,7 +198,7 @@ def test_the_ablation_trains_what_differs_and_has_a_line_for_each_lever(task, tm
         (lever.label.strip("*"), reference, name) for lever in every for reference in references for name in place
     ]
     for preset, scenarios in ((study.preset, s) for study, s, *_ in done.flown):
-        if preset.track is not None and preset.track.observation == "state":
+        if preset.track is not None and not preset.track.looks_ahead:
             assert preset.track.reference == scenarios[0].reference
 
 

@@ -92,7 +92,8 @@ def test_round_trip_is_exact(tmp_path, setup):
 SIZES = {"hover/fast": 23, "hover/released": 27, "hover/paper": 15, "hover/100hz": 31, "track/preview": 43}
 SIZES |= {
     "hover/retrim": 23,
-    "track/paper": 15,
+    "track/paper": 21,
+    "track/blind": 15,
     "track/retrim": 49,
     "track/fast": 49,
     "vision/ideal": 89,

@@ -15,7 +15,7 @@ from retrim.learn import Env, rollout
 from retrim.physics import Command, PointMass, State, small, so3
 from retrim.plants import Measurement
 from retrim.runtime import ControllerPilot
-from retrim.tasks import L2Track, Preview, Reference, Start, StateObs, Track, huber
+from retrim.tasks import L2Track, Preview, Reference, RelativeObs, Start, StateAndErrorObs, StateObs, Track, huber
 from retrim.tasks.shapes import circle, star
 
 
@@ -30,8 +30,20 @@ def nose():
     return Reference.of(lambda t: [0.2 * t, 0.1 * t, 1.0, math.pi / 6.0], seconds=10.0)
 
 
-def tracking(reference, make=Track, *, history=2, spread=1.0, box=5.0, horizon=12, preview=True):
-    seen = Preview(reference, small().omega_max, history) if preview else StateObs(jnp.array(GOAL), small().omega_max)
+def observe(kind, reference, history):
+    """The observation of a tracking policy by its name in a preset."""
+    limits = small().omega_max
+    state = StateObs(jnp.array(GOAL), limits, history)
+    return {
+        "blind": state,
+        "relative": RelativeObs(reference, limits, history),
+        "both": StateAndErrorObs(reference, state),
+        "preview": Preview(reference, limits, history),
+    }[kind]
+
+
+def tracking(reference, make=Track, *, history=2, spread=1.0, box=5.0, horizon=12, kind="preview"):
+    seen = observe(kind, reference, history)
     return make(reference, seen, jnp.array(spread), jnp.array(box), 0.02, horizon)
 
 
@@ -199,6 +211,33 @@ def test_preview_layout(history, loop, key):
     np.testing.assert_allclose(o[35:], np.reshape(newest, -1), atol=1e-12)
 
 
+@pytest.mark.parametrize("history", [0, 2])
+@pytest.mark.parametrize("kind", ["relative", "both"])
+def test_observed_tracking_errors_by_hand(kind, history, loop, key):
+    observation, t, x, memory = observe(kind, loop, history), 3.7, random_state(key), None
+    for k in range(3):
+        u = Command(jnp.array(9.81 * (1.0 + k)), jnp.array([6.0, 0.0, -4.0]) * k)
+        o, memory = seen_by(observation, t, x, u, memory)
+    here, commands = loop(jnp.array(t)), [[k, k, 0.0, -k] for k in range(3)][3 - history :]
+    error = np.asarray(x.p - here.p) / 1.5, np.asarray(x.v - here.v) / 5.0
+    own = (np.asarray(x.p) - np.asarray(GOAL)) / 1.5, np.asarray(x.v) / 5.0
+    first, last = (error, ()) if kind == "relative" else (own, error)
+    wanted = [first[0], np.asarray(x.R).reshape(9), first[1], np.reshape(commands, -1), *last]
+    assert o.shape == (observation.size,) == ((15 if kind == "relative" else 21) + 4 * history,)
+    np.testing.assert_allclose(o, np.concatenate(wanted), atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["relative", "both"])
+def test_a_place_is_observed_by_a_policy_that_observes_both_alone(kind, loop, key):
+    """Shape and vehicle are moved together: the error stays, and absolute positions do not."""
+    by, x = jnp.array([3.0, -7.0, 2.0]), random_state(key)
+    moved = eqx.tree_at(lambda r: r.rows, loop, loop.rows.at[:, :3].add(by))
+    see = jax.jit(lambda reference, x: seen_by(observe(kind, reference, 1), 4.4, x)[0])
+    here, there = see(loop, x), see(moved, replaced(x, p=x.p + by))
+    np.testing.assert_allclose(there[:3] - here[:3], (0.0 if kind == "relative" else by / 1.5), atol=1e-9)
+    np.testing.assert_allclose(there[3:], here[3:], atol=1e-9)
+
+
 def test_preview_shows_the_heading(nose):
     o, _ = seen_by(Preview(nose, small().omega_max, 0), 1.0, on(nose, 1.0))
     np.testing.assert_allclose(o[33:35], [math.cos(math.pi / 6.0), 0.5], atol=1e-12)
@@ -217,10 +256,10 @@ def test_preview_knows_no_place(loop, key):
 
 
 @pytest.mark.parametrize("t0", [0.0, 1.7, 5.95])
-@pytest.mark.parametrize("preview", [True, False])
-def test_simulation_and_flight_see_the_same(t0, preview, loop, key):
+@pytest.mark.parametrize("kind", ["preview", "blind", "relative", "both"])
+def test_simulation_and_flight_see_the_same(t0, kind, loop, key):
     """The pilot, given the states and times of a roll-out that starts anywhere, issues its very commands."""
-    task = tracking(loop, preview=preview)
+    task = tracking(loop, kind=kind)
     policy = Policy.of(task.observation.size, small(), key=key, hidden=(8,))
     policy = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf) + 0.1), policy)  # so that what is seen matters
     x0 = replaced(on(loop, t0), p=place(loop, jnp.array(t0)).p + 0.2)

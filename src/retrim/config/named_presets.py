@@ -87,6 +87,11 @@ VISION_RETRIM = dataclasses.replace(
     adapt=dataclasses.replace(RETRIM.adapt, trim="free"),  # a pose that is estimated wrongly is no rest
 )
 
+# Five seconds of flight are remembered.
+PAPER_TRACK = Preset(
+    name="track/paper", task="track", track=Track(observation="both", start_spread=0.3), adapt=Adapt(window=250)
+)
+
 PRESETS: dict[str, Preset] = {
     # Ours: the frame of the gravity that is felt answers in a second, short bursts of learning take what it leaves.
     "hover/retrim": RETRIM,
@@ -115,8 +120,12 @@ PRESETS: dict[str, Preset] = {
     ),
     # Ours: the reference seen ahead, a sharp reward, one tick of delay and actuator lag in the model.
     "track/preview": TRACK,
-    # Tracking as printed: the policy sees p, R, v and never its reference. Five seconds of flight are remembered.
-    "track/paper": Preset(name="track/paper", task="track", track=Track(start_spread=0.3), adapt=Adapt(window=250)),
+    # The paper's tracking: reward, network, budgets and loop as printed, o = [p, R, v] with the tracking error.
+    "track/paper": PAPER_TRACK,
+    # The same without the tracking error, read literally: the policy cannot know the phase of its reference.
+    "track/blind": dataclasses.replace(
+        PAPER_TRACK, name="track/blind", track=Track(observation="blind", start_spread=0.3)
+    ),
     # Seven points on the ground, five frames, three commands, no state; every point is observed, as in the paper.
     "vision/ideal": VISION,
     # The same, but points outside the image are not observed; pixels are noisy and some points are missed.

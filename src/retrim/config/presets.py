@@ -100,15 +100,21 @@ class Track:
 
     reference: Printable = "circle"
     """Reference of training: circle, figure8, star, a CSV file, module:name, or several of these joined by +."""
-    observation: Literal["state", "preview", "flat"] = "state"
-    """state: o = [p, R, v]; preview: the reference relative to the vehicle, now and soon; flat: its acceleration and
-    jerk, too."""
+    observation: Literal["blind", "relative", "both", "preview", "flat"] = "both"
+    """blind: o = [p, R, v], without the reference; relative: o = [p - p_ref, R, v - v_ref]; both: o = [p, R, v,
+    p - p_ref, v - v_ref]; preview: the reference relative to the vehicle, now and up to 0.4 s ahead; flat: preview with
+    acceleration and jerk."""
     start_spread: Positive = 1.0
     """Starts lie within this of the reference, per axis [m]."""
     felt_copies: int = Field(default=0, ge=0, le=100, strict=True)
     """Training also follows so many copies of each reference as they are where a constant push is gravity."""
     felt_push: Positive = 4.0
     """Largest such push [m/s^2]."""
+
+    @property
+    def looks_ahead(self) -> bool:
+        """Whether the policy observes the future of its reference, so that one policy can follow several."""
+        return self.observation in ("preview", "flat")
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from ..errors import ConfigError
 from ..physics.state import Command
@@ -19,6 +20,7 @@ from ..tasks.reference import Reference
 from ..tasks.task import AbstractTask
 from ..tasks.track import AbstractTrack, L2Track, SharpTrack
 from ..tasks.track import Track as PaperTrack
+from ..tasks.tracking_error import RelativeObs, StateAndErrorObs
 from ..tasks.view import ViewHover
 from .loading import changed
 from .presets import Preset
@@ -30,6 +32,13 @@ from .vehicles import is_published
 
 LEAD = 0.04  # [s]: about as late as commands act, behind a delay and motors
 VISION_REWARDS: dict[str, type[AbstractHover]] = {"paper": Hover, "l2": L2Hover, "view": ViewHover}
+TRACK_OBSERVATIONS: dict[str, Callable[["TaskRequest", Reference], AbstractObservation[Any]]] = {
+    "blind": lambda request, reference: request.state_observation(),
+    "relative": lambda request, reference: RelativeObs(reference, *request.observed_commands()),
+    "both": lambda request, reference: StateAndErrorObs(reference, request.state_observation()),
+    "preview": lambda request, reference: Preview(reference, *request.observed_commands()),
+    "flat": lambda request, reference: Preview(reference, *request.observed_commands(), (LEAD,)),
+}
 TRACKS: dict[str, type[AbstractTrack]] = {"paper": PaperTrack, "l2": L2Track, "sharp": SharpTrack}
 
 
@@ -49,7 +58,11 @@ class TaskRequest:
 
     def state_observation(self) -> StateObs:
         """Return the paper's observation, o = [p, R, v], with the preset's past commands."""
-        return StateObs(jnp.array(self.preset.goal), self.vehicle.omega_max, self.preset.command_history)
+        return StateObs(jnp.array(self.preset.goal), *self.observed_commands())
+
+    def observed_commands(self) -> tuple[Float[Array, "3"], int]:
+        """Return the scale of observed body rates [rad/s], and the number of observed past commands."""
+        return self.vehicle.omega_max, self.preset.command_history
 
 
 @dataclass(frozen=True)
@@ -166,14 +179,10 @@ def _track(request: TaskRequest) -> AbstractTask:
     p, table = request.preset, request.preset.track or TrackTable()
     if request.reference is None:
         raise ConfigError("task 'track' needs a reference")
-    observation: AbstractObservation[Any] = request.state_observation()
-    if table.observation != "state":
-        ahead = (LEAD,) if table.observation == "flat" else ()
-        observation = Preview(request.reference, request.vehicle.omega_max, p.command_history, ahead)
     kind = TRACKS[p.reward]
     return kind(
         request.reference,
-        observation,
+        TRACK_OBSERVATIONS[table.observation](request, request.reference),
         jnp.array(table.start_spread),
         jnp.array(p.termination_box),
         p.dt,

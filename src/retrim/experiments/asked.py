@@ -129,7 +129,7 @@ def flown_reference(preset: Preset, name: str | None) -> str | None:
     trained_on = preset.track.reference
     if name is None and "+" in trained_on:
         raise ConfigError(f"the policy was trained on {trained_on}: say which to fly, as --reference circle")
-    if name is not None and name != trained_on and preset.track.observation == "state":
+    if name is not None and name != trained_on and preset.track.observation == "blind":
         raise ConfigError(
             f"--reference {name}: this policy does not see its reference, and was trained on {trained_on}"
         )

@@ -21,6 +21,8 @@ from .track import AbstractTrack as AbstractTrack
 from .track import L2Track as L2Track
 from .track import SharpTrack as SharpTrack
 from .track import Track as Track
+from .tracking_error import RelativeObs as RelativeObs
+from .tracking_error import StateAndErrorObs as StateAndErrorObs
 from .trajectory_csv import from_csv as from_csv
 from .transition import Spliced as Spliced
 from .transition import spliced as spliced

@@ -111,8 +111,8 @@ def _flown(
 
 
 def _follows(preset: Preset, reference: str | None) -> Preset:
-    """A policy that does not see its reference is trained on the one that it flies."""
-    if reference is None or preset.track is None or preset.track.observation != "state":
+    """Return the preset of a policy for ``reference``: without preview it is trained on the reference that it flies."""
+    if reference is None or preset.track is None or preset.track.looks_ahead:
         return preset
     return changed(preset, track={"reference": reference})
 

@@ -1,4 +1,4 @@
-"""The paper's own formulation of tracking, read in several ways: a policy that does not see its reference."""
+"""The paper's formulation of tracking with several readings of its observation, from blind to state and error."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -14,25 +14,27 @@ from .study import table_presets
 from .track import PAPER
 
 INTRO = """\
-Made by `retrim reproduce phase`. In the paper's formulation a tracking policy sees position, attitude and velocity, and
-its reference in the reward alone: the closed loop is a clock of its own, whose phase nothing that it sees can correct.
-Error over the last 10 s [m]: mean ± standard deviation over flights, at the reference's own time; in step: but for the
-best constant shift in time; cross-track: from the nearest point of the lap. In brackets the paper's figures, which are
-from its own plant. One policy for each reference and reading. Readings:"""
-NEAR: dict[str, Any] = {"start_spread": 0.1}
-RELEASED: dict[str, Any] = {"delay_ticks": 2, "command_history": 3}
-READINGS: dict[str, tuple[str, dict[str, Any], dict[str, Any], dict[str, Any]]] = {
-    "printed": ("o = [p, R, v], no delay in the model, starts within 30 cm of the reference", {}, {}, {}),
-    "released": (
-        "as the authors' code: 40 ms of delay in the model, the last three commands observed, starts within 10 cm",
-        RELEASED, NEAR, {},
+Made by `retrim reproduce phase`. The paper prints o = [p, R, v] as the observation of hover and tracking. This page flies
+the paper's reward, network, budgets and adaptation loop (preset `track/paper`) with four readings of this observation,
+with one policy for each reference and reading. Error over the last 10 s [m]: mean ± standard deviation over flights, at
+the reference's own time; in step: after the best constant shift in time; cross-track: from the nearest point of the
+lap. In brackets the paper's figures, which are from its own plant. Readings:"""
+LIMITS = """\
+A blind policy has no information about the phase of its reference: its closed loop is an oscillator of its own, and no
+command can correct a shift that it cannot observe, so that its error is about as large as the reference. A relative
+policy observes its error and corrects it, but it cannot know where on the reference it is: it reacts to a corner of the
+star after the corner, and a constant lag of the plant remains unless past commands show it. A policy with both observes
+where it is and where it should be, can learn one reference by heart and begins its turn before the corner."""
+DELAY: dict[str, Any] = {"delay_ticks": 1, "command_history": 2}
+READINGS: dict[str, tuple[str, str, dict[str, Any]]] = {
+    "blind": ("o = [p, R, v], 15 numbers", "blind", {}),
+    "relative": ("o = [p - p_ref(t), R, v - v_ref(t)], 15 numbers", "relative", {}),
+    "relative-delay": (
+        "relative with the last two commands, and one tick of delay in the model, 23 numbers", "relative", DELAY,
     ),
-    "flown": (
-        "the same, and updates start where the vehicle has been, at the reference's time then",
-        RELEASED, NEAR, {"task_starts": 0, "start_noise": 0.05},
-    ),
+    "both": ("o = [p, R, v, p - p_ref(t), v - v_ref(t)], 21 numbers", "both", {}),
 }  # fmt: skip
-"""What it is, and changes of the preset, of its table [track], and of its table [adapt]."""
+"""Description, observation, and changes of the preset."""
 
 
 def phase(
@@ -40,19 +42,19 @@ def phase(
     reporter: Reporter,
     *,
     readings: tuple[str, ...] = tuple(READINGS),
-    references: tuple[str, ...] = ("figure8", "circle"),
-    methods: tuple[str, ...] = ("base", "full"),
+    references: tuple[str, ...] = ("circle", "figure8", "star"),
+    methods: tuple[str, ...] = ("base", "full", "lora"),
     seeds: tuple[int, ...] = (0,),
     seconds: float = 60.0,
     starts: int = 4,
     plant: str = "bem",
 ) -> None:
-    """Tracking as the paper formulates it, where the policy does not see its reference, read in several ways.
+    """The paper's formulation of tracking with four observations, from blind to state and tracking error.
 
     Args:
         run: Folder of phase.md, phase.json and the pictures.
         reporter: Receives progress and the sections.
-        readings: printed, released, flown.
+        readings: blind, relative, relative-delay, both.
         references: circle, figure8, star.
         methods: How they fly.
         seeds: Training seeds.
@@ -62,16 +64,17 @@ def phase(
     """
     _check("reading", readings, READINGS)
     _check("reference", references, PAPER)
-    (printed,) = table_presets(["track/paper"], "track", seeds=seeds, starts=starts, seconds=seconds)
+    (paper,) = table_presets(["track/paper"], "track", seeds=seeds, starts=starts, seconds=seconds)
     sections = []
     for reference in references:
         for reading in readings:
-            _, more, track, adapt = READINGS[reading]
-            own = changed(printed, **more, track={**track, "reference": reference}, adapt=adapt)
+            _, observation, changes = READINGS[reading]
+            own = changed(paper, **changes, track={"observation": observation, "reference": reference})
             scenario, stem = Scenario(plant=plant, reference=reference), f"phase_{reference}_{reading}"
             sections.append(Levels(f"{reference}, {reading}", own, scenario, stem, methods, PAPER[reference]))
     about = "\n".join(f"* {name}: {READINGS[name][0]}" for name in readings)
-    document = Document(run, "phase", "Tracking without seeing the reference", f"{INTRO}\n\n{about}", seeds, reporter)
+    title = "Readings of the paper's observation for tracking"
+    document = Document(run, "phase", title, f"{INTRO}\n\n{about}\n\n{LIMITS}", seeds, reporter)
     fly_levels(document, sections, starts=starts, seconds=seconds)
 
 

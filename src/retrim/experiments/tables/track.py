@@ -40,7 +40,8 @@ Made by `retrim reproduce track`. Mean distance from where the reference is at t
 s: mean ± standard deviation over flights. In step: but for the best constant shift in time. Cross-track:
 distance from the nearest point of the lap. Small quadrotor. Presets `track/retrim` and `track/preview`: one
 policy, trained on all three references, sees them ahead; `track/retrim` is flown and adapted in the frame of the
-gravity that it feels. `track/paper`: the paper's observation o = [p, R, v] and reward, one policy per reference.
+gravity that it feels. `track/paper`: the paper's reward, network and loop with o = [p, R, v, p - p_ref, v - v_ref], one
+policy per reference; `retrim reproduce phase` compares readings of the observation.
 Learning is charged to flight time by the preset's fixed latencies. In brackets the paper's figures, which are
 from its own plant; its circle and ours take 3 s."""
 
@@ -81,7 +82,7 @@ def track(
 
 
 def _sections(preset: Preset, plant: str, methods: Sequence[str]) -> list[Levels]:
-    """A section for each reference; a policy that sees it ahead is trained once for all, another for each."""
+    """Return a section for each reference; policies with preview are trained once for all, others for each."""
 
     def section(
         title: str, preset: Preset, reference: str, paper: PaperRows, methods: Sequence[str] = methods
@@ -90,13 +91,13 @@ def _sections(preset: Preset, plant: str, methods: Sequence[str]) -> list[Levels
         stem = "_".join(["track", preset.name.rpartition("/")[2], reference, trained_on])
         return Levels(title, preset, Scenario(plant=plant, reference=reference), stem, methods, paper)
 
-    if preset.track is not None and preset.track.observation != "state":
+    if preset.track is not None and preset.track.looks_ahead:
         unseen = changed(preset, track={"reference": "circle+star"})
         return [
             *(section(f"{name}, seen ahead", preset, name, paper) for name, paper in PAPER.items()),
             section("figure8, never seen in training", unseen, "figure8", {}, of_policies(methods)),
         ]
     return [
-        section(f"{name}, not seen", changed(preset, track={"reference": name}), name, paper)
+        section(f"{name}, {preset.name}", changed(preset, track={"reference": name}), name, paper)
         for name, paper in PAPER.items()
     ]

@@ -1,0 +1,78 @@
+"""Observations of a tracking policy that contain the tracking error: state-based tracking as in the paper.
+
+The paper prints o = [p, R, v] for hover and tracking alike. Read literally for tracking, the policy has no information
+about the phase of its reference (the observation ``blind``). The two classes here are the other readings.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..physics.felt_frame import FeltFrame
+from ..physics.state import Command, State
+from .abstract_reference import AbstractReference
+from .observation import POSITION_SCALE, VELOCITY_SCALE, AbstractObservation, StateObs
+
+
+class RelativeObs(AbstractObservation[Float[Array, "history 4"]]):
+    """o = [p - p_ref(t), R, v - v_ref(t)] and the last ``history`` commands: 15 + 4 ``history`` numbers.
+
+    The policy knows its error and cannot know where on the reference it is, so it cannot anticipate.
+    """
+
+    reference: AbstractReference
+    omega_max: Float[Array, "3"]
+    history: int = eqx.field(static=True, default=0)
+
+    @property
+    def size(self) -> int:
+        """Length of the observation: 15 + 4 ``history``."""
+        return 15 + 4 * self.history
+
+    def init(self, x: State) -> Float[Array, "history 4"]:
+        """Return the memory of a vehicle that has hovered until now."""
+        return jnp.zeros((self.history, 4), dtype=x.p.dtype)
+
+    def __call__(
+        self, memory: Float[Array, "history 4"], t: Float[Array, ""], x: State, last: Command
+    ) -> tuple[Float[Array, " o"], Float[Array, "history 4"]]:
+        """Return the scaled state relative to the reference, in world axes, and the commands."""
+        here = self.reference(t)
+        own = StateObs(jnp.zeros_like(x.p), self.omega_max, self.history)
+        return own(memory, t, State(x.p - here.p, x.R, x.v - here.v), last)
+
+    def in_frame(self, frame: FeltFrame) -> "RelativeObs":
+        """Return the observation relative to the turned reference."""
+        return RelativeObs(self.reference.in_frame(frame), self.omega_max, self.history)
+
+
+class StateAndErrorObs(AbstractObservation[Float[Array, "history 4"]]):
+    """o = [p, R, v, the last ``history`` commands, p - p_ref(t), v - v_ref(t)]: 21 + 4 ``history`` numbers.
+
+    Position, velocity and error together tell the policy where on its reference it is. It can learn one reference by
+    heart and anticipate its corners; a reference that crosses itself is told apart by the velocity.
+    """
+
+    reference: AbstractReference
+    state: StateObs
+
+    @property
+    def size(self) -> int:
+        """Length of the observation: 21 + 4 ``history``."""
+        return self.state.size + 6
+
+    def init(self, x: State) -> Float[Array, "history 4"]:
+        """Return the memory of a vehicle that has hovered until now."""
+        return self.state.init(x)
+
+    def __call__(
+        self, memory: Float[Array, "history 4"], t: Float[Array, ""], x: State, last: Command
+    ) -> tuple[Float[Array, " o"], Float[Array, "history 4"]]:
+        """Return the scaled state, the commands and the scaled error, in world axes."""
+        here = self.reference(t)
+        seen, memory = self.state(memory, t, x, last)
+        return jnp.concatenate([seen, (x.p - here.p) / POSITION_SCALE, (x.v - here.v) / VELOCITY_SCALE]), memory
+
+    def in_frame(self, frame: FeltFrame) -> "StateAndErrorObs":
+        """Return the observation of the turned reference."""
+        return StateAndErrorObs(self.reference.in_frame(frame), self.state.in_frame(frame))
