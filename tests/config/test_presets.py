@@ -146,13 +146,13 @@ OURS = {
     },
     "track/paper": {
         "task": "track",
-        "track": {"reference": "circle", "observation": "both", "start_spread": 0.3},
-        "adapt": {"window": 250},
+        "track": {"reference": "circle", "observation": "both", "start_spread": 0.1},
+        "adapt": {"window": 250, "low_rank_learning_rate": 3e-3},
     },
     "track/blind": {
         "task": "track",
-        "track": {"reference": "circle", "observation": "blind", "start_spread": 0.3},
-        "adapt": {"window": 250},
+        "track": {"reference": "circle", "observation": "blind", "start_spread": 0.1},
+        "adapt": {"window": 250, "low_rank_learning_rate": 3e-3},
     },
     "vision/paper": {
         "task": "vision",
