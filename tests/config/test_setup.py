@@ -27,7 +27,16 @@ from retrim.physics.actuators import Lagged
 from retrim.physics.dynamics import PointMass
 from retrim.runtime import fly
 from retrim.tasks import (
-    Hover, Keypoints, L2Hover, L2Track, OccludedKeypoints, Preview, SharpTrack, StateAndErrorObs, StateObs, Track,
+    Hover,
+    Keypoints,
+    L2Hover,
+    L2Track,
+    OccludedKeypoints,
+    Preview,
+    SharpTrack,
+    StateAndErrorObs,
+    StateObs,
+    Track,
 )  # fmt: skip
 from retrim.tasks.view import ViewHover
 

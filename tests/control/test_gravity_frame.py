@@ -21,7 +21,15 @@ from retrim.physics import Command, Hybrid, PointMass, State, small, so3
 from retrim.physics.actuators import Lagged, RateBiased
 from retrim.physics.felt_frame import FeltFrame
 from retrim.tasks import (
-    Keypoints, L2Track, OccludedKeypoints, Preview, RelativeObs, Start, StateAndErrorObs, StateObs, Track,
+    Keypoints,
+    L2Track,
+    OccludedKeypoints,
+    Preview,
+    RelativeObs,
+    Start,
+    StateAndErrorObs,
+    StateObs,
+    Track,
 )  # fmt: skip
 from retrim.tasks.shapes import circle, figure8, star
 

@@ -14,10 +14,10 @@ observer is a first-order low-pass of what the model missed in each tick.
 While a command at a limit acts, what the vehicle does is no disturbance: d and r are held, and v is what is measured.
 So it is at the first measurement and after a tick that was missed, since what changed then is not of one tick.
 
-Measurements that contradict each other (:mod:`retrim.estimation.consistency`) say nothing of the disturbance: d is held
-and v is predicted during such a tick and the next one. The more of the last ticks were such, the faster d decays, since an estimate
-without measurements is a push of its own. A correction within one tick is limited, so that a wrong velocity that no
-test finds has little effect.
+Measurements that contradict each other (:mod:`retrim.estimation.consistency`) contain no information about the
+disturbance: d is held and v is predicted during such a tick and the next one. d decays faster the more of the last
+ticks were such, since an estimate without measurements is a push of its own. The correction of one tick is limited, so
+that a wrong velocity that no test finds has little effect.
 """
 
 import dataclasses

@@ -14,9 +14,9 @@ from .study import table_presets
 from .track import PAPER
 
 INTRO = """\
-Made by `retrim reproduce phase`. The paper prints o = [p, R, v] as the observation of hover and tracking. This page flies
-the paper's reward, network, budgets and adaptation loop (preset `track/paper`) with four readings of this observation,
-with one policy for each reference and reading. Error over the last 10 s [m]: mean ± standard deviation over flights, at
+Made by `retrim reproduce phase`. The paper prints o = [p, R, v] as the observation of hover and tracking. This page
+flies the paper's reward, network, budgets and adaptation loop (preset `track/paper`) with four readings of this
+observation, with one policy for each reference and reading. Error over the last 10 s [m]: mean ± standard deviation over flights, at
 the reference's own time; in step: after the best constant shift in time; cross-track: from the nearest point of the
 lap. In brackets the paper's figures, which are from its own plant. Readings:"""
 LIMITS = """\
