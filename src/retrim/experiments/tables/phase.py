@@ -16,9 +16,9 @@ from .track import PAPER
 INTRO = """\
 Made by `retrim reproduce phase`. The paper prints o = [p, R, v] as the observation of hover and tracking. This page
 flies the paper's reward, network, budgets and adaptation loop (preset `track/paper`) with four readings of this
-observation, with one policy for each reference and reading. Error over the last 10 s [m]: mean ± standard deviation over flights, at
-the reference's own time; in step: after the best constant shift in time; cross-track: from the nearest point of the
-lap. In brackets the paper's figures, which are from its own plant. Readings:"""
+observation, with one policy for each reference and reading. Error over the last 10 s [m]: mean ± standard deviation
+over flights, at the reference's own time; in step: after the best constant shift in time; cross-track: from the nearest
+point of the lap. In brackets the paper's figures, which are from its own plant. Readings:"""
 LIMITS = """\
 A blind policy has no information about the phase of its reference: its closed loop is an oscillator of its own, and no
 command can correct a shift that it cannot observe, so that its error is about as large as the reference. A relative
