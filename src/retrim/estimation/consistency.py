@@ -136,19 +136,21 @@ class Consistency(eqx.Module):
     """Moments of the last second."""
     scaled: Bool[Array, ""]
     """Whether velocities had a wrong scale when the vehicle moved last."""
+    repeated: Bool[Array, ""]
+    """Whether the last measurement is the one before it again, as after a dropped frame."""
     possible: Bool[Array, ""]
     """Whether the last measurement did not contradict the one before it."""
     certain: Bool[Array, ""]
     """Whether the step to the last measurement can be used: neither of its ends contradicts the measurement before."""
     doubt: Float[Array, ""]
-    """Share of the last steps that could not be used."""
+    """Share of the last steps that could not be used; one at the start, when nothing has shown that they can."""
 
     @classmethod
     def start(cls, x: State) -> "Consistency":
         """Return the memory before the first measurement ``x``."""
         zero, yes = jnp.zeros_like(x.p[0]), jnp.array(True)
         scale = Scale(jnp.zeros_like(x.p), jnp.zeros_like(x.p), zero, jnp.zeros_like(x.p[:2]))
-        return cls(jnp.zeros_like(x.p), jnp.full_like(zero, NOISE_PRIOR), scale, ~yes, yes, yes, zero)
+        return cls(jnp.zeros_like(x.p), jnp.full_like(zero, NOISE_PRIOR), scale, ~yes, ~yes, yes, yes, zero + 1.0)
 
     def after(self, before: State, x: State, dt: float, successive: Bool[Array, ""]) -> "Consistency":
         """Return the memory after a new measurement.
@@ -160,7 +162,8 @@ class Consistency(eqx.Module):
             successive: Whether there is one tick between them; if not, they are not compared.
         """
         missing, v = gap(before, x, dt), 0.5 * (before.v + x.v)
-        possible = ~(successive & contradictions(before, x, dt, self.noise).any)
+        found = contradictions(before, x, dt, self.noise)
+        possible = ~(successive & found.any)
         moving = jax.tree.map(lambda old, new: old + dt / SCALE_TAU * (new - old), self.scale, Scale.of(missing, v, dt))
         scale = where(successive & possible & self.possible, moving, self.scale)
         shows, wrong = scale.verdict(dt, self.noise)
@@ -170,4 +173,4 @@ class Consistency(eqx.Module):
         new = jnp.minimum(gap_noise(self.gap, missing), NOISE_LIMIT)
         noise = self.noise + (1.0 - jnp.exp(-dt / NOISE_TAU)) * (new - self.noise)
         noise = jnp.where(successive & possible & self.possible, noise, self.noise)
-        return Consistency(missing, noise, scale, scaled, possible, certain, doubt)
+        return Consistency(missing, noise, scale, scaled, successive & found.repeated, possible, certain, doubt)

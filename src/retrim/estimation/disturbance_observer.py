@@ -15,9 +15,9 @@ While a command at a limit acts, what the vehicle does is no disturbance: d and 
 So it is at the first measurement and after a tick that was missed, since what changed then is not of one tick.
 
 Measurements that contradict each other (:mod:`retrim.estimation.consistency`) contain no information about the
-disturbance: d is held and v is predicted during such a tick and the next one. d decays faster the more of the last
-ticks were such, since an estimate without measurements is a push of its own. The correction of one tick is limited, so
-that a wrong velocity that no test finds has little effect.
+disturbance: d is held during such a tick and the next one; v is predicted if a frame was dropped. d decays faster the
+more of the last ticks were such, since an estimate without measurements is a push of its own. The correction of one
+tick is limited, so that a wrong velocity that no test finds has little effect.
 """
 
 import dataclasses
@@ -37,7 +37,7 @@ from .latency import follows
 NOISE_TAU = 1.0  # [s], memory of the estimated noise
 DECAY_TAU = 0.1  # [s], decay of the estimate if all of them do
 CORRECTION, SPREADS = 0.08, 6.0  # [m/s] and standard deviations of the noise: largest innovation of a tick
-COAST = 0.5  # share of the last ticks with contradictions up to which the model predicts the velocity meanwhile
+COAST = 0.5  # share of the last ticks with contradictions up to which the model predicts v after a dropped frame
 SECOND_DIFFERENCE = 1.954  # mean magnitude of the second difference of white noise, in standard deviations
 
 
@@ -124,8 +124,10 @@ class DisturbanceObserver(eqx.Module):
         )
         doubted = jnp.exp(-dt / DECAY_TAU * consistency.doubt**2)
         decay = jnp.where(consistency.certain, 1.0, doubted).astype(x.p.dtype)
-        # A few such ticks, as dropped frames, are bridged by the model; measured velocities have all of the noise.
-        coasts = comparable & ~consistency.certain & (consistency.doubt < COAST)
+        # The model bridges a few dropped frames; the measured velocity has all of the noise. After other contradictions
+        # it does not: measurements may be later than declared, and then the prediction is of another time.
+        dropped = consistency.repeated | s.consistency.repeated
+        coasts = comparable & dropped & (consistency.doubt < COAST)
         v = jnp.where(coasts, predicted, x.v)
         held = dataclasses.replace(after, v=v, d_hat=decay * s.d_hat, missed=s.missed, noise=s.noise)
         comparable &= consistency.certain
