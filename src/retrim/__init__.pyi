@@ -62,8 +62,10 @@ from .learn import pretrain as pretrain
 from .learn import residual_targets as residual_targets
 from .learn import rollout as rollout
 from .physics import AbstractDynamics as AbstractDynamics
+from .physics import ActuatorResponse as ActuatorResponse
 from .physics import BemQuadrotor as BemQuadrotor
 from .physics import Command as Command
+from .physics import CommandPath as CommandPath
 from .physics import Constant as Constant
 from .physics import Hybrid as Hybrid
 from .physics import LinearDragQuadrotor as LinearDragQuadrotor
