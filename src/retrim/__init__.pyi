@@ -72,6 +72,7 @@ from .physics import LinearDragQuadrotor as LinearDragQuadrotor
 from .physics import PointMass as PointMass
 from .physics import Push as Push
 from .physics import Reversing as Reversing
+from .physics import SecondOrderQuadrotor as SecondOrderQuadrotor
 from .physics import State as State
 from .physics import StraightThrough as StraightThrough
 from .physics import Vehicle as Vehicle

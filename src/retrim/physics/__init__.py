@@ -28,6 +28,7 @@ from .propeller import Propeller as Propeller
 from .propeller import five_inch as five_inch
 from .propeller import three_inch as three_inch
 from .rotors import LinearDragQuadrotor as LinearDragQuadrotor
+from .second_order import SecondOrderQuadrotor as SecondOrderQuadrotor
 from .state import STANDARD_GRAVITY as STANDARD_GRAVITY
 from .state import Command as Command
 from .state import State as State
