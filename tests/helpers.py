@@ -14,7 +14,7 @@ from retrim import learn
 from retrim.config import changed, load
 from retrim.learn import Env, Window
 from retrim.learn.pretrain import random_starts as training_starts
-from retrim.physics import AbstractSubstepDynamics, Command, PointMass, State, small, so3
+from retrim.physics import AbstractSubstepDynamics, ActuatorResponse, Command, PointMass, State, small, so3
 from retrim.tasks import Hover, StateObs
 
 GOAL = (0.0, 0.0, 1.0)
@@ -75,7 +75,13 @@ def hover_task(*, horizon=5, history=0, heading=math.pi, box=5.0, dt=0.02, make=
 def hover_env(dynamics=None, *, delay_ticks=0, **task):
     """A hover task with a model of its rate, the point mass unless another is given."""
     small_task = hover_task(**task)
-    return Env(PointMass(small_task.dt) if dynamics is None else dynamics, small_task, delay_ticks)
+    delay = jnp.array(delay_ticks * small_task.dt)
+    return Env(PointMass(small_task.dt) if dynamics is None else dynamics, small_task, delay)
+
+
+def first_order(tau):
+    """The response of first-order lags: one time constant for all, or those of a command's parts [s]."""
+    return ActuatorResponse.of(tau.c, tau.omega) if isinstance(tau, Command) else ActuatorResponse.of(tau, tau)
 
 
 def random_field_flight(field, key, *, n=100, delay_ticks=0):

@@ -62,14 +62,17 @@ from .learn import pretrain as pretrain
 from .learn import residual_targets as residual_targets
 from .learn import rollout as rollout
 from .physics import AbstractDynamics as AbstractDynamics
+from .physics import ActuatorResponse as ActuatorResponse
 from .physics import BemQuadrotor as BemQuadrotor
 from .physics import Command as Command
+from .physics import CommandPath as CommandPath
 from .physics import Constant as Constant
 from .physics import Hybrid as Hybrid
 from .physics import LinearDragQuadrotor as LinearDragQuadrotor
 from .physics import PointMass as PointMass
 from .physics import Push as Push
 from .physics import Reversing as Reversing
+from .physics import SecondOrderQuadrotor as SecondOrderQuadrotor
 from .physics import State as State
 from .physics import StraightThrough as StraightThrough
 from .physics import Vehicle as Vehicle

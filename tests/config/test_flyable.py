@@ -10,7 +10,7 @@ from jax import random
 from retrim import ConfigError
 from retrim.config import PRESETS, Scenario, Setup, changed, read_vehicle, register_vehicle
 from retrim.config.baselines import BASELINES, slowness
-from retrim.config.tasks import lag_of
+from retrim.config.command_paths import lag_of
 from retrim.config.vehicles import PUBLISHED, make_vehicle
 from retrim.physics.step_response import step_responses
 from retrim.runtime import fly

@@ -68,11 +68,11 @@ def test_the_model_has_the_presets_delay_and_lag(built):
     delays = {"hover/paper": 0, "track/paper": 0, "track/blind": 0, "hover/released": 2, "hover/100hz": 2}
     assert preset.delay_ticks == delays.get(preset.name, 1)
     for env in (made.env, made.learner.env):
-        assert env.delay_ticks == preset.delay_ticks
+        assert float(env.delay) == pytest.approx(preset.delay_ticks * preset.dt)
         if preset.name in ("track/preview", "track/retrim", "track/fast", "vision/retrim"):
             assert isinstance(env.dynamics, Lagged)
             assert preset.actuator_tau == 0.033
-            assert {float(tau) for tau in env.dynamics.tau.vector()} == {float(jnp.array(0.033))}
+            assert {float(env.dynamics.response.thrust_lag), *env.dynamics.response.rate_lag.tolist()} == {0.033}
             assert isinstance(env.dynamics.base, PointMass)
         else:
             assert preset.actuator_tau is None
@@ -217,7 +217,7 @@ def test_the_pilot_has_the_presets_schedule(built, latency, monkeypatch):
         assert isinstance(flown, Monitor)
         flown = flown.frame
         assert isinstance(flown, GravityFrame)
-        assert flown.observer.delay_ticks == preset.plant_delay_ticks
+        assert float(flown.observer.path.delay) == pytest.approx(preset.plant_delay_ticks * preset.dt)
         assert flown.known.model is made.learner.residual_model
         flown = flown.inner
     assert isinstance(flown, PolicyController)
@@ -387,7 +387,8 @@ def test_a_vehicle_whose_lag_is_known_is_modelled_with_it():
     spec = VehicleSpec("made_up", 1.0, (0.02, 0.02, 0.03), (0.2, 0.2), 20.0, (4.0, 4.0, 3.0), 0.05, (0.07, 0.08, 0.4))
     for name in ("hover/retrim", "track/retrim"):
         made = Setup.of(changed(load(name), vehicle=spec))
-        np.testing.assert_allclose(made.env.dynamics.tau.vector(), [0.05, 0.07, 0.08, 0.4])
+        response = made.env.dynamics.response
+        np.testing.assert_allclose([response.thrust_lag, *response.rate_lag], [0.05, 0.07, 0.08, 0.4])
         prior = made.learner.residual_model.init(jax.random.key(0))
         rates = prior.rates if name == "hover/retrim" else prior.first.rates
         np.testing.assert_allclose(rates.tau, [0.07, 0.08, 0.4])
@@ -397,7 +398,10 @@ def test_a_vehicle_whose_lag_is_known_is_modelled_with_it():
 def test_a_vehicle_whose_delay_is_known_is_trained_with_it(delay, ticks):
     body = ("made_up", 1.0, (0.02, 0.02, 0.03), (0.2, 0.2), 20.0, (4.0, 4.0, 3.0), 0.05)
     made = Setup.of(changed(load("hover/retrim"), vehicle=VehicleSpec(*body, command_delay=delay)))
-    assert made.env.delay_ticks == made.learner.plant_delay_ticks == made.preset.plant_delay_ticks == ticks
+    assert made.learner.plant_delay_ticks == made.preset.plant_delay_ticks == ticks
+    exact = 0.02 if delay is None else delay  # the model, and the observer in flight
+    observer = made.controller(made.learner.init(made.new_policy(random.key(0)), random.key(2))).frame.observer
+    assert [float(made.env.delay), float(observer.path.delay)] == pytest.approx([exact, exact])
     assert Setup.of(made.preset).preset == made.preset
 
 

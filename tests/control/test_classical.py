@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from jax import lax, random
 
-from helpers import GOAL, at, hover_task, random_state
+from helpers import GOAL, at, first_order, hover_task, random_state
 from retrim.control.attitude import LEAST_LIFT, attitude_of, command_for, flyable, thrust_of
 from retrim.control.geometric import Gains, Geometric
 from retrim.control.indi import Incremental
@@ -35,7 +35,7 @@ def made(kind, task):
 
 @eqx.filter_jit
 def _flown(controller, x0, push, start, ticks):
-    model = Lagged(PointMass(DT), jnp.array(TAU))
+    model = Lagged(PointMass(DT), first_order(TAU))
 
     def tick(carry, k):
         s, memory, waiting = carry

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from jax import lax, random
 
-from helpers import GOAL, hover_env, hover_task, random_command, random_state, replaced
+from helpers import GOAL, first_order, hover_env, hover_task, random_command, random_state, replaced
 from retrim.adapt.views import GravityView, RestView, WorldView
 from retrim.control import Policy
 from retrim.control.controller import PolicyController
@@ -17,7 +17,7 @@ from retrim.control.gravity_frame import GravityFrame, SeenFrame, Unsteady
 from retrim.estimation.disturbance_observer import DisturbanceObserver
 from retrim.learn import Env, FittedResidual, rollout
 from retrim.learn.residuals import RegressionModel
-from retrim.physics import Command, Hybrid, PointMass, State, small, so3
+from retrim.physics import ActuatorState, Command, Hybrid, PointMass, State, small, so3
 from retrim.physics.actuators import Lagged, RateBiased
 from retrim.physics.felt_frame import FeltFrame
 from retrim.tasks import (
@@ -65,7 +65,7 @@ def test_felt_gravity_is_standard_gravity_in_the_frame(d):
     np.testing.assert_allclose(frame.Q @ axis, axis, atol=1e-9)
 
 
-@pytest.mark.parametrize("model", [PointMass(0.02), Lagged(PointMass(0.02), jnp.array(0.03))], ids=["bare", "lagged"])
+@pytest.mark.parametrize("model", [PointMass(0.02), Lagged(PointMass(0.02), first_order(0.03))], ids=["bare", "lagged"])
 def test_a_tick_in_the_frame_is_a_tick_in_the_world(model, key):
     """From any state, under any command, with any residual: one tick of Eq. (1), turned before or after."""
     k_x, k_u = random.split(key)
@@ -78,7 +78,7 @@ def test_a_tick_in_the_frame_is_a_tick_in_the_world(model, key):
         world, inside = Hybrid(model, residual), Hybrid(model, left)
         s, turned = world.init(x), inside.init(frame.state(x))
         if isinstance(model, Lagged):  # its actuators hover at first, in the world as in the frame
-            turned = replaced(turned, acting=frame.command(s.acting))
+            turned = replaced(turned, actuators=ActuatorState.at(frame.command(s.actuators.command)))
         s, turned = world.step(s, u, jnp.zeros(3)), inside.step(turned, frame.command(u), jnp.zeros(3))
         return inside.state(turned), frame.state(world.state(s))
 
@@ -378,9 +378,9 @@ def test_a_corrected_model_turns_as_the_vehicle_was_seen_to_turn(key):
     model = RegressionModel.of(0.02)
     fresh = model.init(key)
     known = replaced(fresh, rates=replaced(fresh.rates, bias=jnp.array([0.3, 0.0, 0.0]), tau=jnp.full(3, 0.08)))
-    env = hover_env(Lagged(PointMass(0.02), jnp.array(0.03)))
+    env = hover_env(Lagged(PointMass(0.02), first_order(0.03)))
     world, framed = (view(env, FittedResidual(model, known)).dynamics for view in (WorldView(), GravityView(LIMIT)))
-    true = Lagged(PointMass(0.02), jnp.array(0.08))
+    true = Lagged(PointMass(0.02), first_order(0.08))
     for seen, expected in ((world, RateBiased(true, known.rates.bias)), (framed, true)):
         x, u = random_state(key), random_command(key)
         close(seen.step(seen.init(x), u, jnp.zeros(3)), expected.step(expected.init(x), u, jnp.zeros(3)))

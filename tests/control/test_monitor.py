@@ -38,7 +38,7 @@ def flying(as_a_user):
 def flight(setup, monitor, *, seconds=4.0, fault=None, later=None, model=CheapModel(DT)):  # noqa: B008
     """Fly from a start; after 2 s ``later`` takes over, if there is one."""
     push = Constant(jnp.full(3, 0.5, dtype=jnp.float32))
-    simulation = Simulation(model, push, None, random.key(0), 0.02, fault)
+    simulation = Simulation(model, push, None, random.key(0), jnp.array(0.02), fault)
     half, whole = round(2.0 / DT), round(seconds / DT)
 
     @eqx.filter_jit

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from jax import lax, random
 
-from helpers import GOAL, hover_task, random_state
+from helpers import GOAL, first_order, hover_task, random_state
 from retrim.control.mppi import Mppi, _turned
 from retrim.estimation.l1 import L1Estimator
 from retrim.estimation.prediction import Prediction
@@ -92,7 +92,7 @@ def test_more_samples_plan_better(key):
 @eqx.filter_jit
 def flown(controller, push):
     """Positions and commands of 4 s in the lagged model, whose commands act a tick late."""
-    model = Lagged(PointMass(DT), jnp.array(TAU))
+    model = Lagged(PointMass(DT), first_order(TAU))
 
     def tick(carry, k):
         s, memory, waiting = carry

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from jax import lax, random
 
-from helpers import GOAL, random_state, replaced
+from helpers import GOAL, first_order, random_state, replaced
 from retrim import ConfigError, Setup, load
 from retrim.config.baselines import BASELINES
 from retrim.config.methods import MethodRequest
@@ -36,7 +36,7 @@ def made(setup, name, **changed):
 
 @pytest.mark.parametrize("name", ["geometric-i", "indi"])
 def test_it_hovers_and_rejects_a_step_by_what_the_camera_sees(setup, name):
-    controller, model = made(setup, name), Lagged(PointMass(DT), TAU)
+    controller, model = made(setup, name), Lagged(PointMass(DT), first_order(TAU))
     x0 = State(jnp.array([0.3, -0.2, 1.2]), jnp.eye(3), jnp.zeros(3))
 
     def tick(carry, k):

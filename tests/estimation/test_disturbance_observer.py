@@ -9,7 +9,7 @@ from jax import random
 
 from helpers import stacked
 from retrim.estimation.disturbance_observer import DisturbanceObserver
-from retrim.physics import Command, PointMass, State, so3
+from retrim.physics import ActuatorResponse, Command, CommandPath, PointMass, State, so3
 from retrim.physics.actuators import lagged
 
 DT, D = 0.02, jnp.array([1.5, -1.0, 2.0])
@@ -55,9 +55,9 @@ def _observed(observer, key, ticks, noise, late, turning, d, thrust_tau):
 
 
 def make(*, tau=0.05, wander=4.0, limit=9.0, thrust_tau=None, limits=None, delay_ticks=0):
-    thrust_tau = None if thrust_tau is None else jnp.array(thrust_tau)
+    path = CommandPath.of(delay_ticks * DT, ActuatorResponse.of(thrust_tau or 0.0))
     numbers = (jnp.array(each) for each in (tau, limit, wander))
-    return DisturbanceObserver(PointMass(DT), *numbers, thrust_tau, limits, delay_ticks=delay_ticks)
+    return DisturbanceObserver(PointMass(DT), *numbers, path, limits)
 
 
 @pytest.mark.parametrize(("late", "turning"), [(0, 1.0), (2, 1.0), (0, 0.5)])

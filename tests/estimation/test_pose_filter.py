@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from jax import lax, random
 
-from helpers import GOAL, random_command, replaced, stacked
+from helpers import GOAL, first_order, random_command, replaced, stacked
 from retrim.estimation import Camera, PoseFilter
 from retrim.estimation.camera import in_camera
 from retrim.physics import Command, Lagged, PointMass, State, so3
@@ -154,7 +154,7 @@ def test_a_first_look_may_be_far_off():
 @pytest.mark.parametrize("tau", [0.03, 0.06])
 def test_it_knows_of_lag(tau, key):
     """In the dark, under a command that jumps, it follows a vehicle with such actuators; not without knowing."""
-    plant = Lagged(PointMass(DT), jnp.array(tau))
+    plant = Lagged(PointMass(DT), first_order(tau))
     x0 = State.at(jnp.array(GOAL))
     start = replaced(PoseFilter.near(x0, key), x=x0)
     jumps = [Command(jnp.array(15.0), jnp.array([3.0, -2.0, 1.0]))] * 6

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jax import random
 
-from helpers import random_command, random_state
+from helpers import first_order, random_command, random_state
 from retrim.estimation.prediction import Prediction
 from retrim.physics import Command, PointMass
 from retrim.physics.actuators import Lagged
@@ -17,7 +17,7 @@ DT, TAU = 0.02, 0.033
 @pytest.mark.parametrize("delay", [0, 1, 3])
 def test_it_is_what_the_lagged_model_does(delay, key):
     """Commands under way act first, each for a tick; then the new one begins."""
-    model, d = Lagged(PointMass(DT), jnp.array(TAU)), jnp.array([0.5, -1.0, 0.3])
+    model, d = Lagged(PointMass(DT), first_order(TAU)), jnp.array([0.5, -1.0, 0.3])
     k_x, *keys = random.split(key, 9)
     s = model.init(random_state(k_x))
     prediction = Prediction(jnp.array(TAU), DT, delay)
@@ -29,7 +29,7 @@ def test_it_is_what_the_lagged_model_does(delay, key):
         for u in queue:
             after = model.step(after, u, d)
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-12), soon, model.state(after))
-        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-12), acting, after.acting)
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-12), acting, after.actuators.command)
         u = random_command(k)
         memory = prediction.issued(memory, u)
         queue.append(u)

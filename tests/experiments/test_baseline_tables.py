@@ -339,4 +339,4 @@ def test_re_training_goes_on_from_chunk_to_chunk_and_forgets_the_first(monkeypat
     assert len(made.epoch_s) == 3
     assert all(0.0 < seconds < 1.0 for seconds in made.epoch_s)
     env = asked[0][1]
-    assert (env.task, env.delay_ticks) == (setup.env.task, setup.env.delay_ticks)
+    assert (env.task, float(env.delay)) == (setup.env.task, float(setup.env.delay))

@@ -192,10 +192,13 @@ def test_chunks_do_not_change_the_program(key):
         )
 
 
-def test_an_environment_has_one_tick_and_no_negative_delay():
+def test_an_environment_has_one_tick_and_a_delay_that_its_queue_holds():
     """A model and a task at different rates would disagree on what a tick is."""
     with pytest.raises(ValueError, match=r"the model ticks every 0\.01 s, the task every 0\.02 s"):
         Env(PointMass(0.01), hover_task(dt=0.02))
-    with pytest.raises(ValueError, match=r"delay_ticks = -1 must not be negative"):
+    with pytest.raises(ValueError, match=r"Env\.delay = -0\.02 s must be 0 to 0\.2 s"):
         hover_env(delay_ticks=-1)
-    assert Env(PointMass(0.01), hover_task(dt=0.01)).delay_ticks == 0
+    with pytest.raises(ValueError, match=r"Env\.delay = 0\.24 s must be 0 to 0\.2 s; set longest_delay for more"):
+        hover_env(delay_ticks=12)
+    assert Env(PointMass(0.01), hover_task(dt=0.01), jnp.array(0.3), longest_delay=0.3).delay == 0.3
+    assert Env(PointMass(0.01), hover_task(dt=0.01)).delay == 0.0

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from jax import lax, random
 
-from helpers import GOAL, random_command, random_state, replaced, residual_targets, stacked
+from helpers import GOAL, first_order, random_command, random_state, replaced, residual_targets, stacked
 from retrim.learn import Window
-from retrim.physics import Command, Hybrid, Lagged, PointMass, State, StraightThrough, f_a, so3
+from retrim.physics import ActuatorState, Command, Hybrid, Lagged, PointMass, State, StraightThrough, f_a, so3
 from retrim.physics.actuators import LagState
 
 TAU, DT = 0.033, 0.02
@@ -16,7 +16,7 @@ STILL = jnp.zeros(3)
 
 
 def lagged(tau=TAU):
-    return Lagged(PointMass(DT), jnp.array(tau))
+    return Lagged(PointMass(DT), first_order(tau))
 
 
 def commands(key, n):
@@ -49,8 +49,10 @@ def test_step_response_is_exact_at_every_tick(tau):
     held = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (20, *leaf.shape)), u)
     states = flown(lagged(tau), lagged(tau).init(State.at(jnp.array(GOAL))), held)
     risen = 1.0 - np.exp(-DT * np.arange(21) / tau)
-    np.testing.assert_allclose(states.acting.c - 9.81, risen * (12.0 - 9.81), rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(states.acting.omega, risen[:, None] * np.array([[1.0, -2.0, 0.5]]), rtol=1e-12)
+    np.testing.assert_allclose(states.actuators.command.c - 9.81, risen * (12.0 - 9.81), rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(
+        states.actuators.command.omega, risen[:, None] * np.array([[1.0, -2.0, 0.5]]), rtol=1e-12
+    )
 
 
 def test_hover_is_an_equilibrium():
@@ -101,9 +103,9 @@ def test_external_acceleration_is_not_delayed():
 
 
 def test_what_is_hidden_stays(key):
-    s = LagState(random_state(key), random_command(key))
+    s = LagState(random_state(key), ActuatorState.at(random_command(key)))
     after = lagged().with_state(s, State.at(jnp.array(GOAL)))
-    jax.tree.map(np.testing.assert_array_equal, after.acting, s.acting)
+    jax.tree.map(np.testing.assert_array_equal, after.actuators, s.actuators)
     np.testing.assert_array_equal(lagged().state(after).p, GOAL)
 
 
@@ -115,7 +117,7 @@ def test_gradients_against_finite_differences(key):
 
     def mixture(what):
         x, us, tau = what
-        model, s = Lagged(PointMass(DT), tau), None
+        model, s = Lagged(PointMass(DT), first_order(tau)), None
         s = model.init(x)
         for k in range(3):
             s = model.step(s, jax.tree.map(lambda leaf, k=k: leaf[k], us), STILL)

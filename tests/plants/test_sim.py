@@ -36,10 +36,44 @@ def test_delay_shifts_the_response():
     assert angle(later) < angle(between) < angle(late)
 
 
-@pytest.mark.parametrize("delay_s", [-0.01, 0.0205])
+@pytest.mark.parametrize("delay_s", [-0.01, float("nan"), float("inf")])
 def test_impossible_delays(delay_s):
-    with pytest.raises(ValueError, match="whole, non-negative number of milliseconds"):
+    with pytest.raises(ValueError, match="finite, non-negative number of seconds"):
         simulated(delay_s=delay_s)
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.001, 0.02, 0.0213, 0.035, 0.0996, 0.2, 0.25])
+@pytest.mark.parametrize("dt", [0.002, 0.02])
+def test_a_delay_is_exact_in_each_millisecond(dt, delay_s):
+    """The commands that the model is given are those of a clock that counts in microseconds."""
+    plant = SimPlant(CheapModel(dt), CALM, delay_s=delay_s)
+    ticks, per_tick = round(0.3 / dt), round(1e3 * dt)
+    issued = 9.81 + np.arange(1.0, ticks + 1)
+    queue, found = plant.simulation.launch(START).queue, []
+    arriving = eqx.filter_jit(lambda queue, delay: queue.substeps(delay, dt, per_tick))
+    for c in issued:
+        queue = queue.push(Command(jnp.array(c), jnp.zeros(3)))
+        found.append(np.asarray(arriving(queue, plant.simulation.delay).c))
+    edges = np.arange(ticks * per_tick * 1000)  # [us]
+    acting = np.concatenate([np.full(round(1e6 * delay_s), 9.81), np.repeat(issued, round(1e6 * dt))])[: len(edges)]
+    np.testing.assert_allclose(np.concatenate(found), acting.reshape(-1, 1000).mean(axis=1), rtol=1e-9)
+
+
+def test_another_delay_is_never_another_program():
+    traces = []
+
+    def calm(t, x):
+        traces.append(t)
+        return jnp.zeros(3)
+
+    disturbance, counts = Push(calm), []
+    for delay_s in (0.0, 0.02, 0.0374, 0.2):
+        plant = SimPlant(CheapModel(0.02), disturbance, delay_s=delay_s)
+        plant.reset(START)
+        plant.step(Command.hover())
+        counts.append(len(traces))
+    assert counts[0] > 0
+    assert len(set(counts)) == 1
 
 
 def test_disturbance_accelerates():

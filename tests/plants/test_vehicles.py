@@ -143,7 +143,7 @@ def test_what_can_be_stopped_in_time_is_no_vehicle(plant):
     ("asked", "why"),
     [
         ({"disturbance": "large"}, "a vehicle, whose world nobody can disturb by name"),
-        ({"sensors": "rough"}, "sensors 'rough' need bem or simple"),
+        ({"sensors": "rough"}, "sensors 'rough' need bem, simple or second-order"),
         ({"thrust_error": 0.1}, "its own thrust map"),
         ({"delay": 0.05}, "its own command delay"),
     ],

@@ -11,7 +11,7 @@ from retrim.control import Policy, PolicyController
 from retrim.control.controller import AbstractController
 from retrim.control.gravity_frame import GravityFrame
 from retrim.estimation.disturbance_observer import DisturbanceObserver
-from retrim.physics import Command, Constant, LinearDragQuadrotor, PointMass, State, small
+from retrim.physics import Command, CommandPath, Constant, LinearDragQuadrotor, PointMass, State, small
 from retrim.plants import SensorModel, SimPlant
 from retrim.runtime import ControllerPilot, batch_flight, fly
 from retrim.runtime.batched import one, stacked
@@ -47,7 +47,9 @@ def test_same_as_flying_the_plant(parts, delay_s, sensors):
 def test_a_late_measurement_is_taken_for_what_it_says_of_now(parts):
     """By the layer of felt gravity, in both ways of flying; a vehicle that drifts is seen where it is."""
     model, push, controller, x0 = parts
-    observer = DisturbanceObserver(PointMass(0.02), jnp.array(0.05), jnp.array(6.0), jnp.array(4.0), delay_ticks=1)
+    observer = DisturbanceObserver(
+        PointMass(0.02), jnp.array(0.05), jnp.array(6.0), jnp.array(4.0), CommandPath.of(0.02)
+    )
     framed = GravityFrame(controller, observer)
     moving = State(x0.p, x0.R, jnp.array([2.0, 0.0, 0.0]))
     late, now = (SimPlant(model, push, sensors=SensorModel.of(latency=ms)) for ms in (10, 0))

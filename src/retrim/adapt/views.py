@@ -74,7 +74,8 @@ def with_lag(env: Env, found: RateFit | None) -> Env:
     """
     if found is None or not isinstance(env.dynamics, Lagged):
         return env
-    return dataclasses.replace(env, dynamics=Lagged(env.dynamics.base, Command(found.tau[0], found.tau)))
+    response = dataclasses.replace(env.dynamics.response, thrust_lag=found.tau[0], rate_lag=found.tau)
+    return dataclasses.replace(env, dynamics=Lagged(env.dynamics.base, response))
 
 
 def as_it_turns(env: Env, found: RateFit | None) -> Env:

@@ -21,12 +21,11 @@ from ..estimation.l1 import L1Estimator
 from ..estimation.prediction import Prediction
 from ..learn.datt import KNOWN
 from ..tasks.occluded import OccludedKeypoints
-from .tasks import lag_of
+from .command_paths import ACTUATOR_LAG, declared_path, lag_of
 
 if TYPE_CHECKING:
     from .setup import Setup
 
-ACTUATOR_TAU = 0.033  # [s], where a preset declares no lag: what quadrotors of this size have
 INTEGRAL_LIMIT = 6.0  # [m/s^2], as the largest disturbance that the policies' observer answers
 HORIZON = 0.8  # [s], of MPPI
 L1_POLE = -0.2  # [1/s], as flown on hardware with DATT; its size hardly matters while it is small beside 1 / dt
@@ -66,14 +65,15 @@ class Baseline:
 def prediction_of(setup: "Setup") -> Prediction:
     """Return the nominal model of a preset's vehicle."""
     preset, lag = setup.preset, lag_of(setup.preset, setup.vehicle)
-    tau = jnp.array(ACTUATOR_TAU) if lag is None else lag.omega[0]  # of all axes: a baseline hardly yaws
+    tau = jnp.array(ACTUATOR_LAG) if lag is None else lag.omega[0]  # of all axes: a baseline hardly yaws
     return Prediction(tau, preset.dt, preset.plant_delay_ticks)
 
 
 def slowness(setup: "Setup") -> float:
     """Return how many times later a vehicle turns after a command than in the search for settings, at least 1."""
-    delay, lag = setup.preset.plant_delay_ticks * setup.preset.dt, lag_of(setup.preset, setup.vehicle)
-    return 1.0 if lag is None else max(1.0, (delay + float(lag.omega[0])) / (delay + ACTUATOR_TAU))
+    path = declared_path(setup.preset, setup.vehicle)
+    delay, lag = float(path.delay), float(path.response.rate_lag[0])
+    return max(1.0, (delay + lag) / (delay + ACTUATOR_LAG))
 
 
 def _gains(setup: "Setup", s: Settings) -> Gains:

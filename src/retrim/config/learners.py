@@ -26,8 +26,9 @@ from ..physics.vehicle import Vehicle
 from ..tasks.keypoints import Keypoints
 from ..tasks.occluded import OccludedKeypoints
 from ..tasks.task import AbstractTask
+from .command_paths import declared_path, longest_delay, response_of
 from .presets import Preset, Pretrain
-from .tasks import find_task, lag_of
+from .tasks import find_task
 
 OBSERVER_TAU = 0.05  # [s]: half of it is unstable where the plant's delay is 40 ms longer than declared
 WANDER = 4.0  # [m/s^2] in a second
@@ -36,8 +37,8 @@ TILT_LIMIT = 6.0  # [m/s^2], largest disturbance that turns a frame: gravity kee
 
 def nominal_model(preset: Preset, vehicle: Vehicle) -> AbstractDynamics[Any]:
     """Return the point mass of Eq. (1) of the paper, behind the lag of the actuators where one is declared."""
-    model, lag = PointMass(preset.dt), lag_of(preset, vehicle)
-    return model if lag is None else Lagged(model, lag)
+    model, response = PointMass(preset.dt), response_of(preset, vehicle)
+    return model if response is None else Lagged(model, response)
 
 
 @functools.lru_cache(maxsize=32)
@@ -120,15 +121,14 @@ def felt_frame(
     limit = jnp.array(TILT_LIMIT)
     if isinstance(controller, PolicyController) and isinstance(controller.observation, OccludedKeypoints):
         return SeenFrame(controller, limit)
-    lag = lag_of(preset, vehicle)
     observer = DisturbanceObserver(
         PointMass(preset.dt),
         jnp.array(OBSERVER_TAU),
         limit,
         jnp.array(WANDER),
-        None if lag is None else lag.c,
+        declared_path(preset, vehicle),
         (vehicle.command_min, vehicle.command_max),
-        delay_ticks=preset.plant_delay_ticks,
+        longest_delay=longest_delay(preset),
     )
     found = None if known is None else known.turning
     bias = jnp.zeros(3) if found is None else found.bias

@@ -3,12 +3,16 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import jax.numpy as jnp
 import numpy as np
 
 from ..errors import ConfigError
+from ..physics.actuator_response import ActuatorResponse
 from ..physics.bem import BemQuadrotor
 from ..physics.disturbance import Disturbance
 from ..physics.rotors import LinearDragQuadrotor
+from ..physics.second_order import DRAG, SecondOrderQuadrotor
+from ..physics.step_response import step_responses
 from ..physics.vehicle import Vehicle
 from ..plants.bridges.betaflight import BetaflightPlant
 from ..plants.bridges.betaflight_firmware import find_firmware
@@ -94,6 +98,20 @@ def _simple(r: PlantRequest) -> Plant:
     return SimPlant(model, r.disturbance, delay_s=r.delay, sensors=r.sensors, fault=r.fault, seed=r.seed)
 
 
+def _second_order(r: PlantRequest) -> Plant:
+    vehicle = r.vehicle
+    lag = vehicle.rate_lag
+    response = ActuatorResponse.of(
+        vehicle.motor_tau,
+        jnp.array([axis.rise for axis in step_responses(vehicle)]) if lag is None else lag,
+        inverse_damping=0.0 if vehicle.rate_damping is None else 1.0 / vehicle.rate_damping,
+        thrust_gain=1.0 + r.thrust_error,
+    )
+    limits = (vehicle.command_min, vehicle.command_max)
+    model = SecondOrderQuadrotor(response, vehicle.mass, jnp.array(DRAG), limits, r.dt)
+    return SimPlant(model, r.disturbance, delay_s=r.delay, sensors=r.sensors, fault=r.fault, seed=r.seed)
+
+
 def find_plant(name: str) -> tuple[object, str]:
     """Return what is registered under a name, and the address that follows it.
 
@@ -159,6 +177,17 @@ register_plant(
     PlantEntry(
         _simple,
         "rotors with linear drag, at 1 kHz, 20 ms of command delay",
+        has_sensors=True,
+        has_faults=True,
+        has_thrust_error=True,
+        has_delay=True,
+    ),
+)
+register_plant(
+    "second-order",
+    PlantEntry(
+        _second_order,
+        "a point mass behind a rate loop of second order and a thrust lag, at 1 kHz, 20 ms of command delay",
         has_sensors=True,
         has_faults=True,
         has_thrust_error=True,

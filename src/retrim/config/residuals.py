@@ -12,9 +12,9 @@ from ..learn.residuals.linear import LinearModel
 from ..learn.residuals.model import ResidualModel
 from ..learn.residuals.regression import BLOCK, RegressionModel
 from ..physics.vehicle import Vehicle
+from .command_paths import lag_of
 from .presets import Preset
 from .registry import Registry
-from .tasks import lag_of
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ..errors import ConfigError, RetrimError
+from ..physics.command_path import LONGEST_DELAY
 from ..physics.vehicle import Vehicle
 from ..plants.plant import Plant
 from .disturbances import disturbance
@@ -27,13 +28,14 @@ class Scenario:
     """None: that which the policy was trained for, or the plant's own."""
     sensors: str = "ideal"
     thrust_error: float = THRUST_ERROR
-    """By how much more than commanded the rotors give, as a share; bem and simple only."""
+    """By how much more than commanded the rotors give, as a share; simulations of retrim only."""
     reference: str | None = None
     """What a tracking policy follows; None: what it was trained on."""
     delay: float = DELAY
-    """Command delay of the plant [s]; bem and simple only. The policy does not know of it."""
+    """Command delay of the plant [s]; simulations of retrim only. The policy does not know of it."""
     fault: str = NO_FAULT
-    """Fault of the measurements: a name, or a name with a size, as ``velocity-spikes=3``; bem and simple only."""
+    """Fault of the measurements: a name, or a name with a size, as ``velocity-spikes=3``; simulations of retrim only.
+    """
 
     def __post_init__(self) -> None:
         """Raise :class:`ConfigError` for an unknown name, and for a choice that the plant does not have."""
@@ -55,19 +57,25 @@ class Scenario:
             )
         if self.sensors != "ideal" and not entry.has_sensors:
             raise ConfigError(
-                f"plant {self.plant!r} measures its true state; sensors {self.sensors!r} need bem or simple"
+                f"plant {self.plant!r} measures its true state; sensors {self.sensors!r} need bem, simple or "
+                "second-order"
             )
         measurement_fault(self.fault)
         if self.fault != NO_FAULT and not entry.has_faults:
             raise ConfigError(
-                f"plant {self.plant!r} has no faulty measurements; fault {self.fault!r} needs bem or simple"
+                f"plant {self.plant!r} has no faulty measurements; fault {self.fault!r} needs bem, simple or "
+                "second-order"
             )
         if self.thrust_error != THRUST_ERROR and not entry.has_thrust_error:
-            raise ConfigError(f"plant {self.plant!r} has its own thrust map; a thrust error needs bem or simple")
+            raise ConfigError(
+                f"plant {self.plant!r} has its own thrust map; a thrust error needs bem, simple or second-order"
+            )
         if self.delay != DELAY and not entry.has_delay:
-            raise ConfigError(f"plant {self.plant!r} has its own command delay; another one needs bem or simple")
-        if not 0.0 <= self.delay <= 0.2 or abs(1000 * self.delay - round(1000 * self.delay)) > 1e-6:
-            raise ConfigError(f"delay {self.delay} s must be a whole number of milliseconds, 0 to 0.2 s")
+            raise ConfigError(
+                f"plant {self.plant!r} has its own command delay; another one needs bem, simple or second-order"
+            )
+        if not 0.0 <= self.delay <= LONGEST_DELAY:
+            raise ConfigError(f"delay {self.delay} s must be 0 to {LONGEST_DELAY:g} s")
         if not -0.5 <= self.thrust_error <= 0.5:
             raise ConfigError(f"thrust error {self.thrust_error} must be between -0.5 and 0.5")
 

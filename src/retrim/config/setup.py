@@ -35,13 +35,14 @@ from ..tasks.keypoints import Keypoints
 from ..tasks.motions import MOTIONS
 from ..tasks.reference import Reference
 from ..tasks.task import AbstractTask
+from .command_paths import delayed, longest_delay, model_path
 from .fresh import flight_starts, low_rank, untrained
 from .learners import felt_frame, make_learner, nominal_model, pretraining_optimiser
 from .presets import Preset
 from .presets import Track as TrackTable
 from .references import make_reference, make_training_reference
 from .residuals import ResidualRequest, make_residual
-from .tasks import TaskRequest, delayed, find_task, make_task
+from .tasks import TaskRequest, find_task, make_task
 from .vehicles import make_vehicle
 
 Latency = Literal["fixed", "measured"]
@@ -98,7 +99,8 @@ class Setup:
                 flown = make_task(TaskRequest(preset, vehicle, followed))
             nominal = nominal_model(preset, vehicle)
             jumps = jnp.array(preset.jump_cost) if preset.jump_cost else None
-            env = Env(nominal, task, preset.delay_ticks, jump_cost=jumps)
+            path = model_path(preset, vehicle)
+            env = Env(nominal, task, path.delay, jump_cost=jumps, longest_delay=longest_delay(preset))
             model = residual_model or make_residual(ResidualRequest(preset, vehicle))
             learner = make_learner(preset, model, dataclasses.replace(env, task=flown))
         except (TypeError, ValueError) as error:

@@ -8,8 +8,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..errors import ConfigError
-from ..physics.state import Command
-from ..physics.step_response import step_responses
 from ..physics.vehicle import Vehicle
 from ..tasks.hover import AbstractHover, Hover, L2Hover
 from ..tasks.keypoints import Keypoints
@@ -22,13 +20,11 @@ from ..tasks.track import AbstractTrack, L2Track, SharpTrack
 from ..tasks.track import Track as PaperTrack
 from ..tasks.tracking_error import RelativeObs, StateAndErrorObs
 from ..tasks.view import ViewHover
-from .loading import changed
+from .command_paths import lag_of
 from .presets import Preset
 from .presets import Track as TrackTable
 from .presets import Vision as VisionTable
 from .registry import Registry
-from .vehicle_file import VehicleSpec
-from .vehicles import is_published
 
 LEAD = 0.04  # [s]: about as late as commands act, behind a delay and motors
 VISION_REWARDS: dict[str, type[AbstractHover]] = {"paper": Hover, "l2": L2Hover, "view": ViewHover}
@@ -118,39 +114,6 @@ def _hover(request: TaskRequest) -> AbstractTask:
         p.dt,
         p.pretrain.horizon,
     )
-
-
-def lag_of(preset: Preset, vehicle: Vehicle) -> Command | None:
-    """Return the time constants of thrust and rates [s], or None for a model without lag.
-
-    They are the vehicle's where they are known. A published vehicle has those of the preset; the rates of any other one
-    follow as those of its simulated rate loop do, and its thrust as its motors do.
-    """
-    if vehicle.rate_lag is not None:
-        return Command(vehicle.motor_tau, vehicle.rate_lag)
-    if not is_published(preset.vehicle):
-        return Command(vehicle.motor_tau, jnp.array([about.rise for about in step_responses(vehicle)]))
-    tau = preset.actuator_tau
-    return None if tau is None else Command(jnp.array(tau), jnp.full(3, tau))
-
-
-def delayed(preset: Preset) -> Preset:
-    """Return a preset with the command delay of its vehicle, where its file says one, in the model and declared.
-
-    Raises:
-        ConfigError: It is more ticks than a preset may have.
-    """
-    vehicle = preset.vehicle
-    if not isinstance(vehicle, VehicleSpec) or vehicle.command_delay is None:
-        return preset
-    ticks = round(vehicle.command_delay / preset.dt)
-    try:
-        return changed(preset, delay_ticks=ticks, plant_delay_ticks=ticks)
-    except ConfigError as error:
-        raise ConfigError(
-            f"vehicle {vehicle.name!r}: command_delay = {vehicle.command_delay:g} s is {ticks} ticks of "
-            f"dt = {preset.dt:g} s; {error}"
-        ) from error
 
 
 def _vision(request: TaskRequest) -> AbstractTask:

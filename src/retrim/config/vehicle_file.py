@@ -20,6 +20,7 @@ from .validation import read_toml, validated
 INCH = 0.0254  # [m]
 MILLI = (("ms", 1e-3),)
 Rate = Annotated[Positive, AfterValidator(at_most(40.0, "rad/s", ("deg/s", math.pi / 180.0)))]
+Damping = Annotated[float, Field(ge=0.1, le=10.0, strict=True)]
 Lag = Annotated[Positive, AfterValidator(at_most(2.0, "s", *MILLI))]
 
 
@@ -51,6 +52,9 @@ class VehicleSpec:
     """Time constants of the body rates behind their commands: roll, pitch, yaw [s]; those of the simulated rate loop
     by default, which follow from the motors. Policies are trained for them, and for a thrust that follows as the motors
     do."""
+    rate_damping: tuple[Damping, Damping, Damping] | None = None
+    """Damping ratios of the rate loops: roll, pitch, yaw; loops of first order by default. With them, ``rate_lag`` is
+    2 zeta / omega_n."""
     command_delay: Annotated[float, Field(ge=0, strict=True), AfterValidator(at_most(0.2, "s", *MILLI))] | None = None
     """Between a command and its effect [s]; that of the preset by default. Policies are trained for it, in whole ticks,
     and learners pair accelerations with the commands that caused them."""
@@ -165,6 +169,7 @@ class VehicleSpec:
             drag_area=drag,
             propeller=scaled,
             rate_lag=None if self.rate_lag is None else jnp.array(self.rate_lag),
+            rate_damping=None if self.rate_damping is None else jnp.array(self.rate_damping),
             esc=dataclasses.replace(esc, base=esc.base * ratio, linear=esc.linear * ratio, root=esc.root * ratio),
         )
 

@@ -9,11 +9,13 @@ import dataclasses
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..estimation.disturbance_observer import DisturbanceObserver, ObserverState
 from ..estimation.latency import ahead
+from ..physics.command_path import CommandQueue
 from ..physics.dynamics import Hybrid, Residual
 from ..physics.felt_frame import FeltFrame
 from ..physics.state import Command, State
@@ -57,8 +59,10 @@ class GravityFrame(AbstractController[GravityFrameState]):
     def init(self, x: State) -> GravityFrameState:
         """Return the memory at the start of a flight."""
         observed = self.observer.init(x)
-        told = tuple(Command(u.c, u.omega - self._bias(x.p.dtype)) for u in observed.commands)
-        observed = dataclasses.replace(observed, commands=told)
+        hover = observed.commands.newest
+        told = Command(hover.c, hover.omega - self._bias(x.p.dtype))
+        rows = jax.tree.map(lambda leaf, new: jnp.broadcast_to(new, leaf.shape), observed.commands, CommandQueue(told))
+        observed = dataclasses.replace(observed, commands=rows)
         return GravityFrameState(observed, self.inner.init(x), FeltFrame.of(observed.d_hat))
 
     def __call__(self, memory: GravityFrameState, t: Float[Array, ""], x: State) -> tuple[Command, GravityFrameState]:
@@ -66,12 +70,12 @@ class GravityFrame(AbstractController[GravityFrameState]):
         observer, felt = self.observer, jnp.zeros_like(x.p)
         if self.known is not None:
             unsteady = Unsteady(self.known, self.trust_known)
-            felt = unsteady(x, memory.observer.commands[-1])
+            felt = unsteady(x, memory.observer.commands.newest)
             observer = dataclasses.replace(observer, nominal=Hybrid(observer.nominal, unsteady))
         observed = observer(memory.observer, t, x)
         felt = self.trust_estimate.astype(x.p.dtype) * (observed.d_hat + felt) + self.steady.astype(x.p.dtype)
         frame = FeltFrame.of(capped(felt, observer.limit))
-        bias, last = self._bias(x.p.dtype), memory.observer.commands[0]
+        bias, last = self._bias(x.p.dtype), observer.arrival(memory.observer)
         x = ahead(x, Command(last.c, last.omega + bias), frame.d, self.age.astype(x.p.dtype))
         u, inner = self.inner.in_frame(frame)(memory.inner, t, frame.state(x))
         u = frame.world_command(u)

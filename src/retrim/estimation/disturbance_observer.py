@@ -28,7 +28,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..physics import so3
-from ..physics.actuators import is_followed, lagged
+from ..physics.actuators import is_followed
+from ..physics.command_path import LONGEST_DELAY, CommandPath, CommandQueue
 from ..physics.dynamics import AbstractDynamics
 from ..physics.state import Command, State, where
 from .consistency import Consistency
@@ -48,8 +49,8 @@ class ObserverState(eqx.Module):
     """State measured one tick ago."""
     t: Float[Array, ""]
     """When [s]; minus infinity before the first measurement."""
-    commands: tuple[Command, ...]
-    """Commands of the last ticks, oldest first; the oldest acted during the tick that has just ended."""
+    commands: CommandQueue
+    """Commands of the last ticks; the newest was issued for the tick that has just ended."""
     v: Float[Array, "3"]
     """Estimated velocity, world [m/s]."""
     d_hat: Float[Array, "3"]
@@ -73,20 +74,24 @@ class DisturbanceObserver(eqx.Module):
     """Largest norm of the estimate [m/s^2]."""
     wander: Float[Array, ""]
     """Standard deviation per axis of what the disturbance becomes within a second [m/s^2]; infinite: noise is none."""
-    thrust_tau: Float[Array, ""] | None = None
-    """Time constant with which thrust follows its command [s]; None: at once."""
+    path: CommandPath = eqx.field(default_factory=CommandPath.of)
+    """What becomes of a command; rates are measured, so that only its delay and its thrust count."""
     limits: tuple[Command, Command] | None = None
     """Smallest and largest command; None: commands have no limit."""
-    delay_ticks: int = eqx.field(static=True, default=0)
-    """Declared command delay of the plant [ticks]."""
+    longest_delay: float = eqx.field(static=True, default=LONGEST_DELAY)
+    """Longest delay that the memory has room for [s]."""
+
+    def arrival(self, s: ObserverState) -> Command:
+        """Return the command that arrived during the tick that has just ended, in the mean."""
+        return s.commands.arrival(self.path.delay, self.nominal.dt)
 
     def init(self, x: State) -> ObserverState:
         """Return the memory of a vehicle that hovers at ``x`` undisturbed."""
         zero = jnp.zeros_like(x.p)
-        commands = (Command.hover(x.p.dtype),) * (self.delay_ticks + 1)
+        hover = Command.hover(x.p.dtype)
+        commands = CommandQueue.of(hover, self.nominal.dt, longest=self.longest_delay)
         never = jnp.full_like(x.p[0], -jnp.inf)
-        thrust = commands[0].c
-        return ObserverState(x, never, commands, x.v, zero, zero, zero[0], thrust, Consistency.start(x))
+        return ObserverState(x, never, commands, x.v, zero, zero, zero[0], hover.c, Consistency.start(x))
 
     def __call__(self, s: ObserverState, t: Float[Array, ""], x: State) -> ObserverState:
         """Return the memory with the estimate corrected by what was newly measured.
@@ -98,10 +103,8 @@ class DisturbanceObserver(eqx.Module):
             t: Time since the start of the flight [s].
             x: Measured state.
         """
-        nominal, dt, given = self.nominal, self.nominal.dt, s.commands[0]
-        mean, thrust = given.c, given.c
-        if self.thrust_tau is not None:
-            mean, thrust = lagged(s.thrust, given.c, dt, self.thrust_tau.astype(x.p.dtype))
+        nominal, dt = self.nominal, self.nominal.dt
+        mean, thrust = self.path.thrust(s.commands, s.thrust, dt)
         # The vehicle turned as it was measured to turn, whatever rates it was told.
         u = Command(mean, so3.log(so3.mul(s.last.R.T, x.R)) / dt)
         gained = nominal.state(nominal.step(nominal.init(s.last), u, jnp.zeros_like(x.p))).v - s.last.v
@@ -132,16 +135,16 @@ class DisturbanceObserver(eqx.Module):
         held = dataclasses.replace(after, v=v, d_hat=decay * s.d_hat, missed=s.missed, noise=s.noise)
         comparable &= consistency.certain
         if self.limits is not None:
-            comparable &= is_followed(given, self.limits)
+            comparable &= is_followed(self.arrival(s), self.limits)
         return where(comparable, after, held)
 
     def issued(self, s: ObserverState, u: Command) -> ObserverState:
         """Return the memory after the command ``u`` was issued for the tick that begins."""
-        return dataclasses.replace(s, commands=(*s.commands[1:], u))
+        return dataclasses.replace(s, commands=s.commands.push(u))
 
     def accepted(self, s: ObserverState, u: Command) -> ObserverState:
         """Return the memory after the plant accepted ``u`` instead of the command that was issued last."""
-        return dataclasses.replace(s, commands=(*s.commands[:-1], u))
+        return dataclasses.replace(s, commands=s.commands.amend(u))
 
     def _noise(self, s: ObserverState, missed: Float[Array, "3"]) -> Float[Array, ""]:
         """Noise of velocities shows in how much the missed acceleration jumps from tick to tick."""

@@ -54,10 +54,10 @@ class Where:
     wind, gusts, fan, payload, pickup, battery, weak-rotor, with a size, as wind=6 [m/s] or payload=0.2 [kg], several at
     once, as wind+payload=0.1, or module:name."""
     plant: str = "bem"
-    """bem: blade-element rotors; simple: rotors with linear drag; rotorpy, mujoco, crazyflow: independent simulators,
-    each an extra to install; betaflight: its firmware as the rate controller, in real time;
-    mavlink:udp:HOST:PORT, mavlink:serial:DEVICE:BAUD, crazyflie:udp:HOST:PORT, ros:HOST:PORT: a vehicle; or
-    module:name."""
+    """bem: blade-element rotors; simple: rotors with linear drag; second-order: a rate loop of second order without
+    rotors; rotorpy, mujoco, crazyflow: independent simulators, each an extra to install; betaflight: its firmware as
+    the rate controller, in real time; mavlink:udp:HOST:PORT, mavlink:serial:DEVICE:BAUD, crazyflie:udp:HOST:PORT,
+    ros:HOST:PORT: a vehicle; or module:name."""
     reference: str | None = None
     """What a tracking policy follows: circle, figure8, star, module:name or a CSV file of t, x, y, z[, yaw]; what it
     was trained on by default. A closed file repeats as laps, another is flown once; my.csv:laps and my.csv:once insist.
@@ -70,13 +70,13 @@ class Where:
     10 ms late, 1 % of the samples lost), rough (1 mm, 10 mm/s, 3 mrad, 10 ms late, 5 % of the samples lost), or
     module:name."""
     thrust_error: float = THRUST_ERROR
-    """By how much more than commanded the rotors give, as a share (bem and simple)."""
+    """By how much more than commanded the rotors give, as a share (bem, simple, second-order)."""
     delay: float = DELAY
-    """Command delay of the plant [s], in whole milliseconds (bem and simple); the policy does not know of it."""
+    """Command delay of the plant [s] (bem, simple, second-order); the policy does not know of it."""
     fault: str = NO_FAULT
-    """Fault of the measurements, which the policy does not know of (bem and simple): velocity-spikes, rare-spikes,
-    swapped-markers, late, frozen, repeated, scaled-velocity, velocity-bias, attitude-bias, drift, gaps, clock-jumps,
-    with a size if wanted, as late=3, or module:name."""
+    """Fault of the measurements, which the policy does not know of (bem, simple, second-order): velocity-spikes,
+    rare-spikes, swapped-markers, late, frozen, repeated, scaled-velocity, velocity-bias, attitude-bias, drift, gaps,
+    clock-jumps, with a size if wanted, as late=3, or module:name."""
 
     @property
     def is_vehicle(self) -> bool:

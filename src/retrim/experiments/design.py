@@ -120,7 +120,7 @@ def retrained(setup: Setup, policy: Policy, logs: Sequence[Log], key: Key[Array,
     residual = EnsembleResidual.of(setup.flown.home(), setup.vehicle.omega_max, key=k_fit, members=1)
     fitted, errors = _fitted(EnsembleState.of(residual, adam), rows, adam, fit_epochs)
     dynamics = design_dynamics(setup, fitted.residual, choice)
-    env = Env(dynamics, setup.env.task, setup.env.delay_ticks)
+    env = Env(dynamics, setup.env.task, setup.env.delay, longest_delay=setup.env.longest_delay)
     optimiser = _of_policy(adapt.learning_rate, adapt.max_grad_norm or math.inf, epochs)
     state = PolicyState(policy, optimiser.init(policy.params))
     times = list[float]()

@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
+from ..config.command_paths import declared_path
 from ..config.methods import find_method
 from ..config.presets import Preset
-from ..config.tasks import lag_of
 from ..config.vehicles import make_vehicle
 from .crash_cause import likely_cause
 from .flights import Flight, FlightSpec
@@ -239,8 +239,8 @@ def notes(flights: Sequence[Flight], preset: Preset) -> list[str]:
 def _crashes(method: str, crashed: Sequence[Flight], n: int, preset: Preset) -> str:
     """Tell the first crash of a method, with its likely cause."""
     first = min(crashed, key=lambda flight: float(flight.log.t[-1]))
-    lag = lag_of(preset, make_vehicle(preset.vehicle))
-    lateness = preset.plant_delay_ticks * preset.dt + (0.0 if lag is None else float(lag.omega[0]))
+    path = declared_path(preset, make_vehicle(preset.vehicle))
+    lateness = float(path.delay + path.response.rate_lag[0])
     which = f"start {first.spec.start}"
     which = which if len(crashed) == 1 else f"{len(crashed)} of {n} starts, {which}"
     cause = likely_cause(first.log, lateness)

@@ -1,4 +1,4 @@
-"""The environment of training: a model, a task and a command delay as one value."""
+"""The environment of training: a model, a task and a command path as one value."""
 
 import dataclasses
 from typing import Any
@@ -8,6 +8,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from ..physics.actuators import with_response
+from ..physics.command_path import LONGEST_DELAY, CommandPath, check_delay
 from ..physics.dynamics import AbstractDynamics, Hybrid, Residual
 from ..physics.felt_frame import FeltFrame
 from ..physics.state import Command, State
@@ -20,24 +22,36 @@ class Env(eqx.Module):
     dynamics: AbstractDynamics[Any]
     """Model of the vehicle; it ticks at the task's rate."""
     task: AbstractTask
-    delay_ticks: int = eqx.field(static=True, default=0)
-    """A command issued at a tick acts this many ticks later."""
+    delay: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros(()))
+    """Transport delay of commands [s]. Another one is not another program."""
     felt: Residual | None = None
     """The disturbance that a controller around the policy answers by the frame of the gravity that is felt, given the
     state and the last command, world [m/s^2]; None if the policy sees the world as it is."""
     jump_cost: Float[Array, ""] | None = None
     """Cost of the squared change of a policy's command from tick to tick, [c, omega] in m/s^2 and rad/s; None: none."""
+    longest_delay: float = eqx.field(static=True, default=LONGEST_DELAY)
+    """Longest delay that a roll-out has room for [s]."""
 
     def __check_init__(self) -> None:
-        """Raise ``ValueError`` for a negative delay, and for a model and a task that tick at different rates."""
-        if self.delay_ticks < 0:
-            raise ValueError(f"Env.delay_ticks = {self.delay_ticks} must not be negative")
+        """Raise ``ValueError`` for an impossible delay, and for a model and a task that tick at different rates.
+
+        A delay that is traced, or one of many, is not checked.
+        """
+        check_delay(self.delay, self.longest_delay, "Env")
         if self.dynamics.dt != self.task.dt:
             raise ValueError(f"Env: the model ticks every {self.dynamics.dt} s, the task every {self.task.dt} s")
 
     def with_residual(self, residual: Residual) -> "Env":
         """Return the same environment with ``residual`` added to its model, without gradients through it."""
         return dataclasses.replace(self, dynamics=Hybrid(self.dynamics, residual))
+
+    def with_path(self, path: CommandPath) -> "Env":
+        """Return the same environment for a vehicle with another command path.
+
+        Args:
+            path: Its delay and the response of its actuators.
+        """
+        return dataclasses.replace(self, dynamics=with_response(self.dynamics, path.response), delay=path.delay)
 
     def frame(self, x: State, last: Command) -> FeltFrame | None:
         """Return the frame in which the policy sees the world, without gradients through it; None for the world's own.

@@ -8,6 +8,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from ..control.policy import Inputs, Perturbations, Policy
+from ..physics.command_path import CommandQueue
 from ..physics.felt_frame import FeltFrame
 from ..physics.state import Command, State, where
 from ..tasks.task import AbstractTask, Start
@@ -20,7 +21,7 @@ class Trajectory(eqx.Module):
     x: State
     """State at the start of each tick."""
     u: Command
-    """Command acting during it."""
+    """Command acting during it, in the mean."""
     reward: Float[Array, " horizon"]
     """r(x_t, u_t). After termination: the worst reward of the roll-out so far, so that terminating never pays."""
     terminated: Bool[Array, " horizon"]
@@ -30,8 +31,8 @@ class Trajectory(eqx.Module):
 def rollout(env: Env, policy: Policy, start: Start) -> Trajectory:
     """Fly ``env.task.horizon`` ticks from ``start``.
 
-    A command issued at a tick acts ``env.delay_ticks`` ticks later; until the first one does, the vehicle is told to
-    hover.
+    A command begins to act ``env.delay`` after it was issued; until the first one does, the vehicle is told to hover.
+    During a tick in which the acting command changes, their mean acts.
 
     Args:
         env: Model, task and delay.
@@ -65,6 +66,8 @@ def _scan(env: Env, policy: Policy, start: Start, perturbations: Perturbations |
     dynamics, task = env.dynamics, env.task
     calm = jnp.zeros_like(start.x.p)
     hover = policy.u_hover
+    commands = CommandQueue.of(hover, task.dt, longest=env.longest_delay)
+    shares = commands.weights(env.delay, task.dt)  # the same in every tick
 
     def framed(x: State, issued: Command) -> tuple[FeltFrame | None, AbstractTask, State]:
         """The frame that is flown in, and task and state in it."""
@@ -72,7 +75,7 @@ def _scan(env: Env, policy: Policy, start: Start, perturbations: Perturbations |
         return (None, task, x) if frame is None else (frame, task.in_frame(frame), frame.state(x))
 
     def tick(carry: Any, xs: Any) -> Any:
-        s, memory, last, issued, pending, alive, worst = carry
+        s, memory, last, issued, commands, alive, worst = carry
         k, perturbation = xs
         t = start.t + k * task.dt
         x = dynamics.state(s)
@@ -81,8 +84,8 @@ def _scan(env: Env, policy: Policy, start: Start, perturbations: Perturbations |
         before = last
         last, inputs = (policy(o), ()) if perturbation is None else policy.perturbed(o, perturbation)
         issued = last if frame is None else frame.world_command(last)
-        queue = (*pending, issued)
-        acting, waiting = queue[0], queue[1:]
+        commands = commands.push(issued)
+        acting = commands.combine(shares)
         reward = seen.reward(t, x_seen, acting if frame is None else frame.command(acting))
         reward = jnp.where(alive, reward - env.cost_of_jump(before, last), worst)
         after = dynamics.step(s, acting, calm)
@@ -91,7 +94,7 @@ def _scan(env: Env, policy: Policy, start: Start, perturbations: Perturbations |
         # gradients.
         s = where(survived, after, lax.stop_gradient(s))
         worst = jnp.minimum(worst, lax.stop_gradient(reward))
-        return (s, memory, last, issued, waiting, survived, worst), ((x, acting, reward, ~alive), inputs)
+        return (s, memory, last, issued, commands, survived, worst), ((x, acting, reward, ~alive), inputs)
 
     _, seen, x_seen = framed(start.x, hover)  # what is remembered of before the start is of the same frame
     carry = (
@@ -99,7 +102,7 @@ def _scan(env: Env, policy: Policy, start: Start, perturbations: Perturbations |
         seen.observation.init(x_seen),
         hover,
         hover,
-        (hover,) * env.delay_ticks,
+        commands,
         jnp.array(True),
         jnp.zeros_like(start.t),
     )

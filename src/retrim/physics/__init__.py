@@ -1,8 +1,13 @@
 """Physics: pure, differentiable, unbatched; no networks, no input or output, keys only at construction."""
 
+from .actuator_response import ActuatorResponse as ActuatorResponse
+from .actuator_response import ActuatorState as ActuatorState
 from .actuators import Lagged as Lagged
 from .bem import BemQuadrotor as BemQuadrotor
 from .betaflight import Betaflight as Betaflight
+from .command_path import CommandPath as CommandPath
+from .command_path import CommandQueue as CommandQueue
+from .command_path import PathState as PathState
 from .disturbance import Constant as Constant
 from .disturbance import Disturbance as Disturbance
 from .disturbance import Push as Push
@@ -23,6 +28,7 @@ from .propeller import Propeller as Propeller
 from .propeller import five_inch as five_inch
 from .propeller import three_inch as three_inch
 from .rotors import LinearDragQuadrotor as LinearDragQuadrotor
+from .second_order import SecondOrderQuadrotor as SecondOrderQuadrotor
 from .state import STANDARD_GRAVITY as STANDARD_GRAVITY
 from .state import Command as Command
 from .state import State as State

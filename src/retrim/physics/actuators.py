@@ -1,5 +1,6 @@
-"""First-order actuator lag for any model. Without it, a steep reward yields gains that slow motors cannot follow."""
+"""Actuators in front of any model. Without them, a steep reward yields gains that slow motors cannot follow."""
 
+import dataclasses
 from typing import Any, Generic, TypeVar
 
 import equinox as eqx
@@ -7,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from .actuator_response import ActuatorResponse, ActuatorState
 from .dynamics import AbstractDynamics, AbstractWrapper
 from .state import Command, State
 
@@ -17,10 +19,10 @@ U = TypeVar("U")
 
 
 class LagState(eqx.Module, Generic[X]):
-    """State of the model, and the command that has arrived at the actuators."""
+    """State of the model, and of the actuators in front of it."""
 
     inner: X
-    acting: Command
+    actuators: ActuatorState
 
 
 def lagged(acting: U, u: U, dt: float, tau: Float[Array, ""] | Command) -> tuple[U, U]:
@@ -72,11 +74,10 @@ class RateBiased(AbstractWrapper[X]):
 
 
 class Lagged(AbstractDynamics[LagState[X]]):
-    """Each command reaches the model through a first-order lag."""
+    """A model behind the response of actuators and rate loop."""
 
     base: AbstractDynamics[X]
-    tau: Float[Array, ""] | Command
-    """Time constant [s], of thrust and rates alike, or of each."""
+    response: ActuatorResponse
 
     @property
     def dt(self) -> float:
@@ -85,16 +86,13 @@ class Lagged(AbstractDynamics[LagState[X]]):
 
     @property
     def settling_ticks(self) -> Float[Array, ""]:
-        """Three time constants, on top of the base model's settling time [ticks].
-
-        They are those of what moves the vehicle: a turn about the thrust axis does not, and yaw may take a second.
-        """
-        tau = jnp.maximum(self.tau.c, jnp.max(self.tau.omega[:2])) if isinstance(self.tau, Command) else self.tau
-        return jnp.ceil(3.0 * tau / self.dt - 0.01) + self.base.settling_ticks  # whole ticks are, to rounding
+        """Settling time of the response, on top of that of the base model [ticks]."""
+        # Ticks that are whole but for rounding are whole.
+        return jnp.ceil(self.response.settling_time / self.dt - 0.01) + self.base.settling_ticks
 
     def init(self, x: State) -> LagState[X]:
         """Lift to the base model's state, with the actuators at hover."""
-        return LagState(self.base.init(x), Command.hover(x.p.dtype))
+        return LagState(self.base.init(x), ActuatorState.at(Command.hover(x.p.dtype)))
 
     def state(self, s: LagState[X]) -> State:
         """Return the vehicle's state."""
@@ -102,9 +100,24 @@ class Lagged(AbstractDynamics[LagState[X]]):
 
     def with_state(self, s: LagState[X], x: State) -> LagState[X]:
         """Replace (p, R, v); hidden state stays."""
-        return LagState(self.base.with_state(s.inner, x), s.acting)
+        return LagState(self.base.with_state(s.inner, x), s.actuators)
 
     def step(self, s: LagState[X], u: Command, a_ext: Float[Array, "3"]) -> LagState[X]:
-        """Advance one tick under the mean of the lagged command over it."""
-        mean, end = lagged(s.acting, u, self.dt, self.tau)
-        return LagState(self.base.step(s.inner, mean, a_ext), end)
+        """Advance one tick under the mean of what acts over it."""
+        away, actuators = self.response(s.actuators, u, self.dt)
+        mean = jax.tree.map(lambda target, each: target + each / self.dt, self.response.target(u), away)
+        return LagState(self.base.step(s.inner, mean, a_ext), actuators)
+
+
+def with_response(model: AbstractDynamics[Any], response: ActuatorResponse) -> AbstractDynamics[Any]:
+    """Return a model whose actuators respond in another way; one without actuators is put behind them.
+
+    Args:
+        model: A model, or wrappers around one.
+        response: Of thrust and body rates.
+    """
+    if isinstance(model, Lagged):
+        return Lagged(model.base, response)
+    if isinstance(model, AbstractWrapper):
+        return dataclasses.replace(model, base=with_response(model.base, response))
+    return Lagged(model, response)

@@ -32,6 +32,11 @@ class AbstractSubstepDynamics(AbstractDynamics[X]):
         """Return body rates and rotor speeds, if the model has them."""
         return None
 
+    def body_rates(self, s: X) -> Float[Array, "3"] | None:
+        """Return the body rates [rad/s], if the model has them."""
+        rotors = self.rotor_state(s)
+        return None if rotors is None else rotors.omega
+
     @abc.abstractmethod
     def substep(self, s: X, u: Command, effects: ExternalEffects) -> X:
         """Advance one millisecond under the command ``u``."""

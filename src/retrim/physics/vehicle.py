@@ -75,6 +75,8 @@ class Vehicle(eqx.Module):
     rate_lag: Float[Array, "3"] | None = None
     """Time constants of the body rates behind their commands, if they are known [s]. Models of training have them; a
     plant's follow from motors and rate loop."""
+    rate_damping: Float[Array, "3"] | None = None
+    """Damping ratios of the rate loops; None: they are of first order."""
 
     def __check_init__(self) -> None:
         """Raise ``ValueError``, naming the field, where no such vehicle can exist; traced values are not checked."""

@@ -1,6 +1,7 @@
 """The simulated plant: a model at 1 kHz with command delay, external effects and sensors."""
 
 import dataclasses
+import math
 from typing import Any
 
 import equinox as eqx
@@ -11,6 +12,7 @@ from jax import lax, random
 from jaxtyping import Array, ArrayLike, Float, Int, Key
 
 from ..errors import PlantError
+from ..physics.command_path import LONGEST_DELAY, CommandQueue, check_delay
 from ..physics.disturbance import Disturbance
 from ..physics.effects import ExternalEffects
 from ..physics.state import Command, State
@@ -36,8 +38,8 @@ class SimState(eqx.Module):
 
     model: Any
     """The model's own state."""
-    queue: Command
-    """Commands issued, oldest first; those that the delay still holds back, and the one acting."""
+    queue: CommandQueue
+    """Commands issued, those that have acted, too."""
     samples: State
     """Samples of the state, oldest first: the one that has arrived, and those that the latency still holds back."""
     a: Float[Array, "3"]
@@ -57,17 +59,16 @@ class Simulation(eqx.Module):
     """None: every measurement is exact."""
     key: Key[Array, ""]
     """Seed of noise and dropouts, which follow from it and the tick, so that a flight repeats."""
-    delay_s: float = eqx.field(static=True, default=0.02)
-    """Command delay [s], a whole number of milliseconds."""
+    delay: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(0.02))
+    """Transport delay of commands [s]. Another one is not another program."""
     fault: AbstractMeasurementFault | None = None
     """Fault of the measurements."""
+    longest_delay: float = eqx.field(static=True, default=LONGEST_DELAY)
+    """Longest delay that the queue of commands has room for [s]."""
 
     def __check_init__(self) -> None:
-        """Raise ``ValueError`` if a time is not a whole number of steps or samples."""
-        if self.delay_s < 0 or abs(self.delay_s / SUBSTEP - round(self.delay_s / SUBSTEP)) > 1e-6:
-            raise ValueError(
-                f"SimPlant: delay_s = {self.delay_s} s must be a whole, non-negative number of milliseconds"
-            )
+        """Raise ``ValueError`` for an impossible delay, and if a tick is not a whole number of samples."""
+        check_delay(self.delay, self.longest_delay, "Simulation")
         if self.sensors is not None and round(self.model.dt / SUBSTEP) % self.sensors.period:
             raise ValueError(
                 f"SimPlant: a tick of {self.model.dt} s is no multiple of the {self.sensors.period} ms of SensorModel"
@@ -84,8 +85,7 @@ class Simulation(eqx.Module):
 
     def launch(self, x0: State) -> SimState:
         """Return the state of a plant that hovers at ``x0``, with hover commands under way and one sample of ``x0``."""
-        slots = -(-round(self.delay_s / SUBSTEP) // round(self.model.dt / SUBSTEP)) + 1
-        queue = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (slots, *leaf.shape)), Command.hover(x0.p.dtype))
+        queue = CommandQueue.of(Command.hover(x0.p.dtype), self.model.dt, longest=self.longest_delay)
         held = 1 if self.sensors is None else self.sensors.held
         sample = x0 if self.sensors is None else self.sensors.noisy(x0, random.fold_in(self.key, FIRST_SAMPLE))
         samples = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (held, *leaf.shape)), sample)
@@ -96,18 +96,16 @@ class Simulation(eqx.Module):
         return SimState(self.model.init(x0), queue, samples, jnp.zeros_like(x0.p), reports)
 
     def advance(self, s: SimState, u: Command, tick: Int[ArrayLike, ""]) -> SimState:
-        """Return the state one control tick later, in steps of 1 ms; ``u`` acts :attr:`delay_s` after the tick began.
+        """Return the state one control tick later, in steps of 1 ms; ``u`` acts :attr:`delay` after the tick began.
+
+        In the millisecond in which the acting command changes, the mean of the two acts.
 
         Args:
             s: State at the start of the tick.
             u: Command, within the vehicle's limits.
             tick: Number of the tick since the start of the flight.
         """
-        per_tick, late = round(self.model.dt / SUBSTEP), round(self.delay_s / SUBSTEP)
-        queue = jax.tree.map(lambda old, new: jnp.concatenate([old[1:], new[None]]), s.queue, u)
-        slots = queue.c.shape[0]
-        # In the i-th millisecond, the newest command whose delay has passed is this many ticks old:
-        ages = np.array([-(-max(0, late - i) // per_tick) for i in range(per_tick)])
+        per_tick, queue = round(self.model.dt / SUBSTEP), s.queue.push(u)
 
         def millisecond(inner: Any, xs: tuple[Float[Array, ""], Command]) -> tuple[Any, State]:
             t, acting = xs
@@ -115,7 +113,7 @@ class Simulation(eqx.Module):
             return after, self.model.state(after)
 
         times = self.time(tick, s.a.dtype) + SUBSTEP * jnp.arange(per_tick, dtype=s.a.dtype)
-        acting = jax.tree.map(lambda leaf: leaf[slots - 1 - ages], queue)
+        acting = queue.substeps(self.delay, self.model.dt, per_tick)
         inner, path = lax.scan(millisecond, s.model, (times, acting))
         if (sensors := self.sensors) is None:
             samples = jax.tree.map(lambda leaf: leaf[-1:], path)
@@ -149,12 +147,12 @@ class Simulation(eqx.Module):
             s: State at the end of a tick.
             tick: Number of ticks since the start of the flight.
         """
-        rotors = self.model.rotor_state(s.model)
-        if rotors is None or self.sensors is None:
-            return None if rotors is None else (rotors.omega, s.a)
+        rates = self.model.body_rates(s.model)
+        if rates is None or self.sensors is None:
+            return None if rates is None else (rates, s.a)
         k_gyro, k_accelerometer = random.split(random.fold_in(random.fold_in(self.key, tick), INERTIAL))
         gyro = self.sensors.gyro * random.normal(k_gyro, (3,), s.a.dtype)
-        return rotors.omega + gyro, s.a + self.sensors.accelerometer * random.normal(k_accelerometer, (3,), s.a.dtype)
+        return rates + gyro, s.a + self.sensors.accelerometer * random.normal(k_accelerometer, (3,), s.a.dtype)
 
     def true(self, s: SimState) -> State:
         """Return the state of the vehicle."""
@@ -193,15 +191,20 @@ class SimPlant(Plant):
         Args:
             model: The vehicle.
             disturbance: External effects as a function of time since the reset and state.
-            delay_s: Command delay [s], a whole number of milliseconds.
+            delay_s: Transport delay of commands [s].
             sensors: None: every measurement is exact.
             fault: Fault of the measurements; None for none.
             seed: Noise and dropouts of the sensors follow from it and the tick, so that a flight repeats.
 
         Raises:
-            ValueError: The delay is no whole number of milliseconds, or a tick is no whole number of sensor periods.
+            ValueError: The delay is negative, or a tick is no whole number of sensor periods.
         """
-        self.simulation = Simulation(model, disturbance, sensors, random.key(seed), delay_s, fault)
+        if not 0.0 <= delay_s < math.inf:
+            raise ValueError(f"SimPlant: delay_s = {delay_s} s must be a finite, non-negative number of seconds")
+        longest = max(LONGEST_DELAY, delay_s)
+        self.simulation = Simulation(
+            model, disturbance, sensors, random.key(seed), jnp.array(float(delay_s)), fault, longest
+        )
         self.dt = model.dt
         limits = model.command_limits
         self._limits = None if limits is None else (as_numpy(limits[0]), as_numpy(limits[1]))
@@ -238,12 +241,12 @@ class SimPlant(Plant):
         simulation, state = self.simulation, self._state
         t = self._ticks * self.dt + (0.0 if simulation.fault is None else simulation.fault.clock_error(self._ticks))
         truth, rotors = simulation.true(state), simulation.model.rotor_state(state.model)
-        speeds = None if rotors is None else rotors.motors
+        rates, speeds = simulation.model.body_rates(state.model), None if rotors is None else rotors.motors
         if simulation.sensors is None:
             x = simulation.measured(state)
-            return Measurement(t, x, None if rotors is None else rotors.omega, state.a, speeds, truth=truth)
+            return Measurement(t, x, rates, state.a, speeds, truth=truth)
         omega, a = (
-            (None, state.a) if rotors is None else _inertial(simulation.undisturbed(), state, np.int32(self._ticks))
+            (None, state.a) if rates is None else _inertial(simulation.undisturbed(), state, np.int32(self._ticks))
         )
         return Measurement(t, simulation.measured(state), omega, a, speeds, age=simulation.age, truth=truth)
 

@@ -56,6 +56,8 @@ def vehicle_toml(found: Identified, setup: Setup, log: str) -> str:
         lines.append(f"rate_lag = {_row(lags)}  # [s], identified: {said}")
     elif known is not None:
         lines.append(f"rate_lag = {_row(known)}  # [s]")
+        if base.rate_damping is not None:  # an identified lag is that of a loop of first order
+            lines.append(f"rate_damping = {_row(base.rate_damping.tolist())}")
     if (delay := found.delay) is not None:
         said = delay.text("ms", 1000.0)
         lines.append(f"command_delay = {min(max(delay.value, 0.0), MOST):.4g}  # [s], identified: {said}")

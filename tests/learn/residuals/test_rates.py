@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from jax import lax, random
 
-from helpers import random_state, replaced, residual_targets
+from helpers import first_order, random_state, replaced, residual_targets
 from retrim.learn import Window
 from retrim.learn.residuals import RateModel
 from retrim.physics import Command, Lagged, PointMass, so3
@@ -22,7 +22,7 @@ ENDLESS = replaced(MODEL, memory=jnp.array(1e9))
 def window_of(key, tau, bias, noise=0.0, n=100):
     """A flight under random commands of a vehicle that turns late and too fast, measured with noise [rad]."""
     k_x, k_c, k_w, k_noise = random.split(key, 4)
-    model = Lagged(RateBiased(PointMass(DT), bias), tau)
+    model = Lagged(RateBiased(PointMass(DT), bias), first_order(tau))
     c = 9.81 + random.normal(k_c, (n,))
     u = jax.vmap(Command)(c, jnp.repeat(random.normal(k_w, (n // 4, 3)), 4, axis=0))
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helpers import random_field_flight, replaced, residual_targets
+from helpers import first_order, random_field_flight, replaced, residual_targets
 from retrim.learn import Window
 from retrim.physics import Command, Lagged, PointMass, State
 
@@ -92,7 +92,7 @@ def test_rows_wait_until_the_lag_has_settled(tau, filling, key):
     """The first ceil(3 tau / dt) valid rows: until then the lag still remembers the hover that it assumed."""
     window = random_field_flight(linear_drag, key, n=30, delay_ticks=1)
     window = replaced(window, valid=jnp.arange(30) >= filling)
-    settled = residual_targets(window, Lagged(PointMass(DT), jnp.array(tau)), delay_ticks=1).valid
+    settled = residual_targets(window, Lagged(PointMass(DT), first_order(tau)), delay_ticks=1).valid
     plain = residual_targets(window, PointMass(DT), delay_ticks=1).valid
     assert np.argmax(plain) == filling  # without a lag every valid row counts
     assert np.sum(plain) == 28 - filling

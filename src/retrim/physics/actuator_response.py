@@ -1,0 +1,164 @@
+"""How thrust and body rates follow the commands that arrive.
+
+Thrust follows through a gain and a first-order lag, and each body rate through a gain and a loop of second order,
+
+    tau_c c' + c = k_c c_cmd,    (tau kappa / 2)^2 w'' + tau w' + w = k w_cmd,
+
+with tau = 2 zeta / omega_n and kappa = 1 / zeta. For kappa = 0 the loop is of first order with the time constant tau.
+All values are arrays, so that another lag or damping is never another program.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .state import Command
+
+FASTEST = 1e-6  # [s], shortest time constant of an exponential; below it, a loop has arrived after any step
+STIFFEST = 1e-6  # least kappa of the fast mode of a loop, which has decayed after any step
+NEAR_CRITICAL = 0.25  # of the square of the angle, below which its functions are series
+SERIES = 7  # terms: double precision up to NEAR_CRITICAL
+
+
+class ActuatorState(eqx.Module):
+    """What actuators and rate loop have made of the commands so far."""
+
+    command: Command
+    """Thrust [m/s^2] and body rates [rad/s] that act."""
+    slope: Float[Array, "3"]
+    """Change of the body rates within their time constant, tau w' [rad/s]."""
+
+    @classmethod
+    def at(cls, u: Command) -> "ActuatorState":
+        """Return the state at rest at a command."""
+        return cls(u, jnp.zeros_like(u.omega))
+
+
+class ActuatorResponse(eqx.Module):
+    """How thrust and body rates follow the commands that arrive."""
+
+    thrust_gain: Float[Array, ""]
+    """Thrust over commanded thrust."""
+    thrust_lag: Float[Array, ""]
+    """Time constant of the thrust [s]."""
+    rate_gain: Float[Array, "3"]
+    """Body rates over commanded ones: roll, pitch, yaw."""
+    rate_lag: Float[Array, "3"]
+    """Time constant 2 zeta / omega_n of each body rate [s]."""
+    inverse_damping: Float[Array, "3"]
+    """1 / zeta of each rate loop; zero is a loop of first order."""
+
+    @classmethod
+    def of(
+        cls,
+        thrust_lag: float | Float[Array, ""] = 0.0,
+        rate_lag: float | Float[Array, "*axes"] = 0.0,
+        *,
+        inverse_damping: float | Float[Array, "*axes"] = 0.0,
+        thrust_gain: float | Float[Array, ""] = 1.0,
+        rate_gain: float | Float[Array, "*axes"] = 1.0,
+    ) -> "ActuatorResponse":
+        """Build a response; what is given once holds for all axes.
+
+        Args:
+            thrust_lag: Time constant of the thrust [s].
+            rate_lag: Time constant 2 zeta / omega_n of roll, pitch and yaw [s].
+            inverse_damping: 1 / zeta of each rate loop; zero is a loop of first order.
+            thrust_gain: Thrust over commanded thrust.
+            rate_gain: Body rates over commanded ones.
+        """
+        axes = [jnp.broadcast_to(strong_array(each), (3,)) for each in (rate_gain, rate_lag, inverse_damping)]
+        return cls(strong_array(thrust_gain), strong_array(thrust_lag), *axes)
+
+    @property
+    def settling_time(self) -> Float[Array, ""]:
+        """Three time constants of what moves the vehicle [s].
+
+        A turn about the thrust axis does not move it, and yaw may take a second. A loop that rings settles with its
+        envelope.
+        """
+        envelope = self.rate_lag * jnp.maximum(1.0, 0.5 * self.inverse_damping**2)
+        return 3.0 * jnp.maximum(self.thrust_lag, jnp.max(envelope[:2]))
+
+    def target(self, u: Command) -> Command:
+        """Return what thrust and body rates become under a command that stays."""
+        return Command(self.thrust_gain.astype(u.c.dtype) * u.c, self.rate_gain.astype(u.omega.dtype) * u.omega)
+
+    def __call__(self, s: ActuatorState, u: Command, time: float | Float[Array, ""]) -> tuple[Command, ActuatorState]:
+        """Advance under a constant command; exact, and differentiable in everything.
+
+        Args:
+            s: State at the beginning.
+            u: Command that arrives, held.
+            time: Duration [s]; zero is allowed.
+
+        Returns:
+            How far thrust and body rates were from :meth:`target`, integrated over the duration [m/s, rad], and the
+            state at its end.
+        """
+        dtype, target = u.c.dtype, self.target(u)
+        h = jnp.asarray(time, dtype)
+        thrust, c = self.thrust(s.command.c, target.c, h)
+        # The integral follows from the equation of the loop, which spares another exponential.
+        rate_lag, kappa = self.rate_lag.astype(dtype), self.inverse_damping.astype(dtype)
+        error, quarter = s.command.omega - target.omega, 0.25 * kappa**2
+        mean, half = _modes(h / jnp.maximum(rate_lag, FASTEST), kappa)
+        swing = s.slope * quarter * half
+        slope = s.slope * (mean - 0.5 * half) - error * half
+        turn = rate_lag * (error * (1.0 - mean - 0.5 * half) - swing - quarter * (slope - s.slope))
+        omega = target.omega + error * (mean + 0.5 * half) + swing
+        return Command(thrust, turn), ActuatorState(Command(c, omega), slope)
+
+    def thrust(
+        self, c: Float[Array, ""], target: Float[Array, ""], time: float | Float[Array, ""]
+    ) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """Advance the thrust alone.
+
+        Args:
+            c: Thrust at the beginning [m/s^2].
+            target: Thrust that it tends to [m/s^2].
+            time: Duration [s].
+
+        Returns:
+            Integral of thrust minus target [m/s], and the thrust at the end [m/s^2].
+        """
+        lag, error = self.thrust_lag.astype(c.dtype), c - target
+        decay = jnp.exp(-jnp.asarray(time, c.dtype) / jnp.maximum(lag, FASTEST))
+        return lag * error * (1.0 - decay), target + error * decay
+
+
+def strong_array(value: float | Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """Return an array of strong type: one of weak type would be another program."""
+    return jnp.asarray(value, dtype=float)
+
+
+def _modes(x: Float[Array, "3"], kappa: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+    """Mean of the loop's two modes, and their difference over rho = sqrt(1 - kappa^2), smooth through rho = 0.
+
+    Args:
+        x: Time over the time constant.
+        kappa: 1 / zeta.
+
+    Returns:
+        exp(-b) cosh(b rho) and 2 exp(-b) sinh(b rho) / rho, with b = 2 x / kappa^2.
+    """
+    b = 2.0 * x / jnp.maximum(kappa, STIFFEST) ** 2
+    square = b**2 * (1.0 - kappa**2)
+    near = jnp.abs(square) < NEAR_CRITICAL
+    slow, quick = ~near & (kappa < 1.0), ~near & (kappa >= 1.0)
+    # Each branch is evaluated at harmless numbers where another one holds, or its gradient would not be finite.
+    k = jnp.where(slow, kappa, 0.5)
+    rho = jnp.sqrt(1.0 - k**2)
+    late = jnp.exp(-2.0 * x / (1.0 + rho))
+    early = jnp.exp(-2.0 * x * (1.0 + rho) / jnp.maximum(k, STIFFEST) ** 2)
+    over = (0.5 * (late + early), (late - early) / rho)
+    nu = jnp.sqrt(jnp.where(quick, kappa, 2.0) ** 2 - 1.0)
+    envelope, angle = jnp.exp(-jnp.where(slow, 1.0, b)), jnp.where(quick, b, 1.0) * nu
+    under = (envelope * jnp.cos(angle), 2.0 * envelope * jnp.sin(angle) / nu)
+    w = jnp.where(near, square, 0.0)
+    even, odd = jnp.ones_like(w), jnp.ones_like(w)
+    for n in range(SERIES, 0, -1):
+        even, odd = 1.0 + even * w / (2 * n * (2 * n - 1)), 1.0 + odd * w / (2 * n * (2 * n + 1))
+    close = (envelope * even, 2.0 * jnp.where(near, b, 1.0) * envelope * odd)
+    mean, half = (jnp.where(near, n, jnp.where(slow, o, u)) for n, o, u in zip(close, over, under, strict=True))
+    return mean, half

@@ -1,0 +1,205 @@
+"""The command path of a vehicle: what becomes of a command between the controller and the motion.
+
+A command acts after a transport delay, and thrust and body rates then follow it as
+:class:`~retrim.physics.actuator_response.ActuatorResponse` describes. Commands wait in a queue of fixed length, so that
+another delay is never another program.
+"""
+
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from .actuator_response import ActuatorResponse, ActuatorState, strong_array
+from .state import Command
+
+LONGEST_DELAY = 0.2  # [s], that a queue holds unless it is made for a longer one
+ROUNDING = 1e-4  # steps: a delay this close to a whole number of them is one
+
+
+class CommandQueue(eqx.Module):
+    """The commands of the last ticks, in a queue of fixed length."""
+
+    commands: Command
+    """Oldest first (leading axis); each was held for a tick."""
+
+    @classmethod
+    def of(cls, u: Command, dt: float, *, longest: float = LONGEST_DELAY) -> "CommandQueue":
+        """Return the queue of a controller that has always commanded ``u``.
+
+        Args:
+            u: Command.
+            dt: Control tick [s].
+            longest: Longest delay that the queue can answer for [s].
+        """
+        n = queue_length(dt, longest)
+        return cls(jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n, *leaf.shape)), u))
+
+    def push(self, u: Command) -> "CommandQueue":
+        """Return the queue after the command ``u`` was issued for the tick that begins."""
+        rows = jax.tree.map(lambda old, new: jnp.concatenate([old[1:], new[None]]), self.commands, u)
+        return CommandQueue(rows)
+
+    @property
+    def newest(self) -> Command:
+        """Command that was issued last."""
+        return jax.tree.map(lambda leaf: leaf[-1], self.commands)  # type: ignore[no-any-return]
+
+    def amend(self, u: Command) -> "CommandQueue":
+        """Return the queue where ``u`` takes the place of the command that was issued last."""
+        rows = jax.tree.map(lambda old, new: jnp.concatenate([old[:-1], new[None]]), self.commands, u)
+        return CommandQueue(rows)
+
+    def arrival(self, delay: Float[Array, ""], dt: float) -> Command:
+        """Return the mean of what arrives during the tick that begins: a mean of two neighbours in the queue.
+
+        Args:
+            delay: Transport delay [s], at most the longest that the queue was made for.
+            dt: Control tick [s].
+        """
+        return self.combine(self.weights(delay, dt))
+
+    def pieces(self, delay: Float[Array, ""], dt: float) -> tuple[Command, Command, Float[Array, ""]]:
+        """Return the two commands that arrive during the tick that begins, and the time at which they change [s].
+
+        Args:
+            delay: Transport delay [s], at most the longest that the queue was made for.
+            dt: Control tick [s].
+        """
+        ticks = self._age(delay, dt)
+        n = lax.stop_gradient(jnp.floor(ticks))
+        after, before = (self.combine(self._hat(age)) for age in (n, n + 1.0))
+        return before, after, (ticks - n) * dt
+
+    def substeps(self, delay: Float[Array, ""], dt: float, n: int) -> Command:
+        """Return the mean of what arrives in each of ``n`` equal parts of the tick that begins (leading axis).
+
+        Args:
+            delay: Transport delay [s], at most the longest that the queue was made for.
+            dt: Control tick [s].
+            n: Number of parts.
+        """
+        rows = self.commands.c.shape[0]
+        late = whole_steps(n * self._age(delay, dt), 1.0)
+        begin = jnp.arange(n, dtype=late.dtype)[:, None]
+        issue = n * jnp.arange(1.0 - rows, 1.0, dtype=late.dtype)[None] + late
+        # The share of a part in which a command acts: from its arrival until that of the next one.
+        shares = jnp.clip(begin + 1.0 - issue, 0.0, 1.0) - jnp.clip(begin + 1.0 - n - issue, 0.0, 1.0)
+        return jax.vmap(self.combine)(shares)
+
+    def weights(self, delay: Float[Array, ""], dt: float) -> Float[Array, " n"]:
+        """Return the share of each row in what arrives during the tick that begins; they add up to one."""
+        return self._hat(self._age(delay, dt))
+
+    def combine(self, weights: Float[Array, " n"]) -> Command:
+        """Return a weighted sum of the rows."""
+        # No matrix product: accelerators round its factors to fewer digits.
+        c = jnp.sum(weights * self.commands.c)
+        return Command(c, jnp.sum(weights[:, None] * self.commands.omega, axis=0))
+
+    def _age(self, delay: Float[Array, ""], dt: float) -> Float[Array, ""]:
+        """How many ticks ago the command was issued that arrives when the tick begins."""
+        # Beyond the queue its oldest command acts: a delay that is traced cannot be refused.
+        return jnp.minimum(whole_steps(delay.astype(self.commands.c.dtype), dt), self.commands.c.shape[0] - 1.0)
+
+    def _hat(self, age: Float[Array, ""]) -> Float[Array, " n"]:
+        n = self.commands.c.shape[0]
+        ages = jnp.arange(n - 1, -1, -1, dtype=age.dtype)
+        return jnp.clip(1.0 - jnp.abs(ages - age), 0.0, 1.0)
+
+
+class PathState(eqx.Module):
+    """Commands under way, and what has become of those that arrived."""
+
+    queue: CommandQueue
+    actuators: ActuatorState
+
+
+class CommandPath(eqx.Module):
+    """The command path of a vehicle as one value: transport delay, and response of thrust and body rates."""
+
+    delay: Float[Array, ""]
+    """Transport delay [s]."""
+    response: ActuatorResponse
+
+    @classmethod
+    def of(cls, delay: float | Float[Array, ""] = 0.0, response: ActuatorResponse | None = None) -> "CommandPath":
+        """Build a path.
+
+        Args:
+            delay: Transport delay [s].
+            response: Of thrust and body rates; None: they follow at once.
+        """
+        return cls(strong_array(delay), ActuatorResponse.of() if response is None else response)
+
+    def init(self, u: Command, dt: float, *, longest: float = LONGEST_DELAY) -> PathState:
+        """Return the state of a vehicle at rest under ``u``; see :meth:`CommandQueue.of`."""
+        return PathState(CommandQueue.of(u, dt, longest=longest), ActuatorState.at(u))
+
+    def __call__(self, s: PathState, u: Command, dt: float) -> tuple[Command, PathState]:
+        """Advance by a control tick; exact for commands that are held over each tick.
+
+        Args:
+            s: State at the beginning of the tick.
+            u: Command that is issued for it.
+            dt: Length of the tick [s].
+
+        Returns:
+            Mean of thrust and body rates over the tick, and the state at its end.
+        """
+        queue = s.queue.push(u)
+        before, after, change = queue.pieces(self.delay, dt)
+        first, middle = self.response(s.actuators, before, change)
+        second, end = self.response(middle, after, dt - change)
+        target = self.response.target(queue.arrival(self.delay, dt))
+        mean = jax.tree.map(lambda each, a, b: each + (a + b) / dt, target, first, second)
+        return mean, PathState(queue, end)
+
+    def thrust(self, queue: CommandQueue, c: Float[Array, ""], dt: float) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """Advance the thrust alone by the tick whose command is the newest of the queue.
+
+        Args:
+            queue: Commands.
+            c: Thrust at the beginning of the tick [m/s^2].
+            dt: Length of the tick [s].
+
+        Returns:
+            Mean thrust over the tick, and thrust at its end [m/s^2].
+        """
+        before, after, change = queue.pieces(self.delay, dt)
+        first, middle = self.response.thrust(c, self.response.target(before).c, change)
+        second, end = self.response.thrust(middle, self.response.target(after).c, dt - change)
+        return self.response.target(queue.arrival(self.delay, dt)).c + (first + second) / dt, end
+
+
+def check_delay(delay: Float[Array, "*batch"], longest: float, name: str) -> None:
+    """Refuse a delay that a queue has no room for; one that is traced, or one of many, is not checked.
+
+    Args:
+        delay: Transport delay [s].
+        longest: Longest one that the queue is made for [s].
+        name: Of what has the delay, for the message.
+
+    Raises:
+        ValueError: The delay is negative or too long.
+    """
+    if isinstance(delay, jax.core.Tracer) or not isinstance(delay, jax.Array) or delay.ndim:
+        return
+    if not 0.0 <= delay.item() <= longest * (1.0 + ROUNDING):
+        raise ValueError(f"{name}.delay = {delay.item():g} s must be 0 to {longest:g} s; set longest_delay for more")
+
+
+def queue_length(dt: float, longest: float = LONGEST_DELAY) -> int:
+    """Return how many commands a queue holds for delays of up to ``longest`` [s] at a tick of ``dt`` [s]."""
+    return math.ceil(longest / dt - ROUNDING) + 1
+
+
+def whole_steps(time: Float[Array, "*shape"], dt: float) -> Float[Array, "*shape"]:
+    """Return a time in steps of ``dt``, where a number that is whole but for rounding is whole."""
+    steps = time / dt
+    nearest = jnp.round(steps)
+    rounding = jnp.where(jnp.abs(steps - nearest) < ROUNDING, nearest - steps, 0.0)
+    return steps + lax.stop_gradient(rounding)
