@@ -4,3 +4,4 @@ from .estimate import Estimate as Estimate
 from .estimate import PathEstimate as PathEstimate
 from .estimator import PathEstimator as PathEstimator
 from .estimator import PathState as PathState
+from .report import describe_path as describe_path

@@ -1,13 +1,15 @@
 """Online estimator of the command path: delay, lags, damping and gains between commands and the vehicle's motion.
 
 Call :meth:`PathEstimator.update` with each measurement, then :meth:`PathEstimator.issued` with the new command, and
-:meth:`PathEstimator.accepted` if the plant accepted another one. All arrays have fixed shapes.
+:meth:`PathEstimator.accepted` if the plant accepted another one. For a batch of ticks, call
+:meth:`PathEstimator.measured` in each and :meth:`PathEstimator.estimated` at the end. All arrays have fixed shapes.
 """
 
 import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -16,12 +18,13 @@ from ...physics.state import STANDARD_GRAVITY, Command, State
 from ..consistency import ACCELERATION, RATE, Consistency
 from ..latency import follows
 from .channel import Channel, Sample
-from .estimate import PathEstimate, damping_estimate, delay_estimate, gain_estimate, lag_estimate
+from .estimate import Estimate, PathEstimate, damping_estimate, delay_estimate, gain_estimate, lag_estimate
 from .history import CommandHistory
 from .noise import DIFFERENCE, DIRECT
-from .posterior import Moments, Prior, channel_before, path_posterior, posterior_as_prior
+from .posterior import Prior, channel_before, delay_belief, full_belief, path_posterior
 
-SETTLING = 0.2  # [s] at the start of a flight in which the thrust depends on commands before it
+SETTLING = 0.1  # [s] at the start of a flight in which the thrust depends on commands before it
+FADING = (0.03, 0.08)  # [s]: afterwards, what is left of them fades about so fast
 
 
 class Channels(NamedTuple):
@@ -50,8 +53,8 @@ class Reading(NamedTuple):
 
     def sample(self, axes: slice, other: Float[Array, "axes n"]) -> Sample:
         """Return the sample of some axes, with their features beside the commands."""
-        dtype = self.age.dtype
-        value, width = self.value[axes].astype(dtype), jnp.full((), self.width, dtype)
+        value, dtype = self.value[axes], self.age.dtype
+        width = jnp.full((), self.width, dtype)
         usable = self.usable & jnp.all(jnp.isfinite(value))
         return Sample(value, other, usable, jnp.array(self.kinds, dtype), self.age, width)
 
@@ -100,9 +103,9 @@ class PathEstimator(eqx.Module):
         one, no = jnp.ones(()), jnp.zeros(0)
         rates = Prior(one, 0.15 * one, 0.05 * one, 1.0 * one, no, 0.03 * one, 0.003 * one, 0.0 * one, (9, 9, 5))
         yaw = Prior(one, 0.15 * one, 0.08 * one, 1.0 * one, no, 0.03 * one, 0.003 * one, 0.0 * one, (5, 7, 5))
-        drag = 0.5 * jnp.ones(1)
+        other = jnp.array([0.5, 20.0, 20.0])  # of drag [1/s] and of what is left of earlier commands [m/s^2]
         thrust = Prior(
-            one, 0.3 * one, 0.04 * one, 0.8 * one, drag, 0.2 * one, 0.02 * one, STANDARD_GRAVITY * one, (7, 9, 1)
+            one, 0.3 * one, 0.04 * one, 0.8 * one, other, 0.2 * one, 0.02 * one, STANDARD_GRAVITY * one, (7, 9, 1)
         )
         return cls(rates, yaw, thrust, memory * one, dt)
 
@@ -114,10 +117,13 @@ class PathEstimator(eqx.Module):
             channel_before(1, self.thrust, self.dt),
             channel_before(1, self.thrust, self.dt),
         )
+        x = jax.tree.map(lambda leaf: leaf.astype(self.memory.dtype), x)
         zero = jnp.zeros(())
-        estimate, channels = self._posterior(channels, accelerometer=False)
-        return PathState(
-            CommandHistory.at_hover(self.dt), x, zero - jnp.inf, zero, Consistency.start(x), channels, estimate
+        unknown = Estimate(zero, zero, zero, zero, jnp.array(False))
+        estimate = PathEstimate(*(unknown,) * 8)
+        start = Consistency.start(x)
+        return self.estimated(
+            PathState(CommandHistory.at_hover(self.dt), x, zero - jnp.inf, zero, start, channels, estimate)
         )
 
     def update(
@@ -129,7 +135,19 @@ class PathEstimator(eqx.Module):
         a: Float[Array, "3"] | None = None,
         age: Float[Array, ""] | float = 0.0,
     ) -> PathState:
-        """Return the memory after a measurement.
+        """Return the memory after a measurement, with a new estimate; for the arguments see :meth:`measured`."""
+        return self.estimated(self.measured(s, t, x, omega, a, age))
+
+    def measured(
+        self,
+        s: PathState,
+        t: Float[Array, ""],
+        x: State,
+        omega: Float[Array, "3"] | None = None,
+        a: Float[Array, "3"] | None = None,
+        age: Float[Array, ""] | float = 0.0,
+    ) -> PathState:
+        """Return the memory after a measurement, with the estimate as it was.
 
         Args:
             s: Memory.
@@ -141,6 +159,7 @@ class PathEstimator(eqx.Module):
         """
         dt, dtype = self.dt, s.elapsed.dtype
         t, age = jnp.asarray(t, dtype), jnp.asarray(age, dtype)
+        x, omega, a = jax.tree.map(lambda leaf: leaf.astype(dtype), (x, omega, a))
         successive = follows(t, s.t, dt)
         consistency = s.consistency.after(s.x, x, dt, successive)
         certain = successive & consistency.certain
@@ -162,46 +181,39 @@ class PathEstimator(eqx.Module):
         yaw = now.yaw.measured(features[3:], turned.sample(slice(2, 3), none[3:]), keep, dt)
 
         settled = certain & (s.elapsed > SETTLING)
-        up = jnp.array([0.0, 0.0, STANDARD_GRAVITY], x.p.dtype)
+        up = jnp.array([0.0, 0.0, STANDARD_GRAVITY], dtype)
         axis = 0.5 * (s.x.R + x.R)[:, 2]
-        drag = -0.5 * jnp.sum(axis * (s.x.v + x.v))[None, None].astype(dtype)
+        drag = -0.5 * jnp.sum(axis * (s.x.v + x.v))
+        fading = jnp.exp(-s.elapsed / jnp.array(FADING, dtype))
+        other = jnp.concatenate([drag[None], fading])[None]
         lift = jnp.sum(axis * ((x.v - s.x.v) / dt + up)) - STANDARD_GRAVITY
         thrust = now.thrust.measured(
-            features[:1], Reading(lift[None], settled, DIFFERENCE, age, dt).sample(slice(0, 1), drag), keep, dt
+            features[:1], Reading(lift[None], settled, DIFFERENCE, age, dt).sample(slice(0, 1), other), keep, dt
         )
         force = now.force
         if a is not None:
             # An accelerometer is not late where the attitude is.
-            turn = so3.exp(age.astype(x.p.dtype) * turning.astype(x.p.dtype))
+            turn = so3.exp(age * turning)
             axis = 0.5 * (so3.mul(s.x.R, turn) + so3.mul(x.R, turn))[:, 2]
             lift = jnp.sum(axis * (a + up)) - STANDARD_GRAVITY
             usable = settled & jnp.all(jnp.abs(a) < ACCELERATION)
             now_read = Reading(lift[None], usable, DIRECT, jnp.zeros_like(age), dt)
-            force = force.measured(features[:1], now_read.sample(slice(0, 1), drag), keep, dt)
-        estimate, channels = self._posterior(Channels(rates, yaw, thrust, force), accelerometer=a is not None)
-        return PathState(history, x, t, s.elapsed + dt, consistency, channels, estimate)
+            force = force.measured(features[:1], now_read.sample(slice(0, 1), other), keep, dt)
+        channels = Channels(rates, yaw, thrust, force)
+        return PathState(history, x, t, s.elapsed + dt, consistency, channels, s.estimate)
 
-    def issued(self, s: PathState, u: Command) -> PathState:
-        """Return the memory after the command ``u`` was issued for the tick that begins."""
-        return dataclasses.replace(s, history=s.history.issued(_from_hover(u)))
+    def estimated(self, s: PathState) -> PathState:
+        """Return the memory with a new estimate.
 
-    def accepted(self, s: PathState, u: Command) -> PathState:
-        """Return the memory after the plant accepted ``u`` instead of the command that was issued last."""
-        return dataclasses.replace(s, history=s.history.replaced(_from_hover(u)))
-
-    def _posterior(self, channels: Channels, *, accelerometer: bool) -> tuple[PathEstimate, Channels]:
-        """Return the estimate. The rates say what the delay is, and accelerations are known before velocities."""
+        The rates say what the delay is, and accelerations are known before velocities.
+        """
+        channels = s.channels
         rates = path_posterior(channels.rates, self.rates, None, self.dt)
-        delay = delay_estimate(rates)
-        common = Moments(delay.mean, delay.deviation)
-        yaw = path_posterior(channels.yaw, self.yaw, common, self.dt)
-        prior, force = self.thrust, channels.force
-        if accelerometer:
-            found = path_posterior(force, prior, common, self.dt)
-            force, prior = force.predicted_by(found), posterior_as_prior(found, prior)
-        thrust = path_posterior(channels.thrust, prior, common, self.dt)
+        yaw = path_posterior(channels.yaw, self.yaw, delay_belief(rates, self.yaw), self.dt)
+        force = path_posterior(channels.force, self.thrust, delay_belief(rates, self.thrust), self.dt)
+        thrust = path_posterior(channels.thrust, self.thrust, full_belief(force), self.dt)
         estimate = PathEstimate(
-            delay,
+            delay_estimate(rates),
             lag_estimate(rates, self.rates.lag_spread),
             damping_estimate(rates),
             gain_estimate(rates, self.rates.gain_spread),
@@ -210,10 +222,21 @@ class PathEstimator(eqx.Module):
             lag_estimate(thrust, self.thrust.lag_spread),
             gain_estimate(thrust, self.thrust.gain_spread),
         )
-        return estimate, Channels(
-            channels.rates.predicted_by(rates), channels.yaw.predicted_by(yaw), channels.thrust.predicted_by(thrust),
-            force,
-        )  # fmt: skip
+        found = Channels(
+            channels.rates.predicted_by(rates),
+            channels.yaw.predicted_by(yaw),
+            channels.thrust.predicted_by(thrust),
+            channels.force.predicted_by(force),
+        )
+        return dataclasses.replace(s, channels=found, estimate=estimate)
+
+    def issued(self, s: PathState, u: Command) -> PathState:
+        """Return the memory after the command ``u`` was issued for the tick that begins."""
+        return dataclasses.replace(s, history=s.history.issued(_from_hover(u)))
+
+    def accepted(self, s: PathState, u: Command) -> PathState:
+        """Return the memory after the plant accepted ``u`` instead of the command that was issued last."""
+        return dataclasses.replace(s, history=s.history.replaced(_from_hover(u)))
 
 
 def _from_hover(u: Command) -> Float[Array, "4"]:

@@ -6,7 +6,6 @@ coarse grid over the prior finds where else the posterior may be, for example af
 the likelihood, since its cells are wider than the ridge. All shapes are fixed and nothing is compiled anew.
 """
 
-import dataclasses
 import math
 from typing import NamedTuple
 
@@ -56,11 +55,18 @@ class Prior(eqx.Module):
     """Cells of each grid along delay, lag and damping; one along damping means that the channel is of first order."""
 
 
-class Moments(NamedTuple):
-    """Normal distribution of the delay that another channel has found; an infinite deviation says nothing."""
+class Belief(NamedTuple):
+    """Normal distribution of delay, logarithm of the lag, and gain, which another channel has found."""
 
-    mean: Float[Array, ""]
-    deviation: Float[Array, ""]
+    mean: Float[Array, "2"]
+    """Delay [s], logarithm of the lag [s]."""
+    covariance: Float[Array, "2 2"]
+    gain: Float[Array, ""]
+    """Mean of the gain at ``mean``."""
+    slope: Float[Array, "2"]
+    """Change of the mean of the gain with delay and logarithm of the lag."""
+    gain_spread: Float[Array, ""]
+    """Standard deviation of the gain where the other two are known."""
 
 
 class _Sums(NamedTuple):
@@ -74,6 +80,11 @@ class _Sums(NamedTuple):
     """Sum of the weights of the measurements."""
 
 
+class _GainPrior(NamedTuple):
+    mean: Float[Array, " cells"]
+    spread: Float[Array, ""]
+
+
 class _Fit(NamedTuple):
     """What the sums say of each cell."""
 
@@ -83,56 +94,64 @@ class _Fit(NamedTuple):
     variance: Float[Array, " cells"]
 
 
-def path_posterior(channel: Channel, prior: Prior, delay: Moments | None, dt: float) -> PathPosterior:
+def path_posterior(channel: Channel, prior: Prior, belief: Belief | None, dt: float) -> PathPosterior:
     """Return the posterior of a channel.
 
     Args:
         channel: Its sums.
         prior: What is known before any flight.
-        delay: What another channel says of the delay; None if this one is the first.
+        belief: What other channels say; None if this one is the first.
         dt: Control tick [s].
     """
     sums = _without_others(channel, prior)
-    grid, step = _unit_grid(prior.cells)
+    grid, step = (jnp.asarray(x, channel.response.dtype) for x in _unit_grid(prior.cells))
 
     def likelihood_of(cells: Float[Array, "cells 3"], one: _Sums) -> tuple[_Fit, Float[Array, "cells m"]]:
         h = responses(cells, channel.age, channel.width, prior.hover, dt)
-        return _fit(one, h, channel, prior), h
+        return _fit(one, h, channel, prior, _gain_prior(cells, prior, belief)), h
 
     def around(region: Region) -> tuple[Float[Array, "cells 3"], Float[Array, "3 3"]]:
         factor = _cholesky(region.covariance)
-        least = (factor * (COARSE * step) ** 2) @ factor.T
-        return region.mean + grid @ factor.T, least
+        least = (factor * (COARSE * step[None]) ** 2) @ factor.T
+        return region.mean[None] + grid @ factor.T, least
 
     def region_of(cells: Float[Array, "cells 3"], fit: _Fit, temper: float, least: Float[Array, "3 3"]) -> Region:
-        weight = _weight(fit.log_likelihood, cells, prior, delay, temper)
+        weight = _weight(fit.log_likelihood, cells, prior, belief, temper)
         mean, covariance = _moments(cells, weight)
         return Region(mean, WIDER * covariance + least)
 
     cells, least = around(channel.region)
     h = responses(cells, channel.age, channel.width, prior.hover, dt)
-    fits = jax.vmap(lambda *each: _fit(_Sums(*each, sums.total), h, channel, prior))(*sums[:-1])
-    kind = jnp.argmax(jax.nn.logsumexp(fits.log_likelihood + _log_prior(cells, prior, delay), axis=1))
+    fits = _fits(sums, h, channel, prior, _gain_prior(cells, prior, belief))
+    kind = jnp.argmax(jax.nn.logsumexp(fits.log_likelihood + _log_prior(cells, prior, belief)[None], axis=1))
     one = _Sums(sums.uu[kind], sums.uz[kind], sums.zz[kind], sums.half_log[kind], sums.total)
     fit: _Fit = jax.tree.map(lambda leaf: leaf[kind], fits)
     region = region_of(cells, fit, 1.0, least)
-    coarse, within = _coarse(prior, delay)
+    coarse, within = _coarse(prior, belief)
     far, _ = likelihood_of(coarse, one)
     best, found = (
-        jnp.max(each.log_likelihood + _log_prior(at, prior, delay)) for each, at in ((far, coarse), (fit, cells))
+        jnp.max(each.log_likelihood + _log_prior(at, prior, belief)) for each, at in ((far, coarse), (fit, cells))
     )
     restart = region_of(coarse, far, TEMPER, within)
     region = jax.tree.map(lambda new, old: jnp.where(best > found + ELSEWHERE, new, old), restart, region)
     cells, least = around(region)
     fit, h = likelihood_of(cells, one)
-    weight = _weight(fit.log_likelihood, cells, prior, delay, 1.0)
+    weight = _weight(fit.log_likelihood, cells, prior, belief, 1.0)
     scaled = fit.gain[:, None] * h
     response = weight @ scaled
-    off, middle = scaled - response, weight @ h
+    off, middle = scaled - response[None], weight @ h
     spread = (weight[:, None] * off).T @ off + (weight @ fit.gain_variance) * jnp.outer(middle, middle)
     noise = jnp.sqrt(weight @ fit.variance)
     region = region_of(cells, fit, 1.0, least)
     return PathPosterior(cells, weight, fit.gain, fit.gain_variance, response, spread, noise, kind, region)
+
+
+def log_likelihood(
+    channel: Channel, prior: Prior, cells: Float[Array, "cells 3"], dt: float
+) -> Float[Array, "kinds cells"]:
+    """Return the log likelihood of some cells for each kind of noise, up to a constant; for the arguments see above."""
+    sums, h = _without_others(channel, prior), responses(cells, channel.age, channel.width, prior.hover, dt)
+    return _fits(sums, h, channel, prior, _gain_prior(cells, prior, None)).log_likelihood
 
 
 def channel_before(axes: int, prior: Prior, dt: float) -> Channel:
@@ -141,25 +160,31 @@ def channel_before(axes: int, prior: Prior, dt: float) -> Channel:
     zero = jnp.zeros(())
     h, weight = responses(cells, zero, zero, prior.hover, dt), jax.nn.softmax(_log_prior(cells, prior, None))
     response = prior.gain * weight @ h
-    off = prior.gain * h - response
+    off = prior.gain * h - response[None]
     spread = (weight[:, None] * off).T @ off + prior.gain_spread**2 * jnp.outer(response, response)
     mean, covariance = _moments(cells, weight)
     return Channel.start(axes, prior.other.shape[0], response, spread, prior.noise, Region(mean, covariance + within))
 
 
-def posterior_as_prior(posterior: PathPosterior, prior: Prior) -> Prior:
-    """Return the prior of a second sensor of the same quantity, after the first one had this posterior."""
-    log_lag, gain = posterior.cells[:, 1], posterior.gain
-    lag_mean, gain_mean = posterior.weight @ log_lag, posterior.weight @ gain
-    lag_variance = posterior.weight @ (log_lag - lag_mean) ** 2
-    gain_variance = posterior.weight @ ((gain - gain_mean) ** 2 + posterior.gain_variance)
-    return dataclasses.replace(
-        prior,
-        gain=gain_mean,
-        gain_spread=jnp.sqrt(gain_variance),
-        lag=jnp.exp(lag_mean),
-        lag_spread=jnp.sqrt(lag_variance),
-    )
+def delay_belief(posterior: PathPosterior, prior: Prior) -> Belief:
+    """Return what a channel of another quantity says: the delay, which all channels share."""
+    delay = posterior.cells[:, 0]
+    mean = posterior.weight @ delay
+    variance = posterior.weight @ (delay - mean) ** 2
+    covariance = jnp.diag(jnp.stack([variance, prior.lag_spread**2]))
+    middle = jnp.stack([mean, jnp.log(prior.lag)])
+    return Belief(middle, covariance, prior.gain, jnp.zeros_like(middle), prior.gain_spread)
+
+
+def full_belief(posterior: PathPosterior) -> Belief:
+    """Return what another sensor of the same quantity says, with the correlation of delay, lag and gain."""
+    cells, weight = posterior.cells[:, :2], posterior.weight
+    mean, gain = weight @ cells, weight @ posterior.gain
+    away, off = cells - mean[None], posterior.gain - gain
+    covariance = (weight[:, None] * away).T @ away
+    slope = _inverse(covariance) @ ((weight * off) @ away)
+    variance = weight @ ((off - away @ slope) ** 2 + posterior.gain_variance)
+    return Belief(mean, covariance, gain, slope, jnp.sqrt(variance))
 
 
 def responses(
@@ -179,7 +204,7 @@ def responses(
         dt: Control tick [s].
     """
     delay, lag, ringing = cells[:, :1], jnp.exp(cells[:, 1:2]), jnp.clip(cells[:, 2:], 0.0, MOST_RINGING)
-    t = dt * jnp.asarray(ages(dt), dtype=cells.dtype) - delay - age
+    t = dt * jnp.asarray(ages(dt), dtype=cells.dtype)[None] - delay - age
     settled = jnp.ones_like(delay)
     return jnp.concatenate([mean_step_response(t, width, lag, ringing), settled, hover * settled], axis=1)
 
@@ -204,16 +229,28 @@ def _without_others(channel: Channel, prior: Prior) -> _Sums:
     )
 
 
-def _fit(sums: _Sums, h: Float[Array, "cells m"], channel: Channel, prior: Prior) -> _Fit:
+def _fits(sums: _Sums, h: Float[Array, "cells m"], channel: Channel, prior: Prior, gain: _GainPrior) -> _Fit:
+    """Return :func:`_fit` for each kind of noise."""
+    parts = (sums.uu, sums.uz, sums.zz, sums.half_log)
+    return jax.vmap(lambda uu, uz, zz, half: _fit(_Sums(uu, uz, zz, half, sums.total), h, channel, prior, gain))(*parts)
+
+
+def _gain_prior(cells: Float[Array, "cells 3"], prior: Prior, belief: Belief | None) -> _GainPrior:
+    if belief is None:
+        return _GainPrior(jnp.broadcast_to(prior.gain, cells.shape[:1]), prior.gain_spread)
+    return _GainPrior(belief.gain + (cells[:, :2] - belief.mean[None]) @ belief.slope, belief.gain_spread)
+
+
+def _fit(sums: _Sums, h: Float[Array, "cells m"], channel: Channel, prior: Prior, gain: _GainPrior) -> _Fit:
     """Integrate over gain and noise; everything is a difference from the present prediction of the channel."""
     g = jnp.clip(channel.response[-2], *GAINS)
-    away = g * h - channel.response
+    away = g * h - channel.response[None]
     across = away @ sums.uu
     alone = sums.zz - 2.0 * away @ sums.uz + jnp.sum(away * across, axis=1)
-    slope = jnp.sum(h * (sums.uz - across), axis=1)
-    square = jnp.sum(h * (across + sums.uu @ channel.response), axis=1) / g
+    slope = jnp.sum(h * (sums.uz[None] - across), axis=1)
+    square = jnp.sum(h * (across + (sums.uu @ channel.response)[None]), axis=1) / g
     # The prior of the gain counts like one measurement of it.
-    before, off = (channel.noise / prior.gain_spread) ** 2, prior.gain - g
+    before, off = (channel.noise / gain.spread) ** 2, gain.mean - g
     square, slope, alone = jnp.maximum(square, 0.0) + before, slope + before * off, alone + before * off**2
     left = jnp.maximum(alone - slope**2 / square, 0.0) + sums.total * prior.floor**2 + FREEDOM * prior.noise**2
     freedom = sums.total + FREEDOM
@@ -222,13 +259,15 @@ def _fit(sums: _Sums, h: Float[Array, "cells m"], channel: Channel, prior: Prior
     return _Fit(likelihood, g + slope / square, variance / square, variance)
 
 
-def _log_prior(cells: Float[Array, "cells 3"], prior: Prior, delay: Moments | None) -> Float[Array, " cells"]:
+def _log_prior(cells: Float[Array, "cells 3"], prior: Prior, belief: Belief | None) -> Float[Array, " cells"]:
     d, log_lag, ringing = cells.T
     inside = (d >= 0.0) & (d <= LONGEST_DELAY) & (log_lag >= jnp.log(LAGS[0])) & (log_lag <= jnp.log(LAGS[1]))
     inside &= (ringing >= 0.0) & (ringing <= MOST_RINGING)
-    found = -0.5 * ((log_lag - jnp.log(prior.lag)) / prior.lag_spread) ** 2
-    if delay is not None:
-        found -= 0.5 * ((d - delay.mean) / delay.deviation) ** 2
+    if belief is None:
+        found = -0.5 * ((log_lag - jnp.log(prior.lag)) / prior.lag_spread) ** 2
+    else:
+        away = cells[:, :2] - belief.mean[None]
+        found = -0.5 * jnp.sum(away * (away @ _inverse(belief.covariance)), axis=1)
     return jnp.where(inside, found, -jnp.inf)
 
 
@@ -236,21 +275,21 @@ def _weight(
     likelihood: Float[Array, " cells"],
     cells: Float[Array, "cells 3"],
     prior: Prior,
-    delay: Moments | None,
+    belief: Belief | None,
     temper: float,
 ) -> Float[Array, " cells"]:
-    return jax.nn.softmax(temper * likelihood + _log_prior(cells, prior, delay))
+    return jax.nn.softmax(temper * likelihood + _log_prior(cells, prior, belief))
 
 
-def _coarse(prior: Prior, delay: Moments | None) -> tuple[Float[Array, "cells 3"], Float[Array, "3 3"]]:
+def _coarse(prior: Prior, belief: Belief | None) -> tuple[Float[Array, "cells 3"], Float[Array, "3 3"]]:
     """Return a grid over the prior, and the covariance of a point within a cell."""
     n_delay, n_lag, n_ringing = 9, 10, 3 if prior.cells[2] > 1 else 1
     log_lag = jnp.linspace(math.log(LAGS[0]), math.log(LAGS[1]), n_lag)
-    ringing = (jnp.arange(n_ringing) + 0.5) * MOST_RINGING / n_ringing if n_ringing > 1 else jnp.zeros(1)
-    if delay is None:
+    ringing = jnp.asarray((np.arange(n_ringing) + 0.5) * MOST_RINGING / n_ringing if n_ringing > 1 else np.zeros(1))
+    if belief is None:
         d = jnp.linspace(0.0, LONGEST_DELAY, n_delay)
     else:
-        d = delay.mean + delay.deviation * jnp.linspace(-2.0, 2.0, 5)
+        d = belief.mean[0] + jnp.sqrt(belief.covariance[0, 0]) * jnp.linspace(-2.0, 2.0, 5)
     d = jnp.clip(d, 0.0, LONGEST_DELAY)
     cells = jnp.stack([x.reshape(-1) for x in jnp.meshgrid(d, log_lag, ringing, indexing="ij")], axis=1)
     spacing = jnp.stack(
@@ -263,15 +302,22 @@ def _unit_grid(cells: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
     """Return the points of a grid in standard deviations, (n, 3), and their spacing along each axis."""
     axes = [np.linspace(-REACH, REACH, n) if n > 1 else np.zeros(1) for n in cells]
     points = np.stack([x.reshape(-1) for x in np.meshgrid(*axes, indexing="ij")], axis=1)
-    return points.astype(np.float32), np.array([x[1] - x[0] if len(x) > 1 else 0.0 for x in axes], np.float32)
+    return points, np.array([x[1] - x[0] if len(x) > 1 else 0.0 for x in axes])
 
 
 def _moments(
     cells: Float[Array, "cells 3"], weight: Float[Array, " cells"]
 ) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
     mean = weight @ cells
-    away = cells - mean
+    away = cells - mean[None]
     return mean, (weight[:, None] * away).T @ away
+
+
+def _inverse(a: Float[Array, "2 2"]) -> Float[Array, "2 2"]:
+    """Return the inverse of a covariance, with a correlation of 0.9999 at most."""
+    a = a + jnp.diag(1e-4 * jnp.diag(a) + TINY)
+    turned = jnp.stack([jnp.stack([a[1, 1], -a[0, 1]]), jnp.stack([-a[1, 0], a[0, 0]])])
+    return turned / (a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0])
 
 
 def _cholesky(a: Float[Array, "3 3"]) -> Float[Array, "3 3"]:

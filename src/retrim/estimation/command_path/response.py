@@ -73,5 +73,5 @@ def first_order_equivalent(delay: Any, lag: Any, damping: Any) -> tuple[Any, Any
     responses for damping ratios from 0.3 to infinity.
     """
     ringing = ringing_of(damping)
-    share = jnp.interp(ringing, SHARE_AT, SHARE)
+    share = jnp.interp(ringing, *(jnp.asarray(x, ringing.dtype) for x in (SHARE_AT, SHARE)))
     return delay + (1.0 - share) * lag, share * lag
