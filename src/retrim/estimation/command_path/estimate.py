@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from .channel import PathPosterior
-from .posterior import LONGEST_DELAY, MOST_RINGING
+from .prior import LONGEST_DELAY, MOST_RINGING
 from .response import damping_of, first_order_equivalent
 
 NINETY = 1.645  # standard deviations on each side of a normal distribution that hold 90 %

@@ -21,7 +21,8 @@ from .channel import Channel, Sample
 from .estimate import Estimate, PathEstimate, damping_estimate, delay_estimate, gain_estimate, lag_estimate
 from .history import CommandHistory
 from .noise import DIFFERENCE, DIRECT
-from .posterior import Prior, channel_before, delay_belief, full_belief, path_posterior
+from .posterior import channel_before, path_posterior
+from .prior import Prior, delay_belief, full_belief
 
 SETTLING = 0.1  # [s] at the start of a flight in which the thrust depends on commands before it
 FADING = (0.03, 0.08)  # [s]: afterwards, what is left of them fades about so fast
