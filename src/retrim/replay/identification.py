@@ -6,15 +6,18 @@ rest is linear least squares. Intervals are those of a bootstrap over blocks of 
 the next one misses too.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from ..errors import LogError
+from ..estimation.command_path import Estimate as PathParameter
+from ..estimation.command_path import PathEstimate
 from ..io.logs import FlightLog
 from ..io.logs.on_one_clock import UP
 from .delayed_regression import DELAYS, LAGS, Channel, lowest
+from .path_of_log import path_of_log
 from .rows import acting
 
 BLOCK, DRAWS = 2.0, 200  # [s] of a block, and how many samples the bootstrap draws
@@ -101,11 +104,36 @@ def identify(log: FlightLog, *, seed: int = 0) -> Identified:
     moved = np.sqrt(np.mean(np.einsum("nji,nj->ni", log.R, log.v)[log.valid] ** 2, axis=0))
     x, y, z = (of(f"drag {axis}", bool(told) and bool(fast > SLOW)) for axis, fast in zip("xyz", moved, strict=True))
     lift, turn, yaw = (name in told for name in ("thrust", "rates", "yaw"))
-    return Identified(
+    found_by_batch = Identified(
         of("delay", bool(told)), of("thrust gain", lift), of("offset", lift),
         of("full", lift and log.full_thrust is not None), of("thrust lag", lift), of("rates lag", turn),
         of("rates gain", turn), of("yaw lag", yaw), of("yaw gain", yaw), (x, y, z), found[0]["left"],
     )  # fmt: skip
+    return _with_path(found_by_batch, path_of_log(log)) if turn else found_by_batch
+
+
+def _with_path(found: Identified, path: PathEstimate) -> Identified:
+    """Return what was identified, with the delay and the lags of the estimator that flies where they are excited.
+
+    Its model has a damping and the noise of differences. A vehicle file has a first-order lag, so that delay and lag
+    are those of the nearest first-order path. The thrust map and the drag stay those of the regression: they need the
+    offset and the three drags at once.
+    """
+    if not (bool(path.delay.excited) and bool(path.rate_lag.excited)):
+        return found
+    delay, lag = (float(x) for x in path.first_order())
+    longer, share = delay - float(path.delay.mean), lag / float(path.rate_lag.mean)
+    yaw, thrust = found.yaw_lag, found.thrust_lag
+    if yaw is not None and bool(path.yaw_lag.excited):
+        yaw = _scaled(path.yaw_lag)
+    if thrust is not None and bool(path.thrust_lag.excited):
+        thrust = _scaled(path.thrust_lag)
+    ends = (max(0.0, float(end) + longer) for end in (path.delay.mean, path.delay.low, path.delay.high))
+    return replace(found, delay=Estimate(*ends), rate_lag=_scaled(path.rate_lag, share), yaw_lag=yaw, thrust_lag=thrust)
+
+
+def _scaled(each: PathParameter, scale: float = 1.0) -> Estimate:
+    return Estimate(*(scale * float(end) for end in (each.mean, each.low, each.high)))
 
 
 def _solved(told: dict[str, Channel], thrust: Channel, draw: np.ndarray) -> dict[str, float]:

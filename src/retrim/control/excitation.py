@@ -1,0 +1,91 @@
+"""Active exploration: small doublets of thrust and body rates while the command path is not known well enough.
+
+Each pulse train is (+, -, -, +), so that it leaves neither a velocity nor a displacement. The vehicle moves by a few
+centimetres. A policy does not excite by default: whoever wants it adds the result to the command.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from ..estimation.command_path import PathEstimate
+from ..physics.state import Command
+
+SIGNS = (1.0, -1.0, -1.0, 1.0)
+
+
+class Excitation(eqx.Module):
+    """Bounded additions to the command until the estimate is narrow."""
+
+    thrust: Float[Array, ""]
+    """Amplitude of the thrust [m/s^2]."""
+    rates: Float[Array, "3"]
+    """Amplitudes of the body rates [rad/s]."""
+    pulse: Float[Array, "4"]
+    """Length of a pulse of thrust, roll, pitch and yaw [s]."""
+    delay_margin: Float[Array, ""]
+    """Half width of the 90 % interval of the delay that is narrow enough [s]."""
+    lag_margin: Float[Array, ""]
+    """Likewise of the lag of the rates, as a share of it."""
+    gain_margin: Float[Array, ""]
+    """Likewise of the gain of the thrust."""
+    longest: Float[Array, ""]
+    """Time after which it ends in any case [s]."""
+
+    @classmethod
+    def of(
+        cls,
+        *,
+        thrust: float = 2.0,
+        rates: tuple[float, float, float] = (1.0, 1.0, 0.6),
+        delay_margin: float = 0.008,
+        lag_margin: float = 0.2,
+        gain_margin: float = 0.02,
+        longest: float = 3.0,
+    ) -> "Excitation":
+        """Return the excitation; a thrust of 2 m/s^2 moves the vehicle by 3 cm.
+
+        Args:
+            thrust: Amplitude of the thrust [m/s^2].
+            rates: Amplitudes of the body rates [rad/s].
+            delay_margin: Half width of the 90 % interval of the delay that is narrow enough [s].
+            lag_margin: Likewise of the lag of the rates, as a share of it.
+            gain_margin: Likewise of the gain of the thrust, as a share of it.
+            longest: Time after which it ends in any case [s].
+
+        Raises:
+            ValueError: An amplitude is negative or a margin is not positive.
+        """
+        if min(thrust, *rates) < 0.0:
+            raise ValueError(f"Excitation: amplitudes must not be negative, got thrust = {thrust}, rates = {rates}")
+        if min(delay_margin, lag_margin, gain_margin) <= 0.0:
+            raise ValueError(
+                f"Excitation: margins must be positive, got {delay_margin}, {lag_margin}, {gain_margin}; "
+                "set longest = 0 to switch it off"
+            )
+        pulse = jnp.array([0.12, 0.08, 0.08, 0.10])
+        margins = (jnp.array(delay_margin), jnp.array(lag_margin), jnp.array(gain_margin))
+        return cls(jnp.array(thrust), jnp.array(rates), pulse, *margins, jnp.array(longest))
+
+    def __call__(self, t: Float[Array, ""], estimate: PathEstimate) -> Command:
+        """Return what is added to the command: zero where the estimate is narrow enough.
+
+        Args:
+            t: Time since the start of the flight [s].
+            estimate: What is known of the command path.
+        """
+        t = t.astype(self.thrust.dtype)
+        thrust, rates = self.wide(estimate)
+        active = jnp.stack([thrust, rates, rates, rates]) & (t < self.longest)
+        # Roll and pitch are half a pulse apart, so that each axis shows its own response.
+        shift = jnp.array([0.0, 0.0, 0.5, 0.0])
+        phase = jnp.floor(t / self.pulse + shift + 1e-3).astype(int) % len(SIGNS)
+        signs = jnp.where(active, jnp.array(SIGNS)[phase], 0.0)
+        return Command(self.thrust * signs[0], self.rates * signs[1:])
+
+    def wide(self, estimate: PathEstimate) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
+        """Return whether the thrust, and whether the rates, are not known to within the margins."""
+        gain, lag, delay = estimate.thrust_gain, estimate.rate_lag, estimate.delay
+        thrust = 0.5 * (gain.high - gain.low) > self.gain_margin * gain.mean
+        rates = 0.5 * (lag.high - lag.low) > self.lag_margin * lag.mean
+        return thrust, rates | (0.5 * (delay.high - delay.low) > self.delay_margin)

@@ -1,0 +1,170 @@
+"""Recursive sums of one channel of the command path: roll and pitch rates, yaw rate, or thrust.
+
+A measurement is z = g h(theta) . f + D n + noise, with the features f of the commands, the response h that delay, lag
+and damping give, the gain g, and further features n. Sums of products of whitened features and measurements are
+sufficient for every theta at once, so that no grid is stored. Measurements enter as differences from the present
+prediction, because single precision cannot hold the small difference of large sums.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from .noise import KINDS, Whitening
+
+GATE = 6.0  # standard deviations of the prediction beyond which a measurement does not count
+DOUBT_TAU, DOUBTFUL = 0.3, 0.5  # [s], and the share of recent measurements: if so many miss, the prediction is wrong
+
+
+class Sample(eqx.Module):
+    """One measurement of a channel."""
+
+    value: Float[Array, " axes"]
+    """Mean over ``width``, as a difference from hover."""
+    other: Float[Array, "axes n"]
+    """Features beside the commands."""
+    usable: Bool[Array, ""]
+    kinds: Float[Array, "kinds 2"]
+    """Possible kinds of its noise."""
+    age: Float[Array, ""]
+    """Time since the end of the mean [s]."""
+    width: Float[Array, ""]
+    """Length of the mean [s]; zero for a value."""
+
+
+class Region(eqx.Module):
+    """Ellipsoid of delay [s], logarithm of the lag [s], and ringing."""
+
+    mean: Float[Array, "3"]
+    covariance: Float[Array, "3 3"]
+
+
+class PathPosterior(NamedTuple):
+    """Weighted cells of the last grid."""
+
+    cells: Float[Array, "cells 3"]
+    """Delay [s], logarithm of the lag [s], ringing."""
+    weight: Float[Array, " cells"]
+    gain: Float[Array, " cells"]
+    """Mean of the gain in each cell."""
+    gain_variance: Float[Array, " cells"]
+    response: Float[Array, " m"]
+    """Mean of gain times response."""
+    spread: Float[Array, "m m"]
+    noise: Float[Array, ""]
+    kind: Int[Array, ""]
+    region: Region
+    """Where the next grid lies."""
+
+
+class Channel(eqx.Module):
+    """Sums, and what predicts the next measurement."""
+
+    whitening: Whitening
+    products: Float[Array, "kinds axes columns columns"]
+    """Sums of products of innovations: features of the commands, other features, misfit of the prediction."""
+    half_log: Float[Array, " kinds"]
+    """Half the sum of the logarithms of the innovations' variances."""
+    count: Float[Array, ""]
+    """Sum of the weights of the measurements."""
+    squares: Float[Array, ""]
+    """Sum of their squares."""
+    response: Float[Array, " m"]
+    """Gain times response of the present estimate."""
+    spread: Float[Array, "m m"]
+    """Its covariance."""
+    noise: Float[Array, ""]
+    """Standard deviation of the white noise."""
+    kind: Int[Array, ""]
+    """Index of the most likely kind of noise."""
+    doubt: Float[Array, ""]
+    """Share of recent measurements that are beyond :data:`GATE`."""
+    age: Float[Array, ""]
+    width: Float[Array, ""]
+    region: Region
+    """Where the posterior lies."""
+
+    @classmethod
+    def start(
+        cls,
+        axes: int,
+        others: int,
+        response: Float[Array, " m"],
+        spread: Float[Array, "m m"],
+        noise: Float[Array, ""],
+        region: Region,
+    ) -> "Channel":
+        """Return the channel before the first measurement.
+
+        Args:
+            axes: Number of axes that share all parameters but their disturbances.
+            others: Number of features beside the commands.
+            response: Mean of gain times response before any flight.
+            spread: Its covariance.
+            noise: Standard deviation of the noise before any flight.
+            region: Where the prior lies.
+        """
+        columns, zero = response.shape[0] + others + 1, jnp.zeros(())
+        return cls(
+            Whitening.start(axes, columns), jnp.zeros((KINDS, axes, columns, columns)), jnp.zeros(KINDS),
+            zero, zero, response, spread, zero + noise, jnp.array(0), zero, zero, zero, region,
+        )  # fmt: skip
+
+    def measured(
+        self, features: Float[Array, "axes m"], sample: Sample, keep: Float[Array, ""], dt: float
+    ) -> "Channel":
+        """Return the channel after one tick.
+
+        Args:
+            features: Features of the commands of each axis.
+            sample: The measurement; if it is not usable, only time passes.
+            keep: Weight that earlier measurements keep.
+            dt: Control tick [s].
+        """
+        row = jnp.concatenate([features, sample.other, sample.value[:, None]], axis=1)
+        innovation, variance = self.whitening.innovation(row, sample.kinds)
+        m = self.response.shape[0]
+        misfit = innovation[..., -1] - innovation[..., :m] @ self.response
+        expected = variance[:, None] * self.noise**2 + jnp.einsum(
+            "kai,ij,kaj->ka", innovation[..., :m], self.spread, innovation[..., :m]
+        )
+        far = jnp.any(misfit[self.kind] ** 2 > GATE**2 * expected[self.kind])
+        doubt = self.doubt + dt / DOUBT_TAU * (far.astype(keep.dtype) - self.doubt)
+        doubt = jnp.where(sample.usable, doubt, self.doubt)
+        counts = sample.usable & (~far | (self.doubt > DOUBTFUL))
+        weight = counts.astype(keep.dtype)
+        column = jnp.concatenate([innovation[..., :-1], misfit[..., None]], axis=2)
+        column = jnp.where(counts, column, 0.0) / jnp.sqrt(variance)[:, None, None]
+        axes = row.shape[0]
+        return Channel(
+            self.whitening.after(innovation, sample.kinds, counts),
+            keep * self.products + column[..., :, None] * column[..., None, :],
+            keep * self.half_log + weight * 0.5 * axes * jnp.log(variance),
+            keep * self.count + weight * axes,
+            keep**2 * self.squares + weight * axes,
+            self.response, self.spread, self.noise, self.kind, doubt,
+            jnp.where(sample.usable, sample.age, self.age), jnp.where(sample.usable, sample.width, self.width),
+            self.region,
+        )  # fmt: skip
+
+    def predicted_by(self, posterior: PathPosterior) -> "Channel":
+        """Return the channel with another prediction, from which measurements differ by something else."""
+        m = self.response.shape[0]
+        change = posterior.response - self.response
+        misfit = self.products[..., -1] - self.products[..., :m] @ change
+        last = misfit[..., -1:] - misfit[..., :m] @ change[:, None]
+        side = misfit[..., :-1, None]
+        below = jnp.concatenate([misfit[..., :-1], last], axis=-1)[..., None, :]
+        products = jnp.concatenate([jnp.concatenate([self.products[..., :-1, :-1], side], axis=-1), below], axis=-2)
+        return dataclasses.replace(
+            self,
+            products=products,
+            response=posterior.response,
+            spread=posterior.spread,
+            noise=posterior.noise,
+            kind=posterior.kind,
+            region=posterior.region,
+        )

@@ -1,0 +1,99 @@
+"""Estimates of the command path with their uncertainty."""
+
+import dataclasses
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from .channel import PathPosterior
+from .prior import LONGEST_DELAY, MOST_RINGING
+from .response import damping_of, first_order_equivalent
+
+NINETY = 1.645  # standard deviations on each side of a normal distribution that hold 90 %
+EXCITED = 0.6  # share of the deviation before any flight; a parameter with more is not excited
+
+
+class Estimate(eqx.Module):
+    """One parameter."""
+
+    mean: Float[Array, ""]
+    deviation: Float[Array, ""]
+    """Standard deviation."""
+    low: Float[Array, ""]
+    """Lower end of the 90 % interval."""
+    high: Float[Array, ""]
+    """Upper end of the 90 % interval."""
+    excited: Bool[Array, ""]
+    """Whether the flight says more than was known before: the deviation is below 60 % of that of the prior."""
+
+
+class PathEstimate(eqx.Module):
+    """What is known of the command path."""
+
+    delay: Estimate
+    """Of all commands [s]."""
+    rate_lag: Estimate
+    """2 zeta / omega_n of the roll and pitch rates, the delay of a ramp [s]."""
+    rate_damping: Estimate
+    """Damping ratio zeta of the roll and pitch rates [-]; a large one means first order."""
+    rate_gain: Estimate
+    """Body rate per commanded body rate, roll and pitch [-]."""
+    yaw_lag: Estimate
+    """Likewise of the yaw rate [s]."""
+    yaw_gain: Estimate
+    thrust_lag: Estimate
+    """First-order lag of the thrust [s]."""
+    thrust_gain: Estimate
+    """Thrust per commanded thrust [-]."""
+
+    def first_order(self) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """Return delay and lag [s] of the first-order path that turns most like this one."""
+        return first_order_equivalent(self.delay.mean, self.rate_lag.mean, self.rate_damping.mean)
+
+
+def normal_estimate(mean: Float[Array, ""], deviation: Float[Array, ""], before: Float[Array, ""] | float) -> Estimate:
+    """Return the estimate of a parameter with a normal posterior.
+
+    Args:
+        mean: Mean of the posterior.
+        deviation: Its standard deviation.
+        before: Standard deviation of the prior.
+    """
+    reach = NINETY * deviation
+    return Estimate(mean, deviation, mean - reach, mean + reach, deviation < EXCITED * before)
+
+
+def delay_estimate(posterior: PathPosterior) -> Estimate:
+    """Return the estimate of the delay [s]."""
+    mean, deviation = _moments(posterior.cells[:, 0], posterior.weight)
+    found = normal_estimate(mean, deviation, LONGEST_DELAY / 12.0**0.5)
+    return dataclasses.replace(found, low=jnp.maximum(found.low, 0.0))
+
+
+def lag_estimate(posterior: PathPosterior, before: Float[Array, ""]) -> Estimate:
+    """Return the estimate of the lag [s], whose logarithm is taken for normal; ``before`` is its prior deviation."""
+    mean, deviation = _moments(posterior.cells[:, 1], posterior.weight)
+    value, reach = jnp.exp(mean + 0.5 * deviation**2), NINETY * deviation
+    off = value * jnp.sqrt(jnp.expm1(deviation**2))
+    return Estimate(value, off, jnp.exp(mean - reach), jnp.exp(mean + reach), deviation < EXCITED * before)
+
+
+def damping_estimate(posterior: PathPosterior) -> Estimate:
+    """Return the estimate of the damping ratio."""
+    mean, deviation = _moments(posterior.cells[:, 2], posterior.weight)
+    ends = jnp.clip(jnp.stack([mean, mean + NINETY * deviation, mean - NINETY * deviation]), 0.0, MOST_RINGING)
+    value, low, high = damping_of(ends)
+    return Estimate(value, (high - low) / (2.0 * NINETY), low, high, deviation < EXCITED * MOST_RINGING / 12.0**0.5)
+
+
+def gain_estimate(posterior: PathPosterior, before: Float[Array, ""]) -> Estimate:
+    """Return the estimate of the gain; ``before`` is its prior deviation."""
+    mean, deviation = _moments(posterior.gain, posterior.weight)
+    deviation = jnp.sqrt(deviation**2 + posterior.weight @ posterior.gain_variance)
+    return normal_estimate(mean, deviation, before)
+
+
+def _moments(values: Float[Array, " cells"], weight: Float[Array, " cells"]) -> tuple[Array, Array]:
+    mean = weight @ values
+    return mean, jnp.sqrt(weight @ (values - mean) ** 2)

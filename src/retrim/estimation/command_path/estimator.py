@@ -1,0 +1,244 @@
+"""Online estimator of the command path: delay, lags, damping and gains between commands and the vehicle's motion.
+
+Call :meth:`PathEstimator.update` with each measurement, then :meth:`PathEstimator.issued` with the new command, and
+:meth:`PathEstimator.accepted` if the plant accepted another one. For a batch of ticks, call
+:meth:`PathEstimator.measured` in each and :meth:`PathEstimator.estimated` at the end. All arrays have fixed shapes.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from ...physics import so3
+from ...physics.state import STANDARD_GRAVITY, Command, State
+from ..consistency import ACCELERATION, RATE, Consistency
+from ..latency import follows
+from .channel import Channel, Sample
+from .estimate import Estimate, PathEstimate, damping_estimate, delay_estimate, gain_estimate, lag_estimate
+from .history import CommandHistory
+from .noise import DIFFERENCE, DIRECT
+from .posterior import channel_before, path_posterior
+from .prior import Prior, delay_belief, full_belief
+
+SETTLING = 0.1  # [s] at the start of a flight in which the thrust depends on commands before it
+FADING = (0.03, 0.08)  # [s]: afterwards, what is left of them fades about so fast
+
+
+class Channels(NamedTuple):
+    """Sums of all channels."""
+
+    rates: Channel
+    """Roll and pitch."""
+    yaw: Channel
+    thrust: Channel
+    """Thrust by differences of velocities."""
+    force: Channel
+    """Thrust by accelerations."""
+
+
+class Reading(NamedTuple):
+    """What one sensor says in a tick."""
+
+    value: Float[Array, " axes"]
+    usable: Bool[Array, ""]
+    kinds: tuple[tuple[float, float], ...]
+    """Possible kinds of its noise."""
+    age: Float[Array, ""]
+    """Age [s]."""
+    width: float
+    """Length of the mean [s]."""
+
+    def sample(self, axes: slice, other: Float[Array, "axes n"]) -> Sample:
+        """Return the sample of some axes, with their features beside the commands."""
+        value, dtype = self.value[axes], self.age.dtype
+        width = jnp.full((), self.width, dtype)
+        usable = self.usable & jnp.all(jnp.isfinite(value))
+        return Sample(value, other, usable, jnp.array(self.kinds, dtype), self.age, width)
+
+
+class PathState(eqx.Module):
+    """Memory of the estimator."""
+
+    history: CommandHistory
+    x: State
+    """Last measured state."""
+    t: Float[Array, ""]
+    """Its time [s]; minus infinity before the first."""
+    elapsed: Float[Array, ""]
+    """Time since the start [s]."""
+    consistency: Consistency
+    channels: Channels
+    estimate: PathEstimate
+
+
+class PathEstimator(eqx.Module):
+    """Estimates the command path of one vehicle."""
+
+    rates: Prior
+    yaw: Prior
+    thrust: Prior
+    memory: Float[Array, ""]
+    """A measurement counts for 1/e of the newest after this long [s]."""
+    dt: float = eqx.field(static=True)
+    """Control tick [s]."""
+
+    @classmethod
+    def of(cls, dt: float, *, memory: float = 6.0) -> "PathEstimator":
+        """Return the estimator with priors that fit vehicles from 30 g to 3 kg.
+
+        Args:
+            dt: Control tick [s].
+            memory: Time constant of forgetting [s].
+
+        Raises:
+            ValueError: A time is not positive.
+        """
+        if not (dt > 0.0 and memory > dt):
+            raise ValueError(
+                f"PathEstimator: 0 < dt < memory must hold, got dt = {dt}, memory = {memory}; set both in s"
+            )
+        one, no = jnp.ones(()), jnp.zeros(0)
+        rates = Prior(one, 0.15 * one, 0.05 * one, 1.0 * one, no, 0.03 * one, 0.003 * one, 0.0 * one, (9, 9, 5))
+        yaw = Prior(one, 0.15 * one, 0.08 * one, 1.0 * one, no, 0.03 * one, 0.003 * one, 0.0 * one, (5, 7, 5))
+        other = jnp.array([0.5, 20.0, 20.0])  # of drag [1/s] and of what is left of earlier commands [m/s^2]
+        thrust = Prior(
+            one, 0.3 * one, 0.04 * one, 0.8 * one, other, 0.2 * one, 0.02 * one, STANDARD_GRAVITY * one, (7, 9, 1)
+        )
+        return cls(rates, yaw, thrust, memory * one, dt)
+
+    def init(self, x: State) -> PathState:
+        """Return the memory of a vehicle that has hovered until now, measured at ``x``."""
+        channels = Channels(
+            channel_before(2, self.rates, self.dt),
+            channel_before(1, self.yaw, self.dt),
+            channel_before(1, self.thrust, self.dt),
+            channel_before(1, self.thrust, self.dt),
+        )
+        x = jax.tree.map(lambda leaf: leaf.astype(self.memory.dtype), x)
+        zero = jnp.zeros(())
+        unknown = Estimate(zero, zero, zero, zero, jnp.array(False))
+        estimate = PathEstimate(*(unknown,) * 8)
+        start = Consistency.start(x)
+        return self.estimated(
+            PathState(CommandHistory.at_hover(self.dt), x, zero - jnp.inf, zero, start, channels, estimate)
+        )
+
+    def update(
+        self,
+        s: PathState,
+        t: Float[Array, ""],
+        x: State,
+        omega: Float[Array, "3"] | None = None,
+        a: Float[Array, "3"] | None = None,
+        age: Float[Array, ""] | float = 0.0,
+    ) -> PathState:
+        """Return the memory after a measurement, with a new estimate; for the arguments see :meth:`measured`."""
+        return self.estimated(self.measured(s, t, x, omega, a, age))
+
+    def measured(
+        self,
+        s: PathState,
+        t: Float[Array, ""],
+        x: State,
+        omega: Float[Array, "3"] | None = None,
+        a: Float[Array, "3"] | None = None,
+        age: Float[Array, ""] | float = 0.0,
+    ) -> PathState:
+        """Return the memory after a measurement, with the estimate as it was.
+
+        Args:
+            s: Memory.
+            t: Time since the start of the flight [s].
+            x: Measured state.
+            omega: Measured body rates [rad/s], without latency; None if they are not measured.
+            a: Measured acceleration, the mean over the last tick, world [m/s^2]; None if it is not measured.
+            age: Age of ``x`` [s].
+        """
+        dt, dtype = self.dt, s.elapsed.dtype
+        t, age = jnp.asarray(t, dtype), jnp.asarray(age, dtype)
+        x, omega, a = jax.tree.map(lambda leaf: leaf.astype(dtype), (x, omega, a))
+        successive = follows(t, s.t, dt)
+        consistency = s.consistency.after(s.x, x, dt, successive)
+        certain = successive & consistency.certain
+        missing = jnp.where(jnp.isfinite(s.t), jnp.round((t - s.t) / dt) - 1.0, 0.0)
+        history = s.history.held(missing)
+        features = history.features(dt)
+        none, hover = jnp.zeros((4, 0), dtype), jnp.array([[1.0], [0.0], [0.0], [0.0]], dtype)
+        features = jnp.concatenate([features, hover], axis=1)
+        keep = jnp.exp(-dt / self.memory)
+
+        turning = so3.log(so3.mul(s.x.R.T, x.R)) / dt
+        if omega is None:
+            turned = Reading(turning, certain, DIFFERENCE, age, dt)
+        else:
+            turned = Reading(omega, jnp.all(jnp.abs(omega) < RATE), DIRECT, jnp.zeros_like(age), 0.0)
+            turning = omega
+        now = s.channels
+        rates = now.rates.measured(features[1:3], turned.sample(slice(0, 2), none[1:3]), keep, dt)
+        yaw = now.yaw.measured(features[3:], turned.sample(slice(2, 3), none[3:]), keep, dt)
+
+        settled = certain & (s.elapsed > SETTLING)
+        up = jnp.array([0.0, 0.0, STANDARD_GRAVITY], dtype)
+        axis = 0.5 * (s.x.R + x.R)[:, 2]
+        drag = -0.5 * jnp.sum(axis * (s.x.v + x.v))
+        fading = jnp.exp(-s.elapsed / jnp.array(FADING, dtype))
+        other = jnp.concatenate([drag[None], fading])[None]
+        lift = jnp.sum(axis * ((x.v - s.x.v) / dt + up)) - STANDARD_GRAVITY
+        thrust = now.thrust.measured(
+            features[:1], Reading(lift[None], settled, DIFFERENCE, age, dt).sample(slice(0, 1), other), keep, dt
+        )
+        force = now.force
+        if a is not None:
+            # An accelerometer is not late where the attitude is.
+            turn = so3.exp(age * turning)
+            axis = 0.5 * (so3.mul(s.x.R, turn) + so3.mul(x.R, turn))[:, 2]
+            lift = jnp.sum(axis * (a + up)) - STANDARD_GRAVITY
+            usable = settled & jnp.all(jnp.abs(a) < ACCELERATION)
+            now_read = Reading(lift[None], usable, DIRECT, jnp.zeros_like(age), dt)
+            force = force.measured(features[:1], now_read.sample(slice(0, 1), other), keep, dt)
+        channels = Channels(rates, yaw, thrust, force)
+        return PathState(history, x, t, s.elapsed + dt, consistency, channels, s.estimate)
+
+    def estimated(self, s: PathState) -> PathState:
+        """Return the memory with a new estimate.
+
+        The rates say what the delay is, and accelerations are known before velocities.
+        """
+        channels = s.channels
+        rates = path_posterior(channels.rates, self.rates, None, self.dt)
+        yaw = path_posterior(channels.yaw, self.yaw, delay_belief(rates, self.yaw), self.dt)
+        force = path_posterior(channels.force, self.thrust, delay_belief(rates, self.thrust), self.dt)
+        thrust = path_posterior(channels.thrust, self.thrust, full_belief(force), self.dt)
+        estimate = PathEstimate(
+            delay_estimate(rates),
+            lag_estimate(rates, self.rates.lag_spread),
+            damping_estimate(rates),
+            gain_estimate(rates, self.rates.gain_spread),
+            lag_estimate(yaw, self.yaw.lag_spread),
+            gain_estimate(yaw, self.yaw.gain_spread),
+            lag_estimate(thrust, self.thrust.lag_spread),
+            gain_estimate(thrust, self.thrust.gain_spread),
+        )
+        found = Channels(
+            channels.rates.predicted_by(rates),
+            channels.yaw.predicted_by(yaw),
+            channels.thrust.predicted_by(thrust),
+            channels.force.predicted_by(force),
+        )
+        return dataclasses.replace(s, channels=found, estimate=estimate)
+
+    def issued(self, s: PathState, u: Command) -> PathState:
+        """Return the memory after the command ``u`` was issued for the tick that begins."""
+        return dataclasses.replace(s, history=s.history.issued(_from_hover(u)))
+
+    def accepted(self, s: PathState, u: Command) -> PathState:
+        """Return the memory after the plant accepted ``u`` instead of the command that was issued last."""
+        return dataclasses.replace(s, history=s.history.replaced(_from_hover(u)))
+
+
+def _from_hover(u: Command) -> Float[Array, "4"]:
+    return u.vector() - Command.hover(u.c.dtype).vector()

@@ -1,0 +1,61 @@
+"""Commands of the last second as features that are linear in a step response.
+
+A command that is held over each tick is a sum of steps. Its response is therefore the sum of the steps times the step
+response at their ages. Ages of more than half a second are joined by linear interpolation: the response is smooth.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+SPAN = 1.2  # [s] of commands that are remembered; the response to older ones is complete
+SINGLE = 12  # ages are apart by this share of themselves, but at least by one tick
+
+
+class CommandHistory(eqx.Module):
+    """Commands of the last ticks, oldest first."""
+
+    commands: Float[Array, "k 4"]
+    """[c, omega] as differences from hover [m/s^2, rad/s]."""
+
+    @classmethod
+    def at_hover(cls, dt: float) -> "CommandHistory":
+        """Return the history of a vehicle that has hovered until now."""
+        return cls(jnp.zeros((int(ages(dt)[-1]) + 1, 4)))
+
+    def issued(self, u: Float[Array, "4"]) -> "CommandHistory":
+        """Return the history after one more command."""
+        return CommandHistory(jnp.concatenate([self.commands[1:], u[None].astype(self.commands.dtype)]))
+
+    def replaced(self, u: Float[Array, "4"]) -> "CommandHistory":
+        """Return the history with another last command."""
+        return CommandHistory(jnp.concatenate([self.commands[:-1], u[None].astype(self.commands.dtype)]))
+
+    def held(self, ticks: Float[Array, ""]) -> "CommandHistory":
+        """Return the history after the last command was held for ``ticks`` more ticks."""
+        n = self.commands.shape[0]
+        source = jnp.minimum(jnp.arange(n) + jnp.clip(ticks, 0, n).astype(int), n - 1)
+        return CommandHistory(self.commands[source])
+
+    def features(self, dt: float) -> Float[Array, "4 m"]:
+        """Return the steps at each of the :func:`ages`, and the command before them, of each of the four commands."""
+        newest_first = self.commands[::-1]
+        steps = newest_first[:-1] - newest_first[1:]
+        joined = jnp.asarray(_joining(dt), dtype=steps.dtype) @ steps
+        return jnp.concatenate([joined, newest_first[-1:]]).T
+
+
+def ages(dt: float) -> np.ndarray:
+    """Return the ages of commands for which the step response is evaluated [ticks]."""
+    last, found = round(SPAN / dt), [1]
+    while found[-1] < last:
+        found.append(min(found[-1] + max(1, found[-1] // SINGLE), last))
+    return np.array(found)
+
+
+def _joining(dt: float) -> np.ndarray:
+    """Return the weights of linear interpolation from all ages to :func:`ages`, (m, ticks)."""
+    at = ages(dt)
+    each = np.arange(1, at[-1] + 1)
+    return np.stack([np.interp(each, at, row) for row in np.eye(len(at))])

@@ -1,0 +1,194 @@
+"""Posterior of one channel over delay, lag and damping, on grids that close in on where it lies.
+
+Given these three, gain and noise have a conjugate posterior (normal, inverse gamma), so that they are integrated in
+closed form. The grid covers the ellipsoid in which the posterior of the last tick lies. It moves and shrinks with it. A
+coarse grid over the prior finds where else the posterior may be, for example after a change of the vehicle; it tempers
+the likelihood, since its cells are wider than the ridge. All shapes are fixed and nothing is compiled anew.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .channel import Channel, PathPosterior, Region
+from .grid import cholesky, coarse_grid, moments, unit_grid
+from .history import ages
+from .prior import MOST_RINGING, Belief, GainPrior, Prior, gain_prior, log_prior
+from .response import mean_step_response
+
+TEMPER = 0.03  # share of the information that a coarse grid uses
+ELSEWHERE = 2.0  # by so much must the log posterior be larger outside of the grid to leave it
+WIDER = 1.2  # the next grid covers this times the covariance, since a posterior may also widen
+COARSE = 0.35  # share of the spacing of a grid that is the least deviation of the next one
+GAINS = (0.2, 5.0)  # within which a gain is linearised
+FREEDOM = 2.0  # twice the shape of the inverse gamma prior of the variance of the noise
+
+
+class _Sums(NamedTuple):
+    """Sums without the other features, added over the axes."""
+
+    uu: Float[Array, "*kinds m m"]
+    uz: Float[Array, "*kinds m"]
+    zz: Float[Array, "*kinds"]
+    half_log: Float[Array, "*kinds"]
+    total: Float[Array, ""]
+    """Sum of the weights of the measurements."""
+
+
+class _Fit(NamedTuple):
+    """What the sums say of each cell."""
+
+    log_likelihood: Float[Array, " cells"]
+    gain: Float[Array, " cells"]
+    gain_variance: Float[Array, " cells"]
+    variance: Float[Array, " cells"]
+
+
+def path_posterior(channel: Channel, prior: Prior, belief: Belief | None, dt: float) -> PathPosterior:
+    """Return the posterior of a channel.
+
+    Args:
+        channel: Its sums.
+        prior: What is known before any flight.
+        belief: What other channels say; None if this one is the first.
+        dt: Control tick [s].
+    """
+    sums = _without_others(channel, prior)
+    grid, step = (jnp.asarray(x, channel.response.dtype) for x in unit_grid(prior.cells))
+
+    def likelihood_of(cells: Float[Array, "cells 3"], one: _Sums) -> tuple[_Fit, Float[Array, "cells m"]]:
+        h = responses(cells, channel.age, channel.width, prior.hover, dt)
+        return _fit(one, h, channel, prior, gain_prior(cells, prior, belief)), h
+
+    def around(region: Region) -> tuple[Float[Array, "cells 3"], Float[Array, "3 3"]]:
+        factor = cholesky(region.covariance)
+        least = (factor * (COARSE * step[None]) ** 2) @ factor.T
+        return region.mean[None] + grid @ factor.T, least
+
+    def region_of(cells: Float[Array, "cells 3"], fit: _Fit, temper: float, least: Float[Array, "3 3"]) -> Region:
+        weight = _weight(fit.log_likelihood, cells, prior, belief, temper)
+        mean, covariance = moments(cells, weight)
+        return Region(mean, WIDER * covariance + least)
+
+    cells, least = around(channel.region)
+    h = responses(cells, channel.age, channel.width, prior.hover, dt)
+    fits = _fits(sums, h, channel, prior, gain_prior(cells, prior, belief))
+    kind = jnp.argmax(jax.nn.logsumexp(fits.log_likelihood + log_prior(cells, prior, belief)[None], axis=1))
+    one = _Sums(sums.uu[kind], sums.uz[kind], sums.zz[kind], sums.half_log[kind], sums.total)
+    fit: _Fit = jax.tree.map(lambda leaf: leaf[kind], fits)
+    region = region_of(cells, fit, 1.0, least)
+    coarse, within = coarse_grid(prior, belief)
+    far, _ = likelihood_of(coarse, one)
+    best, found = (
+        jnp.max(each.log_likelihood + log_prior(at, prior, belief)) for each, at in ((far, coarse), (fit, cells))
+    )
+    restart = region_of(coarse, far, TEMPER, within)
+    region = jax.tree.map(lambda new, old: jnp.where(best > found + ELSEWHERE, new, old), restart, region)
+    cells, least = around(region)
+    fit, h = likelihood_of(cells, one)
+    weight = _weight(fit.log_likelihood, cells, prior, belief, 1.0)
+    scaled = fit.gain[:, None] * h
+    response = weight @ scaled
+    off, middle = scaled - response[None], weight @ h
+    spread = (weight[:, None] * off).T @ off + (weight @ fit.gain_variance) * jnp.outer(middle, middle)
+    noise = jnp.sqrt(weight @ fit.variance)
+    region = region_of(cells, fit, 1.0, least)
+    return PathPosterior(cells, weight, fit.gain, fit.gain_variance, response, spread, noise, kind, region)
+
+
+def log_likelihood(
+    channel: Channel, prior: Prior, cells: Float[Array, "cells 3"], dt: float
+) -> Float[Array, "kinds cells"]:
+    """Return the log likelihood of some cells for each kind of noise, up to a constant; for the arguments see above."""
+    sums, h = _without_others(channel, prior), responses(cells, channel.age, channel.width, prior.hover, dt)
+    return _fits(sums, h, channel, prior, gain_prior(cells, prior, None)).log_likelihood
+
+
+def channel_before(axes: int, prior: Prior, dt: float) -> Channel:
+    """Return a channel before the first measurement; its ``axes`` share all parameters but their disturbances."""
+    cells, within = coarse_grid(prior, None)
+    zero = jnp.zeros(())
+    h, weight = responses(cells, zero, zero, prior.hover, dt), jax.nn.softmax(log_prior(cells, prior, None))
+    response = prior.gain * weight @ h
+    off = prior.gain * h - response[None]
+    spread = (weight[:, None] * off).T @ off + prior.gain_spread**2 * jnp.outer(response, response)
+    mean, covariance = moments(cells, weight)
+    return Channel.start(axes, prior.other.shape[0], response, spread, prior.noise, Region(mean, covariance + within))
+
+
+def responses(
+    cells: Float[Array, "cells 3"],
+    age: Float[Array, ""],
+    width: Float[Array, ""],
+    hover: Float[Array, ""],
+    dt: float,
+) -> Float[Array, "cells m"]:
+    """Return what each cell makes of the features of the commands.
+
+    Args:
+        cells: Delay [s], logarithm of the lag [s], ringing.
+        age: Time since the end of the measured mean [s].
+        width: Length of the mean [s].
+        hover: Command from which the features are differences.
+        dt: Control tick [s].
+    """
+    delay, lag, ringing = cells[:, :1], jnp.exp(cells[:, 1:2]), jnp.clip(cells[:, 2:], 0.0, MOST_RINGING)
+    t = dt * jnp.asarray(ages(dt), dtype=cells.dtype)[None] - delay - age
+    settled = jnp.ones_like(delay)
+    return jnp.concatenate([mean_step_response(t, width, lag, ringing), settled, hover * settled], axis=1)
+
+
+def _without_others(channel: Channel, prior: Prior) -> _Sums:
+    """Integrate over the coefficients of the other features, one after another, and add the axes."""
+    m = channel.response.shape[0]
+    # The sum of squared weights corrects the information for forgetting: old measurements are known in part.
+    temper = channel.count / jnp.maximum(channel.squares, 1.0)
+    products = temper * channel.products
+    for i in range(prior.other.shape[0]):
+        row = products[..., m + i, :]
+        pivot = row[..., m + i] + (channel.noise / prior.other[i]) ** 2
+        products -= row[..., :, None] * row[..., None, :] / pivot[..., None, None]
+    products = jnp.sum(products, axis=1)
+    return _Sums(
+        products[:, :m, :m],
+        products[:, :m, -1],
+        products[:, -1, -1],
+        temper * channel.half_log,
+        temper * channel.count,
+    )
+
+
+def _fits(sums: _Sums, h: Float[Array, "cells m"], channel: Channel, prior: Prior, gain: GainPrior) -> _Fit:
+    """Return :func:`_fit` for each kind of noise."""
+    parts = (sums.uu, sums.uz, sums.zz, sums.half_log)
+    return jax.vmap(lambda uu, uz, zz, half: _fit(_Sums(uu, uz, zz, half, sums.total), h, channel, prior, gain))(*parts)
+
+
+def _fit(sums: _Sums, h: Float[Array, "cells m"], channel: Channel, prior: Prior, gain: GainPrior) -> _Fit:
+    """Integrate over gain and noise; everything is a difference from the present prediction of the channel."""
+    g = jnp.clip(channel.response[-2], *GAINS)
+    away = g * h - channel.response[None]
+    across = away @ sums.uu
+    alone = sums.zz - 2.0 * away @ sums.uz + jnp.sum(away * across, axis=1)
+    slope = jnp.sum(h * (sums.uz[None] - across), axis=1)
+    square = jnp.sum(h * (across + (sums.uu @ channel.response)[None]), axis=1) / g
+    # The prior of the gain counts like one measurement of it.
+    before, off = (channel.noise / gain.spread) ** 2, gain.mean - g
+    square, slope, alone = jnp.maximum(square, 0.0) + before, slope + before * off, alone + before * off**2
+    left = jnp.maximum(alone - slope**2 / square, 0.0) + sums.total * prior.floor**2 + FREEDOM * prior.noise**2
+    freedom = sums.total + FREEDOM
+    variance = left / freedom
+    likelihood = -0.5 * jnp.log(square / before) - 0.5 * freedom * jnp.log(left) - sums.half_log
+    return _Fit(likelihood, g + slope / square, variance / square, variance)
+
+
+def _weight(
+    likelihood: Float[Array, " cells"],
+    cells: Float[Array, "cells 3"],
+    prior: Prior,
+    belief: Belief | None,
+    temper: float,
+) -> Float[Array, " cells"]:
+    return jax.nn.softmax(temper * likelihood + log_prior(cells, prior, belief))

@@ -1,0 +1,283 @@
+"""The posterior of the command path is exact, covers what it says, and counts only what belongs to it."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import integrate
+
+from path_flight import DT, LEVELS, Vehicles, doublets, fly, random_vehicles
+from retrim.control.excitation import Excitation
+from retrim.estimation.command_path import PathEstimator, describe_path, noise, posterior
+from retrim.estimation.command_path.channel import Sample
+from retrim.estimation.command_path.history import CommandHistory
+from retrim.estimation.command_path.response import mean_step_response, ringing_of
+from retrim.physics.state import Command, State
+
+ESTIMATOR = PathEstimator.of(DT)
+
+
+@eqx.filter_jit
+def estimates(rows, age, inertial):
+    """Return the state at the end, and the estimates of all ticks."""
+
+    def tick(s, row):
+        t, p, R, v, omega, a, u = row
+        s = ESTIMATOR.update(s, t, State(p, R, v), omega if inertial else None, a if inertial else None, age)
+        return ESTIMATOR.issued(s, Command.of(u)), s.estimate
+
+    return jax.lax.scan(tick, ESTIMATOR.init(State(*(row[0] for row in rows[1:4]))), rows)
+
+
+def estimate(flights, i=0, *, inertial=True, start=0.0, ticks=None, **changed):
+    """Return the estimates of flight ``i`` as NumPy arrays over time."""
+    chosen = {
+        name: np.array(getattr(flights, name)[i][:ticks]) for name in ("p", "R", "v", "omega", "a", "u")
+    } | changed
+    t = start + DT * np.arange(len(chosen["u"]))
+    rows = tuple(jnp.asarray(x, jnp.float32) for x in (t, *chosen.values()))
+    return jax.tree.map(np.asarray, estimates(rows, jnp.float32(flights.age), inertial)[1])
+
+
+def one_vehicle(**changed):
+    """Return a vehicle in the middle of the ranges."""
+    typical = {
+        "delay": 0.03,
+        "rate_lag": 0.06,
+        "rate_damping": 0.8,
+        "yaw_lag": 0.1,
+        "thrust_gain": 0.8,
+        "thrust_lag": 0.04,
+    }
+    return Vehicles(*(np.array([x]) for x in (typical | changed).values()))
+
+
+@pytest.mark.parametrize(("lag", "damping"), [(0.1, 0.4), (0.05, 0.7), (0.08, 1.0), (0.03, 1.2), (0.05, 20.0)])
+@pytest.mark.parametrize("width", [0.0, 0.02])
+def test_a_step_response_solves_its_differential_equation(lag, damping, width):
+    natural, times = 2.0 * damping / lag, np.linspace(0.0, 0.4, 4001)
+
+    def A(t, y):
+        return [y[1], natural**2 * (1.0 - y[0]) - 2.0 * damping * natural * y[1], y[0]]
+
+    y = integrate.solve_ivp(A, (0.0, 0.4), [0.0, 0.0, 0.0], t_eval=times, rtol=1e-8, atol=1e-10, method="LSODA").y
+    before = np.interp(times - width, times, y[2])
+    wanted = (y[2] - before) / width if width else y[0]
+    found = mean_step_response(jnp.array(times), jnp.array(width), jnp.array(lag), jnp.array(ringing_of(damping)))
+    np.testing.assert_allclose(found, wanted, atol=2e-3 if damping > 5 else 5e-4)
+
+
+def _linear_channel(kind, kinds, sigma, n=60):
+    """Return a channel with the sums of a linear vehicle, and what went into them."""
+    rng, prior = np.random.default_rng(3), dataclasses.replace(ESTIMATOR.yaw, cells=(11, 11, 7))
+    channel, history = posterior.channel_before(1, prior, DT), CommandHistory.at_hover(DT)
+    cell = jnp.array([[0.03, np.log(0.07), ringing_of(0.8)]])
+    h = np.asarray(posterior.responses(cell, jnp.zeros(()), jnp.zeros(()), prior.hover, DT))[0]
+    rows, values, e_old = [], [], rng.normal()
+    for k in range(n):
+        features = np.append(np.asarray(history.features(DT))[3], 0.0)
+        e = rng.normal()
+        value = 1.1 * features @ h + 0.2 + sigma * (e - kinds[kind][0] * e_old)
+        e_old = e
+        rows.append(features)
+        values.append(value)
+        sample = Sample(
+            jnp.array([value], float),
+            jnp.zeros((1, 0)),
+            jnp.array(True),
+            jnp.array(kinds),
+            jnp.zeros(()),
+            jnp.zeros(()),
+        )
+        channel = channel.measured(jnp.array(features, float)[None], sample, jnp.ones(()), DT)
+        if k % 10 == 9:
+            channel = channel.predicted_by(posterior.path_posterior(channel, prior, None, DT))
+        u = np.array([0.0, 0.0, 0.0, rng.choice([-1.0, 1.0])])
+        history = history.issued(jnp.array(u, float))
+    return channel, prior, np.array(rows), np.array(values)
+
+
+def _brute_force(cells, kind, channel, prior, rows, values):
+    """Return the log likelihood of each cell by the dense covariance of all measurements, in double precision."""
+    n, (mu, wander) = len(values), kind
+    step = np.minimum.outer(np.arange(n), np.arange(n))
+    dense = noise.DIFFUSE + wander * step + (1.0 + mu**2) * np.eye(n) - mu * (np.eye(n, k=1) + np.eye(n, k=-1))
+    h = np.asarray(posterior.responses(cells, jnp.zeros(()), jnp.zeros(()), prior.hover, DT), float)
+    y = rows @ h.T
+    left = values[:, None] - float(prior.gain) * y
+    loading = y * float(prior.gain_spread) / float(channel.noise)
+    solved = np.linalg.solve(dense, loading)
+    # The covariance of each cell is ``dense`` and the square of its loading: Sherman and Morrison.
+    extra = 1.0 + np.sum(loading * solved, axis=0)
+    square = np.sum(left * np.linalg.solve(dense, left), axis=0) - np.sum(left * solved, axis=0) ** 2 / extra
+    square += n * float(prior.floor) ** 2 + posterior.FREEDOM * float(prior.noise) ** 2
+    half_log = 0.5 * (np.linalg.slogdet(dense)[1] + np.log(extra))
+    return -half_log - 0.5 * (n + posterior.FREEDOM) * np.log(square)
+
+
+@pytest.mark.parametrize(("kinds", "kind", "sigma"), [(noise.DIRECT, 0, 0.05), (noise.DIFFERENCE, 0, 0.1)])
+def test_it_is_the_exact_posterior_of_a_linear_vehicle(kinds, kind, sigma):
+    channel, prior, rows, values = _linear_channel(kind, kinds, sigma)
+    found = posterior.path_posterior(channel, prior, None, DT)
+    chosen = kinds[int(found.kind)]
+    axes = np.linspace(0.0, 0.06, 49), np.log(np.geomspace(0.04, 0.14, 49)), np.linspace(0.01, 0.85, 29)
+    grid = np.meshgrid(*axes, indexing="ij")
+    cells = np.stack([x.ravel() for x in grid], axis=1)
+    exact = _brute_force(jnp.array(cells, float), chosen, channel, prior, rows, values)
+    log_prior = -0.5 * ((cells[:, 1] - np.log(float(prior.lag))) / float(prior.lag_spread)) ** 2
+    weight = np.exp(exact + log_prior - np.max(exact + log_prior))
+    weight /= weight.sum()
+    for i in range(3):
+        mean = weight @ cells[:, i]
+        deviation = np.sqrt(weight @ (cells[:, i] - mean) ** 2)
+        mine = float(found.weight @ found.cells[:, i])
+        spread = np.sqrt(float(found.weight @ (found.cells[:, i] - mine) ** 2))
+        assert abs(mine - mean) < 0.25 * deviation
+        assert 0.75 < spread / deviation < 1.3
+    likely = np.asarray(found.cells)[np.argsort(-np.asarray(found.weight))[:50]]
+    again = _brute_force(jnp.array(likely, float), chosen, channel, prior, rows, values)
+    here = np.asarray(posterior.log_likelihood(channel, prior, jnp.array(likely), DT))[int(found.kind)]
+    np.testing.assert_allclose(here - here[0], again - again[0], atol=0.1)
+
+
+@pytest.fixture(scope="module")
+def many():
+    """A hundred random vehicles, excited for a second, with the sensors ``onboard``."""
+    rng = np.random.default_rng(20)
+    vehicles = random_vehicles(rng, 100)
+    flights = fly(rng, vehicles, LEVELS["onboard"], 1.0, doublets)
+    return vehicles, [estimate(flights, i) for i in range(100)]
+
+
+def test_a_hundred_vehicles_are_identified_within_a_second(many):
+    vehicles, found = many
+    delay, lag, gain = (
+        np.array([getattr(each, name).mean[-1] for each in found]) for name in ("delay", "rate_lag", "thrust_gain")
+    )
+    assert np.mean(np.abs(delay - vehicles.delay) < 0.008) >= 0.97
+    assert np.mean(np.abs(lag / vehicles.rate_lag - 1.0) < 0.2) >= 0.95
+    assert np.mean(np.abs(gain / vehicles.thrust_gain - 1.0) < 0.02) >= 0.85
+
+
+@pytest.mark.parametrize("name", ["delay", "rate_lag", "yaw_lag", "thrust_gain", "thrust_lag"])
+def test_intervals_cover_what_they_state(many, name):
+    vehicles, found = many
+    low, high = (np.array([getattr(getattr(each, name), end)[-1] for each in found]) for end in ("low", "high"))
+    truth = getattr(vehicles, name)
+    assert 0.82 <= np.mean((low <= truth) & (truth <= high)) <= 1.0
+    assert all(getattr(each, name).excited[-1] for each in found)
+
+
+def test_roll_and_pitch_may_change_places_and_clocks_may_start_anywhere():
+    flights = fly(np.random.default_rng(1), one_vehicle(), LEVELS["mocap"], 1.0, doublets)
+    plain, later = estimate(flights), estimate(flights, start=37.0)
+    u, omega = flights.u[0].copy(), flights.omega[0].copy()
+    u[:, [1, 2]], omega[:, [0, 1]] = u[:, [2, 1]], omega[:, [1, 0]]
+    swapped = estimate(flights, u=u, omega=omega)
+    for name in ("delay", "rate_lag", "rate_gain"):
+        one, two, three = (getattr(each, name) for each in (plain, swapped, later))
+        assert abs(one.mean[-1] - two.mean[-1]) < 0.05 * one.deviation[-1]
+        assert abs(one.mean[-1] - three.mean[-1]) < 0.05 * one.deviation[-1]
+
+
+def test_nothing_is_compiled_for_other_values():
+    traced = []
+
+    @jax.jit
+    def update(s, t, x, omega, a, age, u):
+        traced.append(1)
+        return ESTIMATOR.issued(ESTIMATOR.update(s, t, x, omega, a, age), u)
+
+    for delay in (0.01, 0.053):
+        flights = fly(np.random.default_rng(2), one_vehicle(delay=delay), LEVELS["rough"], 0.2, doublets)
+        p, R, v, omega, a, u = (jnp.asarray(x[0], jnp.float32) for x in flights[:6])
+        s = ESTIMATOR.init(State(p[0], R[0], v[0]))
+        for k in range(10):
+            s = update(
+                s,
+                jnp.float32(k * DT),
+                State(p[k], R[k], v[k]),
+                omega[k],
+                a[k],
+                jnp.float32(flights.age),
+                Command.of(u[k]),
+            )
+    assert len(traced) == 1
+
+
+@pytest.mark.parametrize("inertial", [True, False])
+def test_a_vehicle_at_rest_says_nothing(inertial):
+    """A constant push at hover is not mistaken for a gain of the thrust."""
+    rng, n = np.random.default_rng(4), 150
+    R = np.tile(np.eye(3), (n, 1, 1))
+    u = np.tile([8.0, 0.0, 0.0, 0.0], (n, 1))
+    quiet = {"p": 1e-4 * rng.normal(size=(n, 3)), "R": R, "v": 3e-3 * rng.normal(size=(n, 3)), "u": u}
+    quiet |= {"omega": 0.02 * rng.normal(size=(n, 3)), "a": 0.2 * rng.normal(size=(n, 3))}
+    flights = fly(rng, one_vehicle(), LEVELS["ideal"], n * DT)
+    found = estimate(flights, inertial=inertial, **{name: quiet[name] for name in ("p", "R", "v", "omega", "a", "u")})
+    for name in ("delay", "rate_lag", "rate_gain", "yaw_lag"):
+        assert not getattr(found, name).excited[-1], name
+    assert found.thrust_gain.deviation[-1] > 0.1
+    assert "not excited" in describe_path(jax.tree.map(lambda leaf: leaf[-1], found))
+
+
+def test_wrong_measurements_do_not_move_it():
+    flights = fly(np.random.default_rng(5), one_vehicle(), LEVELS["mocap"], 1.6, doublets)
+    p, R, v, omega, a = (np.array(x[0]) for x in flights[:5])
+    omega[[55, 62, 70]] += [8.0, -6.0, 5.0]
+    v[58] += 3.0
+    p[66], R[66], v[66] = p[65], R[65], v[65]
+    a[[57, 73]] -= 25.0
+    good, bad = estimate(flights), estimate(flights, p=p, R=R, v=v, omega=omega, a=a)
+    for name in ("delay", "rate_lag", "rate_gain", "thrust_gain"):
+        one, two = getattr(good, name), getattr(bad, name)
+        assert abs(one.mean[-1] - two.mean[-1]) < 0.7 * one.deviation[-1], name
+        assert two.deviation[-1] < 1.4 * one.deviation[-1], name
+
+
+def test_it_follows_a_change_of_the_vehicle():
+    def excited(t):
+        return doublets(t % 1.0)
+
+    before, after = one_vehicle(rate_lag=0.04), one_vehicle(rate_lag=0.1)
+    flights = fly(np.random.default_rng(6), before, LEVELS["onboard"], 7.0, excited, after, 2.0)
+    found = estimate(flights)
+    assert found.rate_lag.mean[95] == pytest.approx(0.04, rel=0.1)
+    assert found.rate_lag.mean[-1] == pytest.approx(0.1, rel=0.2)
+
+
+def test_the_line_that_reports_it():
+    flights = fly(np.random.default_rng(7), one_vehicle(), LEVELS["ideal"], 1.0, doublets)
+    last = jax.tree.map(lambda leaf: leaf[-1], estimate(flights))
+    assert describe_path(last, (0.02, 0.015)) == (
+        "thrust gain 0.80 ± 0.01; rate delay 30 ms, lag 60 ms (vehicle file: 20 ms, 15 ms)"
+    )
+    delay, lag = last.first_order()
+    assert float(delay + lag) == pytest.approx(0.09, abs=0.002)
+    assert 0.5 < float(lag) / 0.06 < 0.8
+
+
+def test_excitation_is_bounded_returns_and_stops():
+    excitation, s = Excitation.of(), ESTIMATOR.init(State.at(jnp.zeros(3)))
+    times = jnp.arange(0.0, 0.48, 0.004)
+    c = jax.vmap(lambda t: excitation(t, s.estimate).c)(times)
+    v = np.cumsum(c) * 0.004
+    p = np.cumsum(v) * 0.004
+    assert np.abs(c).max() == 2.0
+    assert np.abs(p).max() < 0.04
+    assert abs(v[-1]) < 0.02
+    assert abs(p[-1]) < 0.004
+    flights = fly(np.random.default_rng(8), one_vehicle(), LEVELS["ideal"], 1.0, doublets)
+    narrow = jax.tree.map(lambda leaf: jnp.asarray(leaf[-1]), estimate(flights))
+    np.testing.assert_array_equal(excitation(jnp.array(0.1), narrow).vector(), 0.0)
+    np.testing.assert_array_equal(excitation(jnp.array(4.0), s.estimate).vector(), 0.0)
+
+
+def test_wrong_settings_are_refused():
+    with pytest.raises(ValueError, match="0 < dt < memory must hold, got dt = 0"):
+        PathEstimator.of(0.0)
+    with pytest.raises(ValueError, match="margins must be positive"):
+        Excitation.of(delay_margin=0.0)
