@@ -108,8 +108,8 @@ PRESETS: dict[str, Preset] = {
     "hover/released": Preset(
         name="hover/released", command_history=3, delay_ticks=2, pretrain=Pretrain(num_updates=200, num_envs=200)
     ),
-    # As printed: o = [p, R, v], no delay in the model, 300 x 100 x 150. The paper gives no rates of an update: with 1e-3
-    # for all weights the noise of ten starts moves the policy by more than a small push.
+    # As printed: o = [p, R, v], no delay in the model, 300 x 100 x 150. The paper gives no learning rates of an update.
+    # At 1e-3 for all weights, the noise of ten starts moves the policy by more than a small push does.
     "hover/paper": Preset(adapt=Adapt(learning_rate=5e-4, low_rank_learning_rate=1e-3)),
     # hover/fast at 100 Hz: the same times, twice the ticks.
     "hover/100hz": dataclasses.replace(
