@@ -27,19 +27,23 @@ class RelativeObs(AbstractObservation[Float[Array, "history 4"]]):
     @property
     def size(self) -> int:
         """Length of the observation: 15 + 4 ``history``."""
-        return 15 + 4 * self.history
+        return self._own.size
 
     def init(self, x: State) -> Float[Array, "history 4"]:
         """Return the memory of a vehicle that has hovered until now."""
-        return jnp.zeros((self.history, 4), dtype=x.p.dtype)
+        return self._own.init(x)
 
     def __call__(
         self, memory: Float[Array, "history 4"], t: Float[Array, ""], x: State, last: Command
     ) -> tuple[Float[Array, " o"], Float[Array, "history 4"]]:
         """Return the scaled state relative to the reference, in world axes, and the commands."""
         here = self.reference(t)
-        own = StateObs(jnp.zeros_like(x.p), self.omega_max, self.history)
-        return own(memory, t, State(x.p - here.p, x.R, x.v - here.v), last)
+        return self._own(memory, t, State(x.p - here.p, x.R, x.v - here.v), last)
+
+    @property
+    def _own(self) -> StateObs:
+        """Observation of the state in axes that move with the reference."""
+        return StateObs(jnp.zeros_like(self.omega_max), self.omega_max, self.history)
 
     def in_frame(self, frame: FeltFrame) -> "RelativeObs":
         """Return the observation relative to the turned reference."""
