@@ -40,16 +40,16 @@ TRACKS: dict[str, type[AbstractTrack]] = {"paper": PaperTrack, "l2": L2Track, "s
 
 @dataclass(frozen=True)
 class TaskRequest:
-    """What a preset asks of a task."""
+    """Inputs from which a task is built."""
 
     preset: Preset
     vehicle: Vehicle
     reference: Reference | None = None
-    """What is tracked; None for a task that tracks nothing."""
+    """Reference of a tracking task; None for other tasks."""
 
     @property
     def options(self) -> Mapping[str, Any]:
-        """The preset's free table, for a task of one's own."""
+        """The free table of the preset, for custom tasks."""
         return self.preset.options
 
     def state_observation(self) -> StateObs:
@@ -67,7 +67,7 @@ class TaskEntry:
 
     make: Callable[[TaskRequest], AbstractTask]
     default_preset: str = "hover/fast"
-    """Preset that is trained unless another is asked for."""
+    """Default preset of training."""
     has_reference: bool = False
     """Whether it tracks a reference."""
 
@@ -94,7 +94,7 @@ def make_task(request: TaskRequest) -> AbstractTask:
     """Build the preset's task.
 
     Raises:
-        ConfigError: There is no such task, or what the entry gives is none.
+        ConfigError: The task does not exist, or its entry does not return an ``AbstractTask``.
     """
     name = request.preset.task
     task = find_task(name).make(request)
@@ -123,7 +123,7 @@ def _vision(request: TaskRequest) -> AbstractTask:
         jnp.array(p.goal), omega_max, noise=table.pixel_noise, whitened=table.whiten_pixels, dt=p.dt
     )
     flown: OccludedKeypoints | None = None
-    if table.occlusion:  # a filter estimates the pose so well that training need not know of it
+    if table.occlusion:  # the filter estimates the pose accurately, so training can ignore it
         lag = lag_of(p, request.vehicle)
         flown = OccludedKeypoints(training, jnp.array(table.dropout), lag, delay_ticks=p.plant_delay_ticks)
     kind = VISION_REWARDS[p.reward]

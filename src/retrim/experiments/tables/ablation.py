@@ -1,4 +1,4 @@
-"""Which lever does what: each off our preset, each on the paper's, beside control without learning."""
+"""Ablation: each lever removed from the default preset and added to the paper's, beside control without learning."""
 
 from collections.abc import Sequence
 from dataclasses import replace
