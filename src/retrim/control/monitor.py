@@ -28,6 +28,7 @@ from ..tasks.task import AbstractTask
 from .condition import Cause, Condition, Stage
 from .controller import AbstractController, PolicyController
 from .gravity_frame import GravityFrame, GravityFrameState
+from .near_target import NearTarget
 from .policy import Policy
 from .swings import Swings
 
@@ -40,6 +41,7 @@ CALM = 2.0  # swings up to which the estimate has its full weight
 LAUNCH, LAUNCH_SWINGS = 3.0, 4.0  # [s] at the start with a lower limit: no kick has come, and a start is a large swing
 RAMP = 0.2  # [s] at the start, within which the estimate gains its weight: a launch with late measurements drives it
 HOLD = 10.0  # [s] before the first return
+REACH, WIDENING = 0.3, 0.1  # [m] and [m/s]: after an oscillation, the base policy sees no larger error at first
 MEAN_TAU = 1.0  # [s], of the mean of the estimate
 
 
@@ -104,7 +106,11 @@ class Monitor(AbstractController[MonitorState]):
         slow = memory.stage == Stage.SLOW
         flying = dataclasses.replace(
             self.frame,
-            inner=PolicyController(self._inner.observation, where(adapted, self._inner.policy, memory.base)),
+            inner=NearTarget(
+                PolicyController(self._inner.observation, where(adapted, self._inner.policy, memory.base)),
+                self.task,
+                self._reach(memory),
+            ),
             trust_estimate=observed.astype(x.p.dtype) * self._trust(memory, t),
             trust_known=adapted.astype(x.p.dtype),
             steady=slow.astype(x.p.dtype) * memory.d,
@@ -127,6 +133,15 @@ class Monitor(AbstractController[MonitorState]):
         limit = _limit(t)
         calm = jnp.clip((limit - memory.swings.size) / (limit - CALM), 0.0, 1.0)
         return calm * jnp.minimum(1.0, t / RAMP).astype(calm.dtype)
+
+    def _reach(self, memory: MonitorState) -> Float[Array, ""]:
+        """Return the largest error that the policy sees [m].
+
+        With late measurements, a large error makes a policy oscillate that flies well near its target. The limit grows,
+        since a push that nobody answers needs an error to hold against it.
+        """
+        swung = (memory.cause == Cause.OSCILLATION) & (memory.stage == Stage.BASE)
+        return jnp.where(swung, REACH + WIDENING * (HOLD - jnp.minimum(memory.wait, HOLD)), jnp.inf)
 
     @property
     def _inner(self) -> PolicyController:

@@ -1,0 +1,46 @@
+"""A controller that sees no vehicle far from its target."""
+
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..physics.felt_frame import FeltFrame
+from ..physics.state import Command, State
+from ..tasks.task import AbstractTask
+from .controller import AbstractController
+
+
+class NearTarget(AbstractController[Any]):
+    """Shows a controller the vehicle at ``reach`` from the target where it is farther away.
+
+    The commands of a policy grow with the distance. Where measurements are late, a policy that is stable near its
+    target may oscillate and crash from far away.
+    """
+
+    inner: AbstractController[Any]
+    task: AbstractTask
+    """It says where the target is."""
+    reach: Float[Array, ""]
+    """Largest distance that is shown, in the coordinates of the controller [m]."""
+
+    def init(self, x: State) -> Any:
+        """Return the memory of the controller inside."""
+        return self.inner.init(x)
+
+    def __call__(self, memory: Any, t: Float[Array, ""], x: State) -> tuple[Command, Any]:
+        """Decide as the controller inside does for a vehicle that is near."""
+        target = self.task.target(t)
+        away = x.p - target
+        distance = jnp.sqrt(jnp.sum(away * away) + 1e-12)
+        reach = self.reach.astype(x.p.dtype)
+        near = jnp.where(distance > reach, target + away * (reach / distance), x.p)
+        return self.inner(memory, t, State(near, x.R, x.v))
+
+    def accepted(self, memory: Any, u: Command) -> Any:
+        """Pass the accepted command on."""
+        return self.inner.accepted(memory, u)
+
+    def in_frame(self, frame: FeltFrame) -> "NearTarget":
+        """Return the same for states and commands of ``frame``."""
+        return NearTarget(self.inner.in_frame(frame), self.task.in_frame(frame), self.reach)

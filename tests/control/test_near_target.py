@@ -1,0 +1,58 @@
+"""A controller behind NearTarget: unchanged near the target, and from far away that of a vehicle at the limit."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import random
+
+from helpers import hover_task, random_state
+from retrim.control import Policy, PolicyController
+from retrim.control.near_target import NearTarget
+from retrim.physics import State, small
+from retrim.physics.felt_frame import FeltFrame
+
+REACH = 0.3
+
+
+@pytest.fixture(scope="module")
+def controller():
+    task = hover_task()
+    policy = Policy.of(task.observation.size, small(), key=random.key(1), hidden=(16, 16))
+    inner = PolicyController(task.observation, jax.tree.map(lambda leaf: 3.0 * leaf, policy))
+    return NearTarget(inner, task, jnp.array(REACH))
+
+
+@eqx.filter_jit
+def command(controller, x):
+    return controller(controller.init(x), jnp.zeros(()), x)[0].vector()
+
+
+@pytest.mark.parametrize("distance", [0.0, 0.1, 0.29, 0.31, 2.0, 50.0])
+def test_the_controller_sees_no_larger_error_than_the_limit(controller, distance):
+    x = random_state(random.key(0))
+    direction = x.p / jnp.linalg.norm(x.p)
+    far, shown = (
+        State(controller.task.home() + each * direction, x.R, x.v) for each in (distance, min(distance, REACH))
+    )
+    np.testing.assert_allclose(command(controller, far), command(controller.inner, shown), rtol=1e-5, atol=1e-5)
+
+
+def test_an_infinite_limit_changes_nothing(controller):
+    wide = NearTarget(controller.inner, controller.task, jnp.array(jnp.inf))
+    x = random_state(random.key(2))
+    np.testing.assert_array_equal(command(wide, x), command(controller.inner, x))
+
+
+def test_it_turns_with_its_task(controller):
+    frame, x = FeltFrame.of(jnp.array([1.0, -2.0, 0.5])), random_state(random.key(3))
+    turned, seen = controller.in_frame(frame), frame.state(x)
+    home = turned.task.home()
+    near = home + REACH * (seen.p - home) / jnp.linalg.norm(seen.p - home)
+    np.testing.assert_allclose(
+        command(turned, seen),
+        command(controller.inner.in_frame(frame), State(near, seen.R, seen.v)),
+        rtol=1e-5,
+        atol=1e-5,
+    )
