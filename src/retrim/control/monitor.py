@@ -38,7 +38,6 @@ STRIKES = 3  # intervals in a row; a vehicle recovers from the largest kick of t
 LOST = 3.0  # [m]: a twin with a larger error begins again at the vehicle
 SWINGS = 8.0  # the largest kick of the gauntlet reaches 6.7; measurements 60 ms late drive the estimate beyond 8
 CALM = 2.0  # swings up to which the estimate has its full weight
-LAUNCH, LAUNCH_SWINGS = 3.0, 4.0  # [s] at the start with a lower limit: no kick has come, and a start is a large swing
 RAMP = 0.2  # [s] at the start, within which the estimate gains its weight: a launch with late measurements drives it
 HOLD = 10.0  # [s] before the first return
 REACH, WIDENING = 0.3, 0.1  # [m] and [m/s]: after an oscillation, the base policy sees no larger error at first
@@ -130,8 +129,7 @@ class Monitor(AbstractController[MonitorState]):
 
     def _trust(self, memory: MonitorState, t: Float[Array, ""]) -> Float[Array, ""]:
         """Return the weight of the estimate: small at the launch, and the smaller the more the estimate swings."""
-        limit = _limit(t)
-        calm = jnp.clip((limit - memory.swings.size) / (limit - CALM), 0.0, 1.0)
+        calm = jnp.clip((SWINGS - memory.swings.size) / (SWINGS - CALM), 0.0, 1.0)
         return calm * jnp.minimum(1.0, t / RAMP).astype(calm.dtype)
 
     def _reach(self, memory: MonitorState) -> Float[Array, ""]:
@@ -160,7 +158,7 @@ class Monitor(AbstractController[MonitorState]):
         strikes = jnp.where(over, jnp.where(worse, s.strikes + 1, 0), s.strikes)
         strikes = jnp.where(over & (excess > FAR), STRIKES, strikes)
         failed = (strikes >= STRIKES) & (s.stage < Stage.BASE)
-        swung = swings.size > _limit(t)
+        swung = swings.size > SWINGS
         wait = jnp.maximum(s.wait - dt, 0.0)
         returns = over & ~worse & ~failed & (wait <= 0.0) & (s.stage > s.best)
         stage = s.stage + failed.astype(s.stage.dtype) - returns.astype(s.stage.dtype)
@@ -192,8 +190,3 @@ class Monitor(AbstractController[MonitorState]):
         u, memory = base(memory, t, at)
         after = nominal.state(nominal.step(nominal.init(at), u, s.d))
         return Twin(after, memory, s.twin.excess + jnp.where(near, excess, 0.0), s.twin.ticks + 1)
-
-
-def _limit(t: Float[Array, ""]) -> Float[Array, ""]:
-    """Return the size of swings beyond which the base policy flies, at time ``t`` of the flight [s]."""
-    return jnp.where(t < LAUNCH, LAUNCH_SWINGS, SWINGS)
