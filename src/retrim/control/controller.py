@@ -1,6 +1,7 @@
 """Controllers: functions from time and state to a command, with a memory of fixed shape."""
 
 import abc
+import dataclasses
 from typing import Any, Generic, TypeVar
 
 import equinox as eqx
@@ -8,7 +9,9 @@ import jax
 from jaxtyping import Array, Float
 
 from ..errors import FrameError
+from ..physics.actuator_response import ActuatorState
 from ..physics.felt_frame import FeltFrame
+from ..physics.path_family import Member
 from ..physics.state import Command, State
 from ..tasks.observation import AbstractObservation
 from .condition import Condition
@@ -57,6 +60,24 @@ class AbstractController(eqx.Module, Generic[M]):
         del omega, a
         return self
 
+    def with_vehicle(self, member: Member) -> "AbstractController[M]":
+        """Return the same controller for a vehicle that was identified; by default it does not use it.
+
+        Args:
+            member: Its most likely command path, and the belief about it.
+        """
+        del member
+        return self
+
+    def acting(self, actuators: ActuatorState) -> "AbstractController[M]":
+        """Return the same controller for a tick in which thrust and rates are known; by default it does not use them.
+
+        Args:
+            actuators: Present thrust and body rates.
+        """
+        del actuators
+        return self
+
     def condition(self, memory: M) -> Condition | None:
         """Return how far the controller has stepped back from its full function; None if it never does."""
         del memory
@@ -94,6 +115,14 @@ class PolicyController(AbstractController[tuple[Any, Command]]):
         """Remember ``u`` as the last command."""
         return memory[0], u
 
+    def with_vehicle(self, member: Member) -> "PolicyController":
+        """Return the same policy behind the observation of a vehicle that was identified."""
+        return dataclasses.replace(self, observation=self.observation.believing(member.belief))
+
+    def acting(self, actuators: ActuatorState) -> "PolicyController":
+        """Return the same policy behind the observation of a vehicle whose thrust and rates are known."""
+        return dataclasses.replace(self, observation=self.observation.acting(actuators))
+
     def in_frame(self, frame: FeltFrame) -> "PolicyController":
         """Return the same policy behind the turned observation."""
-        return PolicyController(self.observation.in_frame(frame), self.policy)
+        return dataclasses.replace(self, observation=self.observation.in_frame(frame))

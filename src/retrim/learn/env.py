@@ -5,15 +5,16 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-from jax import lax
-from jaxtyping import Array, Float
+from jax import lax, random
+from jaxtyping import Array, Float, Key
 
 from ..physics.actuators import with_response
 from ..physics.command_path import LONGEST_DELAY, CommandPath, check_delay
 from ..physics.dynamics import AbstractDynamics, Hybrid, Residual
 from ..physics.felt_frame import FeltFrame
+from ..physics.path_family import PathFamily
 from ..physics.state import Command, State
-from ..tasks.task import AbstractTask
+from ..tasks.task import AbstractTask, Start
 
 
 class Env(eqx.Module):
@@ -29,6 +30,8 @@ class Env(eqx.Module):
     state and the last command, world [m/s^2]; None if the policy sees the world as it is."""
     jump_cost: Float[Array, ""] | None = None
     """Cost of the squared change of a policy's command from tick to tick, [c, omega] in m/s^2 and rad/s; None: none."""
+    family: PathFamily | None = None
+    """Vehicles that training draws, each with a belief about it; None: training has the vehicle of the model."""
     longest_delay: float = eqx.field(static=True, default=LONGEST_DELAY)
     """Longest delay that a roll-out has room for [s]."""
 
@@ -52,6 +55,13 @@ class Env(eqx.Module):
             path: Its delay and the response of its actuators.
         """
         return dataclasses.replace(self, dynamics=with_response(self.dynamics, path.response), delay=path.delay)
+
+    def reset(self, key: Key[Array, ""]) -> Start:
+        """Draw a start of training, with a vehicle of the family if there is one; the key is consumed."""
+        if self.family is None:
+            return self.task.reset(key)
+        k_start, k_member = random.split(key)
+        return dataclasses.replace(self.task.reset(k_start), member=self.family.draw(k_member))
 
     def frame(self, x: State, last: Command) -> FeltFrame | None:
         """Return the frame in which the policy sees the world, without gradients through it; None for the world's own.

@@ -38,7 +38,7 @@ def train_chunk(
     Training is cut into such chunks, so that progress can be shown and an interrupted run keeps what it has. Several
     devices share the starts of each step.
     """
-    starts = spread(random_starts(env.task, key, num_updates, num_envs), axis=1)
+    starts = spread(jax.vmap(jax.vmap(env.reset))(random.split(key, (num_updates, num_envs))), axis=1)
     return whole(bptt(state, env, starts, optimiser=optimiser), num_envs)
 
 

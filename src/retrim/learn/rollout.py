@@ -63,6 +63,8 @@ def perturbed_rollout(
 
 
 def _scan(env: Env, policy: Policy, start: Start, perturbations: Perturbations | None) -> tuple[Trajectory, Inputs]:
+    if start.member is not None:
+        env = env.with_path(start.member.path)
     dynamics, task = env.dynamics, env.task
     calm = jnp.zeros_like(start.x.p)
     hover = policy.u_hover
@@ -80,7 +82,12 @@ def _scan(env: Env, policy: Policy, start: Start, perturbations: Perturbations |
         t = start.t + k * task.dt
         x = dynamics.state(s)
         frame, seen, x_seen = framed(x, issued)
-        o, memory = seen.observation(memory, t, x_seen, last)
+        actuators, observation = dynamics.actuators(s), seen.observation
+        if actuators is not None:
+            observation = observation.acting(actuators if frame is None else frame.actuators(actuators))
+        if start.member is not None:
+            observation = observation.believing(start.member.belief)
+        o, memory = observation(memory, t, x_seen, last)
         before = last
         last, inputs = (policy(o), ()) if perturbation is None else policy.perturbed(o, perturbation)
         issued = last if frame is None else frame.world_command(last)

@@ -102,6 +102,10 @@ class Lagged(AbstractDynamics[LagState[X]]):
         """Replace (p, R, v); hidden state stays."""
         return LagState(self.base.with_state(s.inner, x), s.actuators)
 
+    def actuators(self, s: LagState[X]) -> ActuatorState:
+        """Return the present thrust and body rates."""
+        return s.actuators
+
     def step(self, s: LagState[X], u: Command, a_ext: Float[Array, "3"]) -> LagState[X]:
         """Advance one tick under the mean of what acts over it."""
         away, actuators = self.response(s.actuators, u, self.dt)

@@ -20,6 +20,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from . import so3
+from .actuator_response import ActuatorState
 from .state import STANDARD_GRAVITY, Command, State, StateDot
 
 X = TypeVar("X")
@@ -52,6 +53,11 @@ class AbstractDynamics(eqx.Module, Generic[X]):
     @abc.abstractmethod
     def with_state(self, s: X, x: State) -> X:
         """Return ``s`` with (p, R, v) replaced; hidden state stays."""
+
+    def actuators(self, s: X) -> ActuatorState | None:
+        """Return the present thrust and body rates; None for a model that follows commands at once."""
+        del s
+        return None
 
     @abc.abstractmethod
     def step(self, s: X, u: Command, a_ext: Float[Array, "3"]) -> X:
@@ -143,6 +149,10 @@ class AbstractWrapper(AbstractDynamics[X]):
         """Replace (p, R, v); hidden state stays."""
         return self.base.with_state(s, x)
 
+    def actuators(self, s: X) -> ActuatorState | None:
+        """Return the present thrust and body rates of the base model."""
+        return self.base.actuators(s)
+
 
 class Hybrid(AbstractWrapper[X]):
     """Any model plus a residual, evaluated once and held over the tick (paper, Sec. III-E).
@@ -196,6 +206,10 @@ class StraightThrough(AbstractDynamics[X]):
     def with_state(self, s: X, x: State) -> X:
         """Replace (p, R, v); hidden state stays."""
         return self.forward.with_state(s, x)
+
+    def actuators(self, s: X) -> ActuatorState | None:
+        """Return the present thrust and body rates of the forward model."""
+        return self.forward.actuators(s)
 
     def step(self, s: X, u: Command, a_ext: Float[Array, "3"]) -> X:
         """Advance the forward model, with the backward model's derivative at the same state and command."""

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from . import so3
+from .actuator_response import ActuatorState
 from .state import STANDARD_GRAVITY, Command, State
 
 
@@ -60,6 +61,10 @@ class FeltFrame(eqx.Module):
     def command(self, u: Command) -> Command:
         """Return a command of the world, in the frame; body rates are the same."""
         return Command(self.scale * u.c, u.omega)
+
+    def actuators(self, s: ActuatorState) -> ActuatorState:
+        """Return thrust and body rates of the world, in the frame; body rates are the same."""
+        return ActuatorState(self.command(s.command), s.slope)
 
     def world_command(self, u: Command) -> Command:
         """Return a command of the frame, in the world."""

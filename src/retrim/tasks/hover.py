@@ -100,6 +100,21 @@ class L2Hover(AbstractHover):
         return _printed(self.target(t), x, u) - 3.0 * tip
 
 
+class StiffHover(AbstractHover):
+    """Hover with a reward for stiffness: commands and velocity cost a tenth and a fifth of what the paper takes.
+
+    A stiff policy moves less under a push. It needs a model with the delay and the lag of the vehicle.
+    """
+
+    def reward(self, t: Float[Array, ""], x: State, u: Command) -> Float[Array, ""]:
+        """Return the reward; its tip of 20 (sqrt(|p - goal|^2 + (1 cm)^2) - 1 cm) dominates near the goal."""
+        away = x.p - self.target(t)
+        tip = jnp.sqrt(jnp.sum(away**2) + 0.01**2) - 0.01
+        r_pos = -1.0 * huber(5.0 * away) - 20.0 * tip
+        r_vel = -0.02 * huber(x.v) - 0.1 * huber(u.omega)
+        return r_pos + r_vel - 0.05 * huber(u.vector() - Command.hover().vector())
+
+
 def _printed(goal: Float[Array, "3"], x: State, u: Command) -> Float[Array, ""]:
     """The paper's reward."""
     r_pos = -1.0 * huber(5.0 * (x.p - goal))

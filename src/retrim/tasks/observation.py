@@ -8,7 +8,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..errors import FrameError
+from ..physics.actuator_response import ActuatorState
 from ..physics.felt_frame import FeltFrame
+from ..physics.path_family import PathBelief
 from ..physics.state import STANDARD_GRAVITY, Command, State
 
 M = TypeVar("M")
@@ -47,6 +49,24 @@ class AbstractObservation(eqx.Module, Generic[M]):
         """Return what a vehicle sees that has rested in ``x``; an observation with noise overrides it, to show none."""
         o, _ = self(self.init(x), jnp.zeros_like(x.p[0]), x, Command.hover(x.p.dtype))
         return o
+
+    def believing(self, belief: PathBelief) -> "AbstractObservation[M]":
+        """Return the same observation of a vehicle of which more is known; by default the policy does not observe it.
+
+        Args:
+            belief: What is known of the command path.
+        """
+        del belief
+        return self
+
+    def acting(self, actuators: ActuatorState) -> "AbstractObservation[M]":
+        """Return the same observation while thrust and rates act that no command says; by default it has none of them.
+
+        Args:
+            actuators: Present thrust and body rates.
+        """
+        del actuators
+        return self
 
     def in_frame(self, frame: FeltFrame) -> "AbstractObservation[M]":
         """Return the same observation for states and commands of ``frame``.

@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Key
 
 from ..errors import FrameError
 from ..physics.felt_frame import FeltFrame
+from ..physics.path_family import Member
 from ..physics.state import STANDARD_GRAVITY, Command, State
 from .abstract_reference import Point
 from .observation import AbstractObservation
@@ -21,6 +22,8 @@ class Start(eqx.Module):
     t: Float[Array, ""]
     """Time of the task [s]: a reference may be joined anywhere."""
     x: State
+    member: Member | None = None
+    """Vehicle that flies, and what its policy knows of it; None for the vehicle of the model."""
 
 
 class AbstractTask(eqx.Module):

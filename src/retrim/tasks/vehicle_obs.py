@@ -1,0 +1,80 @@
+"""Observation of a policy for many vehicles: that of its task, the actuators, and the belief about the vehicle."""
+
+import dataclasses
+from typing import Any, TypeVar
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..physics.actuator_response import ActuatorState
+from ..physics.felt_frame import FeltFrame
+from ..physics.path_family import COORDINATES, PathBelief
+from ..physics.state import STANDARD_GRAVITY, Command, State
+from .observation import AbstractObservation
+
+M = TypeVar("M")
+
+
+class VehicleObs(AbstractObservation[M]):
+    """o = [o of the task, thrust, body rates and their slope, belief]: 15 more numbers than the task shows.
+
+    The task should show as many past commands as the longest delay has ticks: they tell what is still under way. A slow
+    vehicle goes on turning for long after the last of them, hence thrust and rates. The belief is the centre and the
+    half width of the interval of each coordinate of the command path; see
+    :class:`~retrim.physics.path_family.PathBelief`.
+    """
+
+    inner: AbstractObservation[M]
+    """Observation of the task."""
+    omega_max: Float[Array, "3"]
+    """Scale of body rates [rad/s]."""
+    belief: PathBelief
+    actuators: ActuatorState
+    """Present thrust and body rates."""
+
+    @classmethod
+    def of(cls, inner: AbstractObservation[M], omega_max: Float[Array, "3"], belief: PathBelief) -> "VehicleObs[M]":
+        """Return the observation of a vehicle that hovers.
+
+        Args:
+            inner: Observation of the task.
+            omega_max: Scale of body rates [rad/s].
+            belief: What is known of the vehicle.
+        """
+        return cls(inner, omega_max, belief, ActuatorState.at(Command.hover()))
+
+    @property
+    def size(self) -> int:
+        """Length of the observation: that of the task's, and 15."""
+        return self.inner.size + 7 + 2 * COORDINATES
+
+    def init(self, x: State) -> M:
+        """Return the memory of a vehicle that has hovered until now."""
+        return self.inner.init(x)
+
+    def __call__(self, memory: M, t: Float[Array, ""], x: State, last: Command) -> tuple[Float[Array, " o"], M]:
+        """Return the scaled numbers."""
+        seen, memory = self.inner(memory, t, x, last)
+        acting, slope = self.actuators.command, self.actuators.slope
+        thrust = (acting.c / STANDARD_GRAVITY - 1.0)[None]
+        scaled = (thrust, acting.omega / self.omega_max, slope / self.omega_max, self.belief.vector())
+        return jnp.concatenate([seen, *(each.astype(seen.dtype) for each in scaled)]), memory
+
+    def believing(self, belief: PathBelief) -> "VehicleObs[M]":
+        """Return the same observation with another belief."""
+        return dataclasses.replace(self, belief=belief)
+
+    def acting(self, actuators: ActuatorState) -> "VehicleObs[M]":
+        """Return the same observation with the present thrust and body rates."""
+        return dataclasses.replace(self, actuators=actuators)
+
+    def at_rest(self, x: State) -> Float[Array, " o"]:
+        """Return the observation of a vehicle that rests in ``x``."""
+        hover = Command.hover(x.p.dtype)
+        still = self.acting(ActuatorState.at(hover))
+        return still(self.init(x), jnp.zeros_like(x.p[0]), x, hover)[0]
+
+    def in_frame(self, frame: FeltFrame) -> "VehicleObs[M]":
+        """Return the observation in ``frame``; the actuators that it is given are of that frame, too."""
+        turned: AbstractObservation[Any] = self.inner.in_frame(frame)
+        return dataclasses.replace(self, inner=turned)
