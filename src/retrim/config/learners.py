@@ -12,10 +12,12 @@ from ..adapt.learner import OnlineLearner
 from ..adapt.optimisers import CarriedAdam, FreshAdam
 from ..adapt.starts import FlownStarts, TaskStarts
 from ..adapt.trim import RestTrim, Untrimmed
+from ..adapt.vehicles import IdentifiedVehicle, OwnVehicle
 from ..adapt.views import AbstractView, GravityView, RestView, WorldView
 from ..control.controller import AbstractController, PolicyController
 from ..control.gravity_frame import GravityFrame, SeenFrame
 from ..errors import ConfigError, FrameError
+from ..estimation.command_path import PathEstimator
 from ..estimation.disturbance_observer import DisturbanceObserver
 from ..learn.env import Env
 from ..learn.residuals.model import FittedResidual, ResidualModel
@@ -59,7 +61,7 @@ def make_learner(preset: Preset, model: ResidualModel, env: Env) -> OnlineLearne
     Raises:
         ConfigError: The preset turns the frame of a task that cannot be turned, or trims one that does not rest.
     """
-    a = preset.adapt
+    a, family = preset.adapt, env.family
     if a.frame != "world":
         check_frame(preset, env.task)
     if a.trim == "rest" and find_task(preset.task).has_reference:
@@ -71,12 +73,13 @@ def make_learner(preset: Preset, model: ResidualModel, env: Env) -> OnlineLearne
         env,
         model,
         optimiser,
-        plant_delay_ticks=preset.plant_delay_ticks,
+        plant_delay_ticks=preset.plant_delay_ticks if family is None else 0,  # the identified path has the delay
         num_updates=a.num_updates,
         num_envs=a.num_envs,
         starts=TaskStarts() if a.task_starts is None else FlownStarts(jnp.array(a.start_noise), a.task_starts),
         view=_view(preset, env.task),
         trim=RestTrim() if a.trim == "rest" else Untrimmed(),
+        vehicles=OwnVehicle() if family is None else IdentifiedVehicle(PathEstimator.of(preset.dt), family),
         low_rank_optimiser=low_rank,
     )
 

@@ -21,6 +21,7 @@ from ..runtime.pilot import ControllerPilot, Pilot
 from ..tasks.keypoints import Keypoints
 from ..tasks.occluded import OccludedKeypoints
 from .baselines import BASELINES, Baseline, datt_of
+from .families import identified, policy_controller, tracked
 from .learners import check_frame, felt_frame
 from .on_board import raptor
 from .registry import Registry
@@ -44,7 +45,16 @@ class MethodRequest:
 
     def controller(self) -> PolicyController:
         """Return the policy behind the observation of flight."""
-        return PolicyController(self.setup.flown.observation_in_flight, self.policy.merged())
+        return policy_controller(self.setup.preset, self.setup.flown, self.policy.merged())
+
+    def in_felt_frame(self) -> AbstractController[Any]:
+        """Return the policy in the gravity that is felt.
+
+        Raises:
+            ConfigError: The task cannot be turned.
+        """
+        check_frame(self.setup.preset, self.setup.env.task)
+        return tracked(felt_frame(self.controller(), self.setup.preset, self.setup.vehicle), self.setup.preset)
 
     def by_state(self, controller: AbstractController[Any], called: str | None = None) -> AbstractController[Any]:
         """Return a controller that needs the state as it can be flown: by a pose filter where keypoints are seen.
@@ -115,20 +125,22 @@ def find_method(name: str) -> MethodEntry:
 
 
 def _base(request: MethodRequest) -> Pilot:
-    return ControllerPilot(request.controller())
+    return ControllerPilot(tracked(request.controller(), request.setup.preset))
 
 
 def _integral(request: MethodRequest) -> Pilot:
     if isinstance(request.setup.env.task.observation, Keypoints):
         raise ConfigError("method 'base-i' shifts the measured position; a policy that sees keypoints is shown none")
-    return ControllerPilot(
-        IntegralAction(request.controller(), request.setup.flown, gain=jnp.array(0.8), limit=jnp.array(2.0))
-    )
+    integral = IntegralAction(request.controller(), request.setup.flown, gain=jnp.array(0.8), limit=jnp.array(2.0))
+    return ControllerPilot(tracked(integral, request.setup.preset))
 
 
 def _gravity_frame(request: MethodRequest) -> Pilot:
-    check_frame(request.setup.preset, request.setup.env.task)
-    return ControllerPilot(felt_frame(request.controller(), request.setup.preset, request.setup.vehicle))
+    return ControllerPilot(request.in_felt_frame())
+
+
+def _identified(request: MethodRequest) -> Pilot:
+    return ControllerPilot(identified(request.in_felt_frame(), request.setup.preset))
 
 
 def _without_policy(name: str, baseline: Baseline, request: MethodRequest) -> Pilot:
@@ -160,6 +172,7 @@ def _lora(request: MethodRequest) -> Pilot:
 register_method("base", MethodEntry(_base, "base policy"))
 register_method("base-i", MethodEntry(_integral, "base policy + integral action"))
 register_method("base-do", MethodEntry(_gravity_frame, "base policy + disturbance observer"))
+register_method("base-id", MethodEntry(_identified, "base policy + observer + identification"))
 for _name, _baseline in BASELINES.items():
     register_method(_name, MethodEntry(partial(_without_policy, _name, _baseline), _baseline.label))
 register_method("datt", MethodEntry(_datt, "DATT"))

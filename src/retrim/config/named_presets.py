@@ -3,7 +3,7 @@
 import dataclasses
 
 from ..tasks.hover import TILT
-from .presets import Adapt, Preset, Pretrain, Track, Vision
+from .presets import Adapt, Family, Preset, Pretrain, Track, Vision
 
 TRACK = Preset(
     name="track/preview",
@@ -50,6 +50,20 @@ RETRIM = dataclasses.replace(
         trim="rest", fit_latency=0.02, update_latency=0.1,
     ),
 )  # fmt: skip
+
+# One policy for many vehicles: it observes what is known of its vehicle, and that is identified in flight.
+ANY = dataclasses.replace(
+    RETRIM,
+    name="hover/any",
+    reward="stiff",
+    command_history=6,
+    jump_cost=0.05,
+    family=Family(),
+    pretrain=dataclasses.replace(
+        RETRIM.pretrain, num_updates=1000, num_envs=64, learning_rate=5e-3, hidden_sizes=(256, 256)
+    ),
+    adapt=dataclasses.replace(RETRIM.adapt, window=150, trim="free"),  # in flight, its output is shifted at each tick
+)
 
 FELT = Track(reference="circle+figure8+star", observation="flat", felt_copies=7)
 TRACK_RETRIM = dataclasses.replace(
@@ -98,6 +112,8 @@ PAPER_TRACK = Preset(
 PRESETS: dict[str, Preset] = {
     # Ours: the frame of the gravity that is felt answers in a second, short bursts of learning take what it leaves.
     "hover/retrim": RETRIM,
+    # The same for any vehicle of a family, which is identified in flight.
+    "hover/any": ANY,
     # The same for tracking: trained on references as they are and as they are felt under a push.
     "track/retrim": TRACK_RETRIM,
     # The same at up to 8 m/s, for the kingfisher.

@@ -16,6 +16,7 @@ from .vehicle_file import VehicleSpec
 STRICT = ConfigDict(extra="forbid")
 BUILT_IN_TASKS = ("hover", "track", "vision")
 Positive = Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False, strict=True)]
+NotNegative = Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False, strict=True)]
 Count = Annotated[int, Field(ge=1, le=1_000_000, strict=True)]
 LearningRate = Annotated[float, Field(gt=0, le=10.0, strict=True)]
 Seconds = Annotated[float, Field(ge=1e-3, le=3600.0, strict=True)]
@@ -137,15 +138,32 @@ class Vision:
 
 
 @dataclass(frozen=True, config=STRICT)
+class Family:
+    """The vehicles that one policy is trained for, by their command paths. The policy observes what is known of its
+    vehicle: a vehicle file, and the identification in flight."""
+
+    delay: tuple[NotNegative, Positive] = (0.0, 0.1)
+    """Shortest and longest delay of commands [s]."""
+    rate_lag: tuple[Positive, Positive] = (0.01, 0.25)
+    """Smallest and largest time constant of the body rates, 2 zeta / omega_n [s]."""
+    least_damping: Positive = 0.4
+    """Smallest damping ratio zeta of the rate loop."""
+    thrust_lag: tuple[Positive, Positive] = (0.01, 0.15)
+    """Smallest and largest time constant of the thrust [s]."""
+    least_frequency: Positive = 4.0
+    """Smallest natural frequency omega_n of a rate loop [rad/s]; a slower one rings less."""
+
+
+@dataclass(frozen=True, config=STRICT)
 class Preset:
     """An experiment."""
 
     name: Plain = "hover/paper"
     task: TaskName = "hover"
     """hover, track, vision, or module:name."""
-    reward: Literal["paper", "l2", "sharp", "view"] = "paper"
-    """paper: as printed; l2: ours, with a tip at the goal in hover; sharp: l2 with a tip at the reference, too;
-    view: l2 that keeps keypoints in the image."""
+    reward: Literal["paper", "l2", "stiff", "sharp", "view"] = "paper"
+    """paper: as printed; l2: ours, with a tip at the goal in hover; stiff: in hover, with cheap commands and a steep
+    tip; sharp: l2 with a tip at the reference, too; view: l2 that keeps keypoints in the image."""
     vehicle: Printable | VehicleSpec = "small"
     """Vehicle of training: small, large, kingfisher, module:name, or a vehicle file."""
     dt: float = Field(default=0.02, ge=0.002, le=0.1, strict=True)
@@ -166,6 +184,8 @@ class Preset:
     """Cost of the squared change of the command from tick to tick, c in m/s^2 and rates in rad/s."""
     track: Track | None = None
     vision: Vision | None = None
+    family: Family | None = None
+    """Vehicles of training; None: the vehicle alone."""
     options: dict[str, Any] = Field(default_factory=dict)
     """Free table for a task of one's own."""
     pretrain: Pretrain = Field(default_factory=Pretrain)
@@ -177,9 +197,17 @@ class Preset:
         for name in ("track", "vision"):
             if getattr(self, name) is not None and self.task != name:
                 raise ValueError(f"a table [{name}] needs task = {name!r}, not {self.task!r}")
-        for reward, task in (("sharp", "track"), ("view", "vision")):
+        for reward, task in (("stiff", "hover"), ("sharp", "track"), ("view", "vision")):
             if self.reward == reward and self.task != task:
                 raise ValueError(f"reward = {reward!r} is for task = {task!r}, not for {self.task!r}")
+        if self.family is not None:
+            if self.task == "vision":
+                raise ValueError("a table [family] is for a task with a measured state, not for 'vision'")
+            if self.command_history * self.dt < self.family.delay[1]:
+                raise ValueError(
+                    f"command_history = {self.command_history} ticks must cover family.delay up to "
+                    f"{self.family.delay[1]:g} s, that is {math.ceil(self.family.delay[1] / self.dt - 1e-6)} ticks"
+                )
         if self.adapt.trim == "rest" and self.adapt.frame == "world":
             raise ValueError("adapt.trim = 'rest' needs adapt.frame = 'gravity': a push is part of hover there only")
         if self.options and self.task in BUILT_IN_TASKS:

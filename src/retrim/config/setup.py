@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Key
 
 from ..adapt.learner import LearnerState, OnlineLearner
 from ..adapt.workers import PolicyWorker, ResidualWorker
-from ..control.controller import AbstractController, PolicyController
+from ..control.controller import AbstractController
 from ..control.gravity_frame import GravityFrame
 from ..control.lora import LoraPolicy
 from ..control.monitor import Monitor
@@ -36,6 +36,7 @@ from ..tasks.motions import MOTIONS
 from ..tasks.reference import Reference
 from ..tasks.task import AbstractTask
 from .command_paths import delayed, longest_delay, model_path
+from .families import identified, make_family, policy_controller, tracked
 from .fresh import flight_starts, low_rank, untrained
 from .learners import felt_frame, make_learner, nominal_model, pretraining_optimiser
 from .presets import Preset
@@ -100,7 +101,14 @@ class Setup:
             nominal = nominal_model(preset, vehicle)
             jumps = jnp.array(preset.jump_cost) if preset.jump_cost else None
             path = model_path(preset, vehicle)
-            env = Env(nominal, task, path.delay, jump_cost=jumps, longest_delay=longest_delay(preset))
+            env = Env(
+                nominal,
+                task,
+                path.delay,
+                jump_cost=jumps,
+                family=make_family(preset),
+                longest_delay=longest_delay(preset),
+            )
             model = residual_model or make_residual(ResidualRequest(preset, vehicle))
             learner = make_learner(preset, model, dataclasses.replace(env, task=flown))
         except (TypeError, ValueError) as error:
@@ -203,12 +211,15 @@ class Setup:
 
         In the frame of effective gravity a monitor steps back from what was learned if that makes the flight worse.
         """
-        plain = PolicyController(self.flown.observation_in_flight, state.policy.policy.merged())
+        plain = policy_controller(self.preset, self.flown, state.policy.policy.merged())
         if self.preset.adapt.frame == "world":
-            return plain
+            return tracked(plain, self.preset)
         known = FittedResidual(self.learner.residual_model, state.residual)
         frame = felt_frame(plain, self.preset, self.vehicle, known)
-        return Monitor(frame, self.flown) if isinstance(frame, GravityFrame) else frame
+        if not isinstance(frame, GravityFrame):
+            return frame
+        monitor = tracked(Monitor(frame, self.flown), self.preset)
+        return monitor if self.preset.family is None else identified(monitor, self.preset)
 
     def low_rank(self, policy: Policy | LoraPolicy, key: Key[Array, ""]) -> LoraPolicy:
         """Return ``policy`` with a fresh low-rank delta (ranks 4, 10, 1 and scale 4, as in the paper).

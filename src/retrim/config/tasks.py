@@ -8,8 +8,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..errors import ConfigError
+from ..physics.path_family import PathBelief
 from ..physics.vehicle import Vehicle
-from ..tasks.hover import AbstractHover, Hover, L2Hover
+from ..tasks.hover import AbstractHover, Hover, L2Hover, StiffHover
 from ..tasks.keypoints import Keypoints
 from ..tasks.observation import AbstractObservation, StateObs
 from ..tasks.occluded import OccludedKeypoints
@@ -19,6 +20,7 @@ from ..tasks.task import AbstractTask
 from ..tasks.track import AbstractTrack, L2Track, SharpTrack
 from ..tasks.track import Track as PaperTrack
 from ..tasks.tracking_error import RelativeObs, StateAndErrorObs
+from ..tasks.vehicle_obs import VehicleObs
 from ..tasks.view import ViewHover
 from .command_paths import lag_of
 from .presets import Preset
@@ -27,6 +29,7 @@ from .presets import Vision as VisionTable
 from .registry import Registry
 
 LEAD = 0.04  # [s]: about as late as commands act, behind a delay and motors
+HOVER_REWARDS: dict[str, type[AbstractHover]] = {"paper": Hover, "l2": L2Hover, "stiff": StiffHover}
 VISION_REWARDS: dict[str, type[AbstractHover]] = {"paper": Hover, "l2": L2Hover, "view": ViewHover}
 TRACK_OBSERVATIONS: dict[str, Callable[["TaskRequest", Reference], AbstractObservation[Any]]] = {
     "blind": lambda request, reference: request.state_observation(),
@@ -55,6 +58,12 @@ class TaskRequest:
     def state_observation(self) -> StateObs:
         """Return the paper's observation, o = [p, R, v], with the preset's past commands."""
         return StateObs(jnp.array(self.preset.goal), *self.observed_commands())
+
+    def of_vehicle(self, observation: AbstractObservation[Any]) -> AbstractObservation[Any]:
+        """Return an observation that shows the vehicle, too, if the preset is for a family of vehicles."""
+        if self.preset.family is None:
+            return observation
+        return VehicleObs.of(observation, self.vehicle.omega_max, PathBelief.unknown())
 
     def observed_commands(self) -> tuple[Float[Array, "3"], int]:
         """Return the scale of observed body rates [rad/s], and the number of observed past commands."""
@@ -105,10 +114,10 @@ def make_task(request: TaskRequest) -> AbstractTask:
 
 def _hover(request: TaskRequest) -> AbstractTask:
     p = request.preset
-    kind = L2Hover if p.reward == "l2" else Hover
+    kind = HOVER_REWARDS.get(p.reward, Hover)
     return kind(
         jnp.array(p.goal),
-        request.state_observation(),
+        request.of_vehicle(request.state_observation()),
         jnp.array(p.termination_box),
         jnp.array(p.pretrain.max_start_yaw),
         p.dt,
@@ -145,7 +154,7 @@ def _track(request: TaskRequest) -> AbstractTask:
     kind = TRACKS[p.reward]
     return kind(
         request.reference,
-        TRACK_OBSERVATIONS[table.observation](request, request.reference),
+        request.of_vehicle(TRACK_OBSERVATIONS[table.observation](request, request.reference)),
         jnp.array(table.start_spread),
         jnp.array(p.termination_box),
         p.dt,

@@ -7,7 +7,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from ..physics.actuator_response import ActuatorState
 from ..physics.felt_frame import FeltFrame
+from ..physics.path_family import Member
 from ..physics.state import Command, State
 from .controller import AbstractController
 
@@ -62,6 +64,14 @@ class FiniteController(AbstractController[FiniteMemory[Any]]):
     def sensing(self, omega: Float[Array, "3"], a: Float[Array, "3"]) -> "FiniteController":
         """Return the same for a tick in which body rates and acceleration were measured."""
         return FiniteController(self.base.sensing(omega, a))
+
+    def with_vehicle(self, member: Member) -> "FiniteController":
+        """Return the same for a vehicle that was identified."""
+        return FiniteController(self.base.with_vehicle(member))
+
+    def acting(self, actuators: ActuatorState) -> "FiniteController":
+        """Return the same for a tick in which thrust and body rates are known."""
+        return FiniteController(self.base.acting(actuators))
 
     def in_frame(self, frame: FeltFrame) -> "FiniteController":
         """Return the same for states and commands of ``frame``."""

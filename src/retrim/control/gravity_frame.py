@@ -15,9 +15,11 @@ from jaxtyping import Array, Float
 
 from ..estimation.disturbance_observer import DisturbanceObserver, ObserverState
 from ..estimation.latency import ahead
+from ..physics.actuator_response import ActuatorState
 from ..physics.command_path import CommandQueue
 from ..physics.dynamics import Hybrid, Residual
 from ..physics.felt_frame import FeltFrame
+from ..physics.path_family import Member
 from ..physics.state import Command, State
 from ..tasks.occluded import OccludedMemory
 from .controller import AbstractController, PolicyController
@@ -49,12 +51,23 @@ class GravityFrame(AbstractController[GravityFrameState]):
     """Share of the disturbance that turns the frame: 0 flies the controller inside as it is."""
     trust_known: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(1.0))
     """Share of what has been learnt, residual and bias of the rates, that is used."""
+    actuators: ActuatorState | None = None
+    """Present thrust and body rates; None: the last command acts."""
     steady: Float[Array, "3"] = eqx.field(default_factory=lambda: jnp.zeros(3))
     """Disturbance that turns the frame beside the estimated one, world [m/s^2]."""
 
     def aged(self, age: float | Float[Array, ""]) -> "GravityFrame":
         """Return the same for measurements that are ``age`` old [s]."""
         return dataclasses.replace(self, age=jnp.array(age))
+
+    def with_vehicle(self, member: Member) -> "GravityFrame":
+        """Return the same for a vehicle that was identified: the observer uses its delay and the lag of its thrust."""
+        observer = dataclasses.replace(self.observer, path=member.path)
+        return dataclasses.replace(self, inner=self.inner.with_vehicle(member), observer=observer)
+
+    def acting(self, actuators: ActuatorState) -> "GravityFrame":
+        """Return the same for a tick in which thrust and body rates are known."""
+        return dataclasses.replace(self, actuators=actuators)
 
     def init(self, x: State) -> GravityFrameState:
         """Return the memory at the start of a flight."""
@@ -76,8 +89,11 @@ class GravityFrame(AbstractController[GravityFrameState]):
         felt = self.trust_estimate.astype(x.p.dtype) * (observed.d_hat + felt) + self.steady.astype(x.p.dtype)
         frame = FeltFrame.of(capped(felt, observer.limit))
         bias, last = self._bias(x.p.dtype), observer.arrival(memory.observer)
-        x = ahead(x, Command(last.c, last.omega + bias), frame.d, self.age.astype(x.p.dtype))
-        u, inner = self.inner.in_frame(frame)(memory.inner, t, frame.state(x))
+        acting, flying = Command(last.c, last.omega + bias), self.inner
+        if self.actuators is not None:
+            acting, flying = self.actuators.command, flying.acting(frame.actuators(self.actuators))
+        x = ahead(x, acting, frame.d, self.age.astype(x.p.dtype))
+        u, inner = flying.in_frame(frame)(memory.inner, t, frame.state(x))
         u = frame.world_command(u)
         u = Command(u.c, u.omega - bias)
         return u, GravityFrameState(observer.issued(observed, u), inner, frame)

@@ -1,11 +1,14 @@
 """Integral action on the position of an unchanged policy: the baseline that learning has to beat in hover."""
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..physics.actuator_response import ActuatorState
+from ..physics.path_family import Member
 from ..physics.state import Command, State
 from ..tasks.task import AbstractTask
 from .controller import AbstractController
@@ -44,3 +47,11 @@ class IntegralAction(AbstractController[IntegralState]):
     def accepted(self, memory: IntegralState, u: Command) -> IntegralState:
         """Pass the accepted command on."""
         return IntegralState(memory.integral, self.inner.accepted(memory.inner, u))
+
+    def with_vehicle(self, member: Member) -> "IntegralAction":
+        """Return the same for a vehicle that was identified."""
+        return dataclasses.replace(self, inner=self.inner.with_vehicle(member))
+
+    def acting(self, actuators: ActuatorState) -> "IntegralAction":
+        """Return the same for a tick in which thrust and body rates are known."""
+        return dataclasses.replace(self, inner=self.inner.acting(actuators))

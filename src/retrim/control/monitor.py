@@ -23,6 +23,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from ..physics.actuator_response import ActuatorState
+from ..physics.command_path import CommandPath, PathState
+from ..physics.path_family import Member
 from ..physics.state import Command, State, where
 from ..tasks.task import AbstractTask
 from .condition import Cause, Condition, Stage
@@ -54,6 +57,8 @@ class Twin(eqx.Module):
     """Sum over the interval of the error of the vehicle minus that of the twin [m]."""
     ticks: Int[Array, ""]
     """Since the start of the interval."""
+    path: PathState | None = None
+    """Command path of the simulated vehicle; None if it follows commands at once."""
 
 
 class MonitorState(eqx.Module):
@@ -86,15 +91,25 @@ class Monitor(AbstractController[MonitorState]):
     """The adapted flight; the controller inside is a :class:`~retrim.control.controller.PolicyController`."""
     task: AbstractTask
     """It measures the error."""
+    path: CommandPath | None = None
+    """Command path of the twin; None: it follows commands at once."""
 
     def aged(self, age: float | Float[Array, ""]) -> "Monitor":
         """Return the same for measurements that are ``age`` old [s]."""
-        return Monitor(self.frame.aged(age), self.task)
+        return dataclasses.replace(self, frame=self.frame.aged(age))
+
+    def with_vehicle(self, member: Member) -> "Monitor":
+        """Return the same for a vehicle that was identified."""
+        return Monitor(self.frame.with_vehicle(member), self.task, member.path)
+
+    def acting(self, actuators: ActuatorState) -> "Monitor":
+        """Return the same for a tick in which thrust and body rates are known."""
+        return dataclasses.replace(self, frame=self.frame.acting(actuators))
 
     def init(self, x: State) -> MonitorState:
         """Return the memory at the start of a flight; the policy of now is the base policy from then on."""
         policy, zero, never = self._inner.policy, jnp.zeros_like(x.p[0]), jnp.array(0)
-        twin = Twin(x, self._inner.init(x), zero, never)
+        twin = Twin(x, self._inner.init(x), zero, never, self._at_hover(x))
         flight, hold = self.frame.init(x), jnp.full_like(zero, HOLD)
         still = jnp.zeros_like(x.p)
         return MonitorState(flight, policy, never, never, never, Swings.none(still), still, twin, never, zero, hold)
@@ -106,7 +121,7 @@ class Monitor(AbstractController[MonitorState]):
         flying = dataclasses.replace(
             self.frame,
             inner=NearTarget(
-                PolicyController(self._inner.observation, where(adapted, self._inner.policy, memory.base)),
+                dataclasses.replace(self._inner, policy=where(adapted, self._inner.policy, memory.base)),
                 self.task,
                 self._reach(memory),
             ),
@@ -175,7 +190,9 @@ class Monitor(AbstractController[MonitorState]):
             best=jnp.where(swung & (s.stage < Stage.BASE), best, s.best),
             swings=where(swung, calm, swings),
             d=d,
-            twin=Twin(twin.x, twin.memory, jnp.where(over, 0.0, twin.excess), jnp.where(over, 0, twin.ticks)),
+            twin=Twin(
+                twin.x, twin.memory, jnp.where(over, 0.0, twin.excess), jnp.where(over, 0, twin.ticks), twin.path
+            ),
             strikes=jnp.where(moved | swung, 0, strikes),
             wait=jnp.where(moved | swung, s.hold, wait),
             hold=jnp.where(failed, 2.0 * s.hold, s.hold),
@@ -183,10 +200,21 @@ class Monitor(AbstractController[MonitorState]):
 
     def _step(self, s: MonitorState, t: Float[Array, ""], x: State) -> Twin:
         """Return the twin one tick later."""
-        nominal, base = self.frame.observer.nominal, PolicyController(self._inner.observation, s.base)
+        nominal, base = self.frame.observer.nominal, dataclasses.replace(self._inner, policy=s.base)
         excess = self.task.error(t, x) - self.task.error(t, s.twin.x)
         near = self.task.error(t, s.twin.x) < LOST  # false for an error that is not a number, too
-        at, memory = where(near, (s.twin.x, s.twin.memory), (x, base.init(x)))
-        u, memory = base(memory, t, at)
-        after = nominal.state(nominal.step(nominal.init(at), u, s.d))
-        return Twin(after, memory, s.twin.excess + jnp.where(near, excess, 0.0), s.twin.ticks + 1)
+        at, memory, path = where(near, (s.twin.x, s.twin.memory, s.twin.path), (x, base.init(x), self._at_hover(x)))
+        if path is None or self.path is None:
+            u, memory = base(memory, t, at)
+            acting = u
+        else:
+            u, memory = base.acting(path.actuators)(memory, t, at)
+            acting, path = self.path(path, u, nominal.dt)
+        after = nominal.state(nominal.step(nominal.init(at), acting, s.d))
+        excess = s.twin.excess + jnp.where(near, excess, 0.0)
+        return Twin(after, memory, excess, s.twin.ticks + 1, path)
+
+    def _at_hover(self, x: State) -> PathState | None:
+        if self.path is None:
+            return None
+        return self.path.init(Command.hover(x.p.dtype), self.frame.observer.nominal.dt)

@@ -5,7 +5,9 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..physics.actuator_response import ActuatorState
 from ..physics.felt_frame import FeltFrame
+from ..physics.path_family import Member
 from ..physics.state import Command, State
 from ..tasks.task import AbstractTask
 from .controller import AbstractController
@@ -40,6 +42,14 @@ class NearTarget(AbstractController[Any]):
     def accepted(self, memory: Any, u: Command) -> Any:
         """Pass the accepted command on."""
         return self.inner.accepted(memory, u)
+
+    def with_vehicle(self, member: Member) -> "NearTarget":
+        """Return the same for a vehicle that was identified."""
+        return NearTarget(self.inner.with_vehicle(member), self.task, self.reach)
+
+    def acting(self, actuators: ActuatorState) -> "NearTarget":
+        """Return the same for a tick in which thrust and body rates are known."""
+        return NearTarget(self.inner.acting(actuators), self.task, self.reach)
 
     def in_frame(self, frame: FeltFrame) -> "NearTarget":
         """Return the same for states and commands of ``frame``."""

@@ -1,0 +1,119 @@
+"""The vehicle behind a window of flight: that of the model, or one of a family that the window identifies."""
+
+import abc
+import dataclasses
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax, random
+from jaxtyping import Array, Float, Key
+
+from ..control.identified import believed, bounded_gain
+from ..estimation.command_path import PathEstimator, PathState
+from ..learn.window import Window
+from ..physics.command_path import CommandPath
+from ..physics.command_path import PathState as QueueState
+from ..physics.path_family import Member, PathBelief, PathFamily
+from ..physics.state import Command, State
+from ..tasks.task import Start
+
+
+class AbstractVehicles(eqx.Module):
+    """What learners know of the vehicle."""
+
+    @abc.abstractmethod
+    def arrived(self, window: Window) -> Window:
+        """Return the window with the commands that a model without delay and lag would have to be given.
+
+        Args:
+            window: Ticks of flight.
+        """
+
+    @abc.abstractmethod
+    def assigned(self, starts: Start, window: Window, key: Key[Array, ""]) -> Start:
+        """Return starts with the vehicles that fly from them; the key is consumed.
+
+        Args:
+            starts: Starts of roll-outs, with any leading axes.
+            window: Ticks of flight.
+            key: Random key.
+        """
+
+
+class OwnVehicle(AbstractVehicles):
+    """The vehicle of the model, with the delay that is declared."""
+
+    def arrived(self, window: Window) -> Window:
+        """Return the window as it is; the delay is a setting of the learner."""
+        return window
+
+    def assigned(self, starts: Start, window: Window, key: Key[Array, ""]) -> Start:
+        """Return the starts as they are."""
+        return starts
+
+
+class Identification(NamedTuple):
+    """What a window says of the vehicle."""
+
+    belief: PathBelief
+    path: CommandPath
+    """Most likely path, with the gain of the thrust."""
+
+
+class IdentifiedVehicle(AbstractVehicles):
+    """A vehicle of a family. Updates train for samples of the belief about it."""
+
+    estimator: PathEstimator
+    family: PathFamily
+
+    def identify(self, window: Window) -> Identification:
+        """Return what commands and attitudes of a window say of the vehicle.
+
+        Args:
+            window: Ticks of flight.
+        """
+        estimator = self.estimator
+        age = jnp.zeros_like(window.t) if window.age is None else window.age
+
+        def tick(s: PathState, row: tuple[Array, State, Command, Array, Array]) -> tuple[PathState, None]:
+            t, x, u, valid, age = row
+            seen = estimator.issued(estimator.measured(s, t, x, age=age), u)
+            return jax.tree.map(lambda new, old: jnp.where(valid, new, old), seen, s), None
+
+        first = estimator.init(jax.tree.map(lambda leaf: leaf[0], window.x))
+        last, _ = lax.scan(tick, first, (window.t, window.x, window.u, window.valid, age))
+        estimate = estimator.estimated(last).estimate
+        belief = believed(self.family, estimate)
+        path = self.family.path(belief.centre)
+        response = dataclasses.replace(path.response, thrust_gain=bounded_gain(estimate))
+        return Identification(belief, dataclasses.replace(path, response=response))
+
+    def arrived(self, window: Window) -> Window:
+        """Return the window with thrust and rates behind the identified path; its first ticks do not count."""
+        path, dt = self.identify(window).path, self.estimator.dt
+        first: Command = jax.tree.map(lambda leaf: leaf[0], window.u)
+
+        def tick(s: QueueState, u: Command) -> tuple[QueueState, Command]:
+            mean, s = path(s, u, dt)
+            return s, mean
+
+        _, acting = lax.scan(tick, path.init(first, dt), window.u)
+        forgotten = jnp.ceil((path.delay + path.response.settling_time) / dt)
+        count = jnp.cumsum(window.valid.astype(window.t.dtype))
+        acting = jax.tree.map(lambda new, old: new.astype(old.dtype), acting, window.u)
+        return dataclasses.replace(window, u=acting, valid=window.valid & (count > forgotten))
+
+    def assigned(self, starts: Start, window: Window, key: Key[Array, ""]) -> Start:
+        """Return starts with vehicles that are drawn from the belief."""
+        belief, shape = self.identify(window).belief, starts.t.shape
+        inside = random.uniform(key, (*shape, belief.centre.shape[0]), minval=-1.0, maxval=1.0)
+
+        def assign(t: Float[Array, ""], x: State, inside: Float[Array, "4"]) -> Start:
+            at = belief.centre + belief.half_width * inside
+            return Start(t, x, Member(self.family.path(at), belief))
+
+        for _ in shape:
+            assign = jax.vmap(assign)
+        return assign(starts.t, starts.x, inside)

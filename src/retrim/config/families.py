@@ -1,0 +1,125 @@
+"""The family of vehicles of a preset, and the parts of a flight that only such presets have."""
+
+from typing import Any
+
+import jax.numpy as jnp
+
+from ..control.actuator_tracking import ActuatorTracking
+from ..control.controller import AbstractController, PolicyController
+from ..control.identified import IdentifiedFlight
+from ..control.policy import Policy
+from ..control.resting import RestingController
+from ..errors import ConfigError
+from ..estimation.command_path import PathEstimator, ringing_of
+from ..physics.path_family import Member, PathBelief, PathFamily
+from ..tasks.task import AbstractTask
+from .presets import Preset
+from .tasks import find_task
+from .vehicle_file import VehicleSpec
+
+TRUST = 2.0  # a delay or a lag of a vehicle file may be wrong by this factor
+LEAST = 0.01  # [s]: a shorter delay or lag may be wrong by this much
+
+
+def make_family(preset: Preset) -> PathFamily | None:
+    """Return the family of a preset; None if it is for one vehicle.
+
+    Raises:
+        ConfigError: A range is empty or impossible.
+    """
+    table = preset.family
+    if table is None:
+        return None
+    try:
+        return PathFamily.of(
+            delay=table.delay,
+            rate_lag=table.rate_lag,
+            least_damping=table.least_damping,
+            thrust_lag=table.thrust_lag,
+            least_frequency=table.least_frequency,
+        )
+    except ValueError as error:
+        raise ConfigError(f"preset {preset.name!r}: [family]: {error}") from error
+
+
+def prior_belief(preset: Preset, family: PathFamily) -> PathBelief:
+    """Return what is known of a vehicle before take-off: what its file states may be wrong by a factor of two.
+
+    Args:
+        preset: Its vehicle may be a vehicle file.
+        family: Family of the preset.
+    """
+    vehicle = preset.vehicle
+    unknown = PathBelief.unknown()
+    if not isinstance(vehicle, VehicleSpec):
+        return unknown
+    (low_delay, high_delay), (low_lag, high_lag) = _interval(vehicle.command_delay), _interval(_lag(vehicle))
+    low_thrust, high_thrust = _interval(vehicle.motor_tau)
+    least, most = (0.0, 1.0)
+    if vehicle.rate_damping is not None:
+        damping = min(vehicle.rate_damping[:2])
+        least, most = float(ringing_of(damping * TRUST)), float(ringing_of(damping / TRUST))
+    ends = [
+        family.coordinates(*(jnp.array(value) for value in values))
+        for values in ((low_delay, low_lag, least, low_thrust), (high_delay, high_lag, most, high_thrust))
+    ]
+    return PathBelief.between(*ends)
+
+
+def policy_controller(preset: Preset, task: AbstractTask, policy: Policy) -> PolicyController:
+    """Return a policy behind the observation of flight.
+
+    Args:
+        preset: A policy for a family that rests at home is shifted, so that it commands hover there.
+        task: Task of the flight.
+        policy: Policy that flies.
+    """
+    observation = task.observation_in_flight
+    if preset.family is None or find_task(preset.task).has_reference:
+        return PolicyController(observation, policy)
+    return RestingController(observation, policy, task.home())
+
+
+def tracked(controller: AbstractController[Any], preset: Preset) -> AbstractController[Any]:
+    """Return a controller that is told thrust and body rates, if its preset is for a family of vehicles.
+
+    Args:
+        controller: Controller of a policy.
+        preset: Preset of the policy.
+    """
+    family = make_family(preset)
+    if family is None:
+        return controller
+    prior = prior_belief(preset, family)
+    path = family.path(prior.centre)
+    return ActuatorTracking(controller.with_vehicle(Member(path, prior)), path, preset.dt)
+
+
+def identified(controller: AbstractController[Any], preset: Preset) -> IdentifiedFlight:
+    """Return a controller that is told the vehicle as it is identified in flight.
+
+    Args:
+        controller: Controller of a policy for a family; see :func:`tracked`.
+        preset: Preset of the policy.
+
+    Raises:
+        ConfigError: The preset is for one vehicle.
+    """
+    family = make_family(preset)
+    if family is None:
+        raise ConfigError(
+            f"preset {preset.name!r} is for one vehicle, and its policy has no use for an identified one: use a preset "
+            "with a table [family], such as hover/any"
+        )
+    return IdentifiedFlight(controller, PathEstimator.of(preset.dt), family, prior_belief(preset, family))
+
+
+def _lag(vehicle: VehicleSpec) -> float | None:
+    return None if vehicle.rate_lag is None else max(vehicle.rate_lag[:2])
+
+
+def _interval(value: float | None) -> tuple[float, float]:
+    """Return the interval of a time that a vehicle file states [s]; everything if it states none."""
+    if value is None:
+        return 0.0, jnp.inf
+    return min(value / TRUST, max(value - LEAST, 0.0)), max(value * TRUST, value + LEAST)

@@ -1,0 +1,69 @@
+"""Track thrust and body rates in flight, for a policy that observes them."""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..estimation.body_rates import BodyRates
+from ..physics.command_path import CommandPath
+from ..physics.path_family import Member
+from ..physics.state import Command, State
+from .condition import Condition
+from .controller import AbstractController
+
+
+class TrackingState(eqx.Module):
+    """Memory of the tracking and of the controller inside."""
+
+    rates: BodyRates
+    inner: Any
+
+
+class ActuatorTracking(AbstractController[TrackingState]):
+    """Tells the controller inside which thrust and body rates act now.
+
+    The command path predicts them. A gyroscope, or the measured attitudes, corrects the body rates.
+    """
+
+    inner: AbstractController[Any]
+    path: CommandPath
+    """Command path of the vehicle, as far as it is known."""
+    dt: float = eqx.field(static=True)
+    """Control tick [s]."""
+    omega: Float[Array, "3"] | None = None
+    """Measured body rates [rad/s]; None if they are not measured."""
+    age: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(0.0))
+    """Age of measurements [s]."""
+
+    def aged(self, age: float | Float[Array, ""]) -> "ActuatorTracking":
+        """Return the same for measurements that are ``age`` old [s]."""
+        return dataclasses.replace(self, inner=self.inner.aged(age), age=jnp.array(age))
+
+    def sensing(self, omega: Float[Array, "3"], a: Float[Array, "3"]) -> "ActuatorTracking":
+        """Return the same for a tick in which body rates and acceleration were measured."""
+        return dataclasses.replace(self, inner=self.inner.sensing(omega, a), omega=omega)
+
+    def with_vehicle(self, member: Member) -> "ActuatorTracking":
+        """Return the same for a vehicle that was identified."""
+        return dataclasses.replace(self, inner=self.inner.with_vehicle(member), path=member.path)
+
+    def condition(self, memory: TrackingState) -> Condition | None:
+        """Return the condition of the controller inside."""
+        return self.inner.condition(memory.inner)
+
+    def init(self, x: State) -> TrackingState:
+        """Return the memory at the start of a flight."""
+        return TrackingState(BodyRates.start(x, self.dt), self.inner.init(x))
+
+    def __call__(self, memory: TrackingState, t: Float[Array, ""], x: State) -> tuple[Command, TrackingState]:
+        """Return the command of the controller inside, which is told what acts."""
+        rates = memory.rates.measured(x, self.age, self.path, self.dt, self.omega)
+        u, inner = self.inner.acting(rates.path.actuators)(memory.inner, t, x)
+        return u, TrackingState(rates.issued(u, self.path, self.dt), inner)
+
+    def accepted(self, memory: TrackingState, u: Command) -> TrackingState:
+        """Remember the accepted command."""
+        return TrackingState(memory.rates.accepted(u, self.path, self.dt), self.inner.accepted(memory.inner, u))

@@ -1,0 +1,37 @@
+"""A policy that commands hover where it rests, whatever it observes beside the state."""
+
+import dataclasses
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..physics import so3
+from ..physics.felt_frame import FeltFrame
+from ..physics.state import Command, State
+from .controller import PolicyController
+
+
+class RestingController(PolicyController):
+    """A policy whose output is shifted by that at rest at home, with the heading of now.
+
+    A policy for many vehicles comes to rest somewhere else for each belief. The shift removes that error, so that it
+    rests at home, as :class:`~retrim.adapt.trim.RestTrim` does after an update.
+    """
+
+    home: Float[Array, "3"]
+    """Where the vehicle rests [m]."""
+
+    def __call__(
+        self, memory: tuple[Any, Command], t: Float[Array, ""], x: State
+    ) -> tuple[Command, tuple[Any, Command]]:
+        """Evaluate observation and policy once, and the policy at rest."""
+        heading = jnp.arctan2(x.R[1, 0], x.R[0, 0])
+        home = self.home.astype(x.p.dtype)
+        o = self.observation.at_rest(State(home, so3.rotz(heading), jnp.zeros_like(home)))
+        shifted = PolicyController(self.observation, self.policy.shifted(-self.policy.output(o)))
+        return shifted(memory, t, x)
+
+    def in_frame(self, frame: FeltFrame) -> "RestingController":
+        """Return the same policy behind the turned observation, at rest at the turned home."""
+        return dataclasses.replace(self, observation=self.observation.in_frame(frame), home=frame.vector(self.home))

@@ -1,0 +1,99 @@
+"""Body rates now: those of a gyroscope, or those that commands and measured attitudes imply.
+
+Without a gyroscope, the command path predicts the rates, and the rotation between two attitudes corrects them. That
+rotation is noisy and of the past; the prediction is of now and as good as what is known of the path.
+"""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..physics import so3
+from ..physics.actuator_response import ActuatorState
+from ..physics.command_path import LONGEST_DELAY, CommandPath, PathState
+from ..physics.state import Command, State
+
+SHARE = 0.3  # of the difference between measurement and prediction that corrects the prediction
+
+
+class BodyRates(eqx.Module):
+    """Prediction of the body rates, and what it needs."""
+
+    R: Float[Array, "3 3"]
+    """Attitude measured one tick ago."""
+    before: PathState
+    """Command path one tick ago."""
+    path: PathState
+    """Command path now."""
+    mean: Float[Array, "3"]
+    """Predicted mean over the tick that has just ended [rad/s]."""
+    earlier: Float[Array, "3"]
+    """Likewise over the tick before."""
+
+    @classmethod
+    def start(cls, x: State, dt: float, *, longest: float = LONGEST_DELAY) -> "BodyRates":
+        """Return the prediction for a vehicle that has hovered until now.
+
+        Args:
+            x: Measured state.
+            dt: Control tick [s].
+            longest: Longest delay of a path [s].
+        """
+        hover = CommandPath.of().init(Command.hover(x.p.dtype), dt, longest=longest)
+        zero = jnp.zeros_like(x.p)
+        return cls(x.R, hover, hover, zero, zero)
+
+    @property
+    def omega(self) -> Float[Array, "3"]:
+        """Body rates now [rad/s]."""
+        return self.path.actuators.command.omega
+
+    def measured(
+        self,
+        x: State,
+        age: Float[Array, ""],
+        path: CommandPath,
+        dt: float,
+        omega: Float[Array, "3"] | None,
+    ) -> "BodyRates":
+        """Return the rates corrected by a measurement.
+
+        Args:
+            x: Measured state.
+            age: Age of ``x`` [s].
+            path: Command path of the vehicle.
+            dt: Control tick [s].
+            omega: Rates of a gyroscope [rad/s]; None if there is none.
+        """
+        if omega is None:
+            late = jnp.clip(age / dt, 0.0, 1.0).astype(x.p.dtype)
+            predicted = (1.0 - late) * self.mean + late * self.earlier
+            error = SHARE * (so3.log(so3.mul(self.R.T, x.R)) / dt - predicted)
+        else:
+            error = omega.astype(x.p.dtype) - self.omega
+        error = jnp.where(jnp.all(jnp.isfinite(error)), error, 0.0)
+        acting = self.path.actuators
+        # A rate that differs by the end of a tick has changed faster during it.
+        slope = acting.slope + SHARE * (path.response.rate_lag / dt) * error
+        corrected = ActuatorState(Command(acting.command.c, acting.command.omega + error), slope)
+        return dataclasses.replace(self, R=x.R, path=dataclasses.replace(self.path, actuators=corrected))
+
+    def issued(self, u: Command, path: CommandPath, dt: float) -> "BodyRates":
+        """Return the prediction for the end of the tick that begins with the command ``u``.
+
+        Args:
+            u: Command.
+            path: Command path of the vehicle.
+            dt: Control tick [s].
+        """
+        mean, after = path(self.path, u, dt)
+        return BodyRates(self.R, self.path, after, mean.omega, self.mean)
+
+    def accepted(self, u: Command, path: CommandPath, dt: float) -> "BodyRates":
+        """Return the prediction after the plant accepted ``u`` instead of the command that was issued last."""
+        mean, after = path(self.before, u, dt)
+        after = jax.tree.map(lambda new, old: new.astype(old.dtype), after, self.path)
+        return dataclasses.replace(self, path=after, mean=mean.omega)

@@ -1,0 +1,169 @@
+"""Flights of an identified vehicle: the controller inside is told the vehicle, thrust and rates, slowly and truly."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax, random
+
+from retrim.config import Setup, changed, load
+from retrim.config.families import prior_belief
+from retrim.control.actuator_tracking import ActuatorTracking
+from retrim.control.controller import AbstractController
+from retrim.control.finite_controller import FiniteController
+from retrim.control.identified import IdentifiedFlight
+from retrim.control.integral import IntegralAction
+from retrim.control.near_target import NearTarget
+from retrim.errors import ConfigError
+from retrim.estimation.command_path import PathEstimator, ringing_of
+from retrim.physics import ActuatorResponse, Command, CommandPath, small
+from retrim.physics.actuator_response import ActuatorState
+from retrim.physics.effects import ExternalEffects
+from retrim.physics.path_family import Member, PathBelief, PathFamily
+from retrim.physics.second_order import SecondOrderQuadrotor
+from retrim.plants.sim import Simulation
+
+pytestmark = pytest.mark.usefixtures("as_a_user")
+
+DT = 0.02
+family = PathFamily.of  # the type of numbers follows from the test
+SHORT = {"num_updates": 10, "num_envs": 2, "horizon": 20, "hidden_sizes": (16, 16)}
+
+
+class Weak(AbstractController[Command]):
+    """A soft hover that needs no policy; its memory is what it was told last."""
+
+    told: ActuatorState = dataclasses.field(default_factory=lambda: ActuatorState.at(Command.hover()))
+    member: Member = dataclasses.field(
+        default_factory=lambda: Member(family().path(jnp.zeros(4)), PathBelief.unknown())
+    )
+
+    def init(self, x):
+        return self.told, self.member
+
+    def __call__(self, memory, t, x):
+        wobble = jnp.stack([jnp.sin(7.0 * t), jnp.cos(5.0 * t), jnp.sin(3.0 * t)])
+        level = jnp.stack([-x.R[2, 1], x.R[2, 0], 0.0 * t])
+        pull = -2.0 * (x.p[2] - 1.0) - 2.0 * x.v[2] + 0.5 * jnp.sin(11.0 * t)
+        return Command(9.81 + pull, 2.0 * level + wobble), (self.told, self.member)
+
+    def acting(self, actuators):
+        return dataclasses.replace(self, told=actuators)
+
+    def with_vehicle(self, member):
+        return dataclasses.replace(self, member=member)
+
+
+def simulation(delay, lag, *, damping=1.0, gain=1.0):
+    limits = (small().command_min, small().command_max)
+    response = ActuatorResponse.of(0.03, lag, inverse_damping=1.0 / damping, thrust_gain=gain)
+    calm = lambda t, x: ExternalEffects.calm(x.p.dtype)  # noqa: E731
+    model = SecondOrderQuadrotor(response, jnp.array(1.0), jnp.array(0.3), limits, DT)
+    return Simulation(model, calm, None, random.key(0), jnp.array(delay))
+
+
+@eqx.filter_jit
+def fly(plant, controller, x0, ticks=200, *, senses=True):
+    """Fly; return true states and the memories of the controller after each tick."""
+    first = plant.launch(x0)
+
+    def tick(carry, k):
+        sim, memory = carry
+        now = controller.sensing(*plant.inertial(sim, k)) if senses else controller
+        u, memory = now(memory, plant.time(k, sim.a.dtype), plant.measured(sim))
+        return (plant.advance(sim, plant.within_limits(u), k), memory), (plant.true(sim), memory)
+
+    return lax.scan(tick, (first, controller.init(plant.measured(first))), jnp.arange(ticks))[1]
+
+
+@pytest.fixture(scope="module")
+def x0(as_a_user):
+    return Setup.of(load("hover/retrim")).flight_starts(1, 3)[0]
+
+
+@pytest.mark.parametrize(("delay", "lag", "gain"), [(0.0, 0.03, 1.0), (0.05, 0.12, 0.7), (0.03, 0.2, 1.4)])
+def test_the_vehicle_is_identified_in_flight(x0, delay, lag, gain):
+    controller = IdentifiedFlight(Weak(), PathEstimator.of(DT), family(), PathBelief.unknown())
+    _, memory = fly(simulation(delay, lag, gain=gain), controller, x0)
+    last = jax.tree.map(lambda leaf: np.asarray(leaf)[-1], memory)
+    true = family().coordinates(jnp.array(delay), jnp.array(lag), ringing_of(jnp.array(1.0)), jnp.array(0.03))
+    assert abs(last.belief.centre[0] - true[0]) * 0.05 < 0.01  # [s]
+    assert last.belief.half_width[0] < 0.5
+    assert abs(float(last.gain) - gain) < 0.1 * gain
+    assert np.all(np.asarray(memory.belief.half_width[0]) > 0.9)  # unknown at take-off
+
+
+def test_belief_and_gain_never_jump(x0):
+    controller = IdentifiedFlight(Weak(), PathEstimator.of(DT), family(), PathBelief.unknown())
+    _, memory = fly(simulation(0.08, 0.2, gain=0.6), controller, x0)
+    low, high = jax.vmap(lambda each: each.ends)(memory.belief)
+    for ends in (low, high):
+        assert np.abs(np.diff(np.asarray(ends), axis=0)).max() <= 2.0 * DT + 1e-5
+    assert np.abs(np.diff(np.asarray(memory.gain))).max() <= 1.0 * DT + 1e-5
+
+
+@pytest.mark.parametrize("sensed", [True, False])
+def test_the_tracked_rates_are_those_of_the_vehicle(x0, sensed):
+    """Exactly, where the path is known; with a gyroscope, at once, where it is not."""
+    known = CommandPath.of(0.03, ActuatorResponse.of(0.03, 0.1, inverse_damping=1.0))
+    path = known if not sensed else CommandPath.of(0.0, ActuatorResponse.of(0.03, 0.01))
+    plant = simulation(0.03, 0.1)
+
+    true, memory = fly(plant, ActuatorTracking(Weak(), path, DT), x0, 100, senses=sensed)
+    told, _ = memory.inner
+    R = np.asarray(true.R)
+    turn = np.einsum("kji,kjl->kil", R[:-1], R[1:])
+    mean = np.stack([turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], 1)
+    omega = np.asarray(told.command.omega)
+    np.testing.assert_allclose(0.5 * (omega[:-1] + omega[1:]), mean / (2.0 * DT), atol=0.06)
+
+
+@pytest.mark.parametrize("wrap", [FiniteController, "integral", "near", "tracking"])
+def test_controllers_around_another_one_pass_the_vehicle_on(wrap, x0):
+    """A wrapper that swallowed it would fly a policy for the wrong vehicle without a word."""
+    task = Setup.of(load("hover/retrim")).flown
+    makers = {
+        "integral": lambda inner: IntegralAction(inner, task, jnp.array(0.5), jnp.array(1.0)),
+        "near": lambda inner: NearTarget(inner, task, jnp.array(1.0)),
+        "tracking": lambda inner: ActuatorTracking(inner, family().path(jnp.zeros(4)), DT),
+    }
+    outer = makers.get(wrap, wrap)(Weak())
+    member = Member(family().path(jnp.ones(4)), PathBelief.between(jnp.ones(4), jnp.ones(4)))
+    found = outer.with_vehicle(member)
+    inner = next(getattr(found, name) for name in ("inner", "base") if hasattr(found, name))
+    np.testing.assert_array_equal(inner.member.belief.centre, np.ones(4))
+    if wrap != "tracking":  # it tells the controller inside itself
+        told = outer.acting(ActuatorState.at(Command(jnp.array(5.0), jnp.ones(3))))
+        inner = next(getattr(told, name) for name in ("inner", "base") if hasattr(told, name))
+        assert float(inner.told.command.c) == 5.0
+
+
+def test_a_vehicle_file_is_believed_within_a_factor_of_two():
+    vehicle = {
+        "name": "mine", "mass": 0.3, "inertia": [4e-4, 5e-4, 8e-4], "arm": [0.06, 0.07], "thrust_max": 11.0,
+        "rates_max": [10.0, 10.0, 4.0], "motor_tau": 0.03, "rate_lag": [0.1, 0.1, 0.2], "command_delay": 0.03,
+    }  # fmt: skip
+    preset = changed(load("hover/any"), vehicle=vehicle)
+    low, high = prior_belief(preset, family()).ends
+    for factor in (0.5, 1.0, 2.0):
+        at = family().coordinates(
+            jnp.array(factor * 0.03), jnp.array(factor * 0.1), jnp.array(0.3), jnp.array(factor * 0.03)
+        )
+        assert np.all(at >= low - 1e-5)
+        assert np.all(at <= high + 1e-5)
+    assert float(high[0]) < 0.5  # the file does say something
+    np.testing.assert_array_equal(prior_belief(load("hover/any"), family()).half_width, np.ones(4))
+
+
+def test_a_preset_for_one_vehicle_identifies_none():
+    setup = Setup.of(changed(load("hover/retrim"), pretrain=SHORT))
+    with pytest.raises(ConfigError, match="hover/any"):
+        setup.pilot(setup.new_policy(random.key(0)), "base-id")
+
+
+def test_past_commands_must_cover_the_delays_of_the_family():
+    with pytest.raises(ConfigError, match="5 ticks"):
+        changed(load("hover/any"), command_history=4)
