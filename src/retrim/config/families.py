@@ -3,6 +3,7 @@
 from typing import Any
 
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from ..control.actuator_tracking import ActuatorTracking
 from ..control.controller import AbstractController, PolicyController
@@ -111,7 +112,16 @@ def identified(controller: AbstractController[Any], preset: Preset) -> Identifie
             f"preset {preset.name!r} is for one vehicle, and its policy has no use for an identified one: use a preset "
             "with a table [family], such as hover/any"
         )
-    return IdentifiedFlight(controller, PathEstimator.of(preset.dt), family, prior_belief(preset, family))
+    prior = prior_belief(preset, family)
+    return IdentifiedFlight(controller, PathEstimator.of(preset.dt), family, prior, _declared(preset))
+
+
+def _declared(preset: Preset) -> Float[Array, "2"] | None:
+    """Return command delay and rate lag of the vehicle file [s], if it states both."""
+    vehicle = preset.vehicle
+    if not isinstance(vehicle, VehicleSpec) or vehicle.command_delay is None or vehicle.rate_lag is None:
+        return None
+    return jnp.array([vehicle.command_delay, max(vehicle.rate_lag[:2])])
 
 
 def _lag(vehicle: VehicleSpec) -> float | None:

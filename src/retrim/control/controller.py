@@ -16,6 +16,7 @@ from ..physics.state import Command, State
 from ..tasks.observation import AbstractObservation
 from .condition import Condition
 from .policy import Policy
+from .vehicle_report import VehicleReport
 
 M = TypeVar("M")
 
@@ -80,6 +81,11 @@ class AbstractController(eqx.Module, Generic[M]):
 
     def condition(self, memory: M) -> Condition | None:
         """Return how far the controller has stepped back from its full function; None if it never does."""
+        del memory
+        return None
+
+    def vehicle(self, memory: M) -> VehicleReport | None:
+        """Return the vehicle that was identified; None for a controller that identifies none."""
         del memory
         return None
 

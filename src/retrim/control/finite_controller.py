@@ -12,6 +12,7 @@ from ..physics.felt_frame import FeltFrame
 from ..physics.path_family import Member
 from ..physics.state import Command, State
 from .controller import AbstractController
+from .vehicle_report import VehicleReport
 
 LARGEST = float(2**20)
 """A number of this size or more, in SI units, is no measurement; networks overflow far beyond it."""
@@ -64,6 +65,10 @@ class FiniteController(AbstractController[FiniteMemory[Any]]):
     def sensing(self, omega: Float[Array, "3"], a: Float[Array, "3"]) -> "FiniteController":
         """Return the same for a tick in which body rates and acceleration were measured."""
         return FiniteController(self.base.sensing(omega, a))
+
+    def vehicle(self, memory: FiniteMemory[Any]) -> VehicleReport | None:
+        """Return the vehicle that the controller inside has identified."""
+        return self.base.vehicle(memory.inner)
 
     def with_vehicle(self, member: Member) -> "FiniteController":
         """Return the same for a vehicle that was identified."""

@@ -19,6 +19,7 @@ from ..physics.path_family import Member, PathBelief, PathFamily
 from ..physics.state import Command, State
 from .condition import Condition
 from .controller import AbstractController
+from .vehicle_report import VehicleReport
 
 PACE = 2.0  # [1/s]: an unknown coordinate is known after half a second at the earliest
 GAIN_PACE = 1.0  # [1/s], change of the gain of the thrust
@@ -44,6 +45,8 @@ class IdentifiedFlight(AbstractController[IdentifiedState]):
     family: PathFamily
     prior: PathBelief
     """Belief at take-off."""
+    declared: Float[Array, "2"] | None = None
+    """Command delay and rate lag of the vehicle file [s]; None if it states none."""
     omega: Float[Array, "3"] | None = None
     """Measured body rates [rad/s]; None if they are not measured."""
     a: Float[Array, "3"] | None = None
@@ -62,6 +65,10 @@ class IdentifiedFlight(AbstractController[IdentifiedState]):
     def condition(self, memory: IdentifiedState) -> Condition | None:
         """Return the condition of the controller inside."""
         return self.inner.condition(memory.inner)
+
+    def vehicle(self, memory: IdentifiedState) -> VehicleReport:
+        """Return the vehicle as it is known now."""
+        return VehicleReport(memory.path.estimate, self.declared)
 
     def init(self, x: State) -> IdentifiedState:
         """Return the memory at the start of a flight."""

@@ -10,6 +10,7 @@ from jaxtyping import Array, ArrayLike, Int
 
 from ..control.condition import Condition
 from ..control.controller import AbstractController
+from ..control.vehicle_report import VehicleReport
 from ..physics.state import Command, State, where
 from ..plants.sim import SimState, Simulation
 
@@ -37,6 +38,8 @@ class Ticks(eqx.Module):
     """Command that the plant accepted for the tick."""
     condition: Condition | None
     """Of the controller after its command; None for a controller that never steps back."""
+    vehicle: VehicleReport | None = None
+    """Vehicle that the controller has identified; None for one that identifies none."""
 
 
 def take_off(simulation: Simulation, controller: AbstractController[Any], x0: State) -> InFlight:
@@ -91,8 +94,9 @@ def fly_ticks(
         limited = jnp.any(accepted.vector() != issued.vector())
         memory = where(limited, controller.accepted(memory, accepted), memory)
         s, condition = simulation.advance(s, accepted, k), controller.condition(memory)
+        vehicle = controller.vehicle(memory)
         return InFlight(s, memory, k + 1), Ticks(
-            simulation.true(s), simulation.measured(s), issued, accepted, condition
+            simulation.true(s), simulation.measured(s), issued, accepted, condition, vehicle
         )
 
     def step(i: Array, carry: tuple[InFlight, Ticks]) -> tuple[InFlight, Ticks]:
@@ -101,7 +105,7 @@ def fly_ticks(
 
     x = simulation.true(flight.sim)
     u = Command.hover(x.p.dtype)
-    row = Ticks(x, x, u, u, controller.condition(flight.memory))
+    row = Ticks(x, x, u, u, controller.condition(flight.memory), controller.vehicle(flight.memory))
     blank = jax.tree.map(lambda leaf: jnp.zeros((room, *leaf.shape), leaf.dtype), row)
     flown: tuple[InFlight, Ticks] = lax.fori_loop(0, ticks, step, (flight, blank))
     return flown

@@ -15,7 +15,7 @@ from ..learn.window import Window
 from ..physics.state import Command, State
 from ..plants.sim import SimState, Simulation
 from .batch import InFlight, Ticks, fly_ticks, in_flight
-from .events import Event, stage_events
+from .events import Event, stage_events, vehicle_events
 from .flight import FlightStopped, Log, States
 
 T = TypeVar("T")
@@ -102,7 +102,8 @@ class Batch:
         u = np.concatenate([accepted.c[:, None], accepted.omega], axis=1)
         hover = np.asarray(Command.hover().vector(), dtype=u.dtype)[None]
         t = np.arange(self.ticks + 1) * self.dt
-        events = sorted([*events, *stage_events(rows.condition, t[:-1])], key=lambda event: event.t)
+        own = [*stage_events(rows.condition, t[:-1]), *vehicle_events(rows.vehicle, t[:-1])]
+        events = sorted([*events, *own], key=lambda event: event.t)
         return Log(
             t,
             States(*true),

@@ -4,13 +4,17 @@ import json
 from pathlib import Path
 from typing import NamedTuple, Protocol, runtime_checkable
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
 from ..adapt.updates import KINDS, Update
 from ..control.condition import Condition, describe_condition
+from ..control.vehicle_report import REPORTS, VehicleReport
 from ..physics.state import Command
 from ..plants.plant import Measurement
+
+ROUNDING = 1e-3  # [s]
 
 
 class Event(NamedTuple):
@@ -20,7 +24,7 @@ class Event(NamedTuple):
     """Time since the start of the flight at which it became visible [s]."""
     kind: str
     """``residual``, ``policy``, ``rejected`` (a result that must not be used), ``skipped`` (the learner was busy),
-    ``stage`` (the controller stepped back, or returned) or ``terminated``."""
+    ``stage`` (the controller stepped back, or returned), ``vehicle`` (the identified vehicle) or ``terminated``."""
     note: str
     """One line."""
 
@@ -42,6 +46,20 @@ def stage_events(conditions: Condition | None, t: Float[np.ndarray, " n"]) -> li
     stages, causes = np.asarray(conditions.stage), np.asarray(conditions.cause)
     changed = np.flatnonzero(np.diff(stages, prepend=0))
     return [Event(float(t[k]), "stage", describe_condition(int(stages[k]), int(causes[k]))) for k in changed]
+
+
+def vehicle_events(vehicles: VehicleReport | None, t: Float[np.ndarray, " n"]) -> list[Event]:
+    """Return the events in which the identified vehicle is reported.
+
+    Args:
+        vehicles: Of each tick (leading axis n); None for a controller that identifies none.
+        t: Times of the ticks since the start of the flight [s].
+    """
+    if vehicles is None:
+        return []
+    ticks = [int(np.searchsorted(t, at - ROUNDING)) for at in REPORTS]
+    rows = [(k, jax.tree.map(lambda leaf, k=k: np.asarray(leaf)[k], vehicles)) for k in ticks if k < len(t)]
+    return [Event(float(t[k]), "vehicle", row.note()) for k, row in rows]
 
 
 @runtime_checkable

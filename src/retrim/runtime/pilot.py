@@ -10,9 +10,10 @@ from jaxtyping import Array, Float
 
 from ..control.condition import Condition
 from ..control.controller import AbstractController
+from ..control.vehicle_report import REPORTS, VehicleReport
 from ..physics.state import Command, State
 from ..plants.plant import Measurement
-from .events import Event
+from .events import ROUNDING, Event
 
 
 class Pilot(abc.ABC):
@@ -68,7 +69,7 @@ class FunctionPilot(Pilot):
 class ControllerPilot(Pilot):
     """Any controller as a pilot. ``controller`` may be replaced in flight; its memory goes on.
 
-    Each change of the controller's stage is an event.
+    Each change of the controller's stage is an event, and so is the vehicle that it has identified.
     """
 
     def __init__(self, controller: AbstractController[Any]) -> None:
@@ -76,12 +77,13 @@ class ControllerPilot(Pilot):
         self._memory: Any = None
         self._start = 0.0
         self._stage = 0
+        self._t = -1.0
         self._events: list[Event] = []
 
     def reset(self, measurement: Measurement) -> None:
         """Initialise the controller's memory."""
         self._memory, self._start = _begin(self.controller, measurement.x), measurement.t
-        self._stage, self._events = 0, []
+        self._stage, self._t, self._events = 0, -1.0, []
 
     def act(self, measurement: Measurement) -> Command:
         """Call the controller once, with the time since the start of the flight."""
@@ -90,8 +92,12 @@ class ControllerPilot(Pilot):
         controller = self.controller.aged(measurement.age)
         if measurement.omega is not None and measurement.a is not None:
             controller = controller.sensing(measurement.omega, measurement.a)
-        u, self._memory, condition = _decide(controller, self._memory, t, x)
-        self._note(float(t), condition)
+        before = self._t
+        u, self._memory, condition, vehicle = _decide(controller, self._memory, t, x)
+        self._t = float(t)
+        self._note(self._t, condition)
+        if vehicle is not None and any(before < at - ROUNDING <= self._t for at in REPORTS):
+            self._events.append(Event(self._t, "vehicle", vehicle.note()))
         return u
 
     def accepted(self, u: Command) -> None:
@@ -117,6 +123,6 @@ def _begin(controller: AbstractController[Any], x: State) -> Any:
 @eqx.filter_jit
 def _decide(
     controller: AbstractController[Any], memory: Any, t: Float[Array, ""], x: State
-) -> tuple[Command, Any, Condition | None]:
+) -> tuple[Command, Any, Condition | None, VehicleReport | None]:
     u, memory = controller(memory, t, x)
-    return u, memory, controller.condition(memory)
+    return u, memory, controller.condition(memory), controller.vehicle(memory)

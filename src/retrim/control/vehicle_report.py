@@ -1,0 +1,24 @@
+"""The vehicle that a controller has identified, as a line for the log."""
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+from ..estimation.command_path import PathEstimate, describe_path
+
+REPORTS = (1.0, 5.0)
+"""Times of a flight at which the identified vehicle is reported [s]."""
+
+
+class VehicleReport(eqx.Module):
+    """What is known of the vehicle now, beside what its file states."""
+
+    estimate: PathEstimate
+    declared: Float[Array, "2"] | None = None
+    """Command delay and rate lag of the vehicle file [s]; None if it states none."""
+
+    def note(self) -> str:
+        """Return the vehicle in one line."""
+        if self.declared is None:
+            return describe_path(self.estimate)
+        delay, lag = (float(each) for each in self.declared)
+        return describe_path(self.estimate, (delay, lag))
