@@ -105,7 +105,7 @@ def test_what_is_no_file(tmp_path):
 
 
 def test_unknown_presets():
-    with pytest.raises(ConfigError, match="no preset 'quick'; there are hover/retrim, track/retrim, track/fast"):
+    with pytest.raises(ConfigError, match="no preset 'quick'; there are hover/retrim, hover/any, track/retrim"):
         load("quick")
     with pytest.raises(ConfigError, match=r"no preset 'hover/fsat'; did you mean 'hover/fast'\? there are"):
         load("hover/fsat")

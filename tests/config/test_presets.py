@@ -63,7 +63,7 @@ def test_a_hundred_hertz_has_the_same_times():
         ({"actuator_tau": -0.1}, r"actuator_tau: Input should be greater than 0"),
         ({"reward": "sharp"}, r"reward = 'sharp' is for task = 'track', not for 'hover'"),
         ({"reward": "view"}, r"reward = 'view' is for task = 'vision', not for 'hover'"),
-        ({"reward": "l3"}, r"reward: Input should be 'paper', 'l2', 'sharp' or 'view'"),
+        ({"reward": "l3"}, r"reward: Input should be 'paper', 'l2', 'stiff', 'sharp' or 'view'"),
     ],
 )
 def test_what_does_not_fit_together(tables, message):
@@ -195,6 +195,18 @@ OURS["track/fast"] = OURS["track/retrim"] | {
     "vehicle": "kingfisher",
     "track": OURS["track/retrim"]["track"] | {"reference": "circle=8+figure8=8+circle=4+figure8=4+star=1.5"},
 }
+OURS["hover/any"] = OURS["hover/retrim"] | {
+    "reward": "stiff",
+    "command_history": 6,
+    "jump_cost": 0.05,
+    "family": {
+        "delay": (0.0, 0.1), "rate_lag": (0.01, 0.25), "least_damping": 0.4, "thrust_lag": (0.01, 0.15),
+        "least_frequency": 4.0,
+    },
+    "pretrain": OURS["hover/retrim"]["pretrain"]
+    | {"num_updates": 1000, "num_envs": 64, "learning_rate": 5e-3, "hidden_sizes": (256, 256)},
+    "adapt": OURS["hover/retrim"]["adapt"] | {"window": 150, "trim": "free"},
+}  # fmt: skip
 OURS["vision/occluded"] = OURS["vision/ideal"] | {
     "vision": {"occlusion": True, "pixel_noise": 1.0, "dropout": 0.05, "whiten_pixels": True}
     | {"encoder_steps": 3000, "encoder_motions": "near"}

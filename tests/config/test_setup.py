@@ -14,13 +14,16 @@ from retrim import ConfigError
 from retrim.adapt.optimisers import CarriedAdam, FreshAdam
 from retrim.adapt.starts import TaskStarts
 from retrim.adapt.trim import RestTrim, Untrimmed
+from retrim.adapt.vehicles import IdentifiedVehicle, OwnVehicle
 from retrim.adapt.views import GravityView, RestView, WorldView
 from retrim.config import PRESETS, Scenario, Setup, changed, load, setup
 from retrim.config.learners import check_frame
 from retrim.config.vehicle_file import VehicleSpec
 from retrim.config.vehicles import make_vehicle
+from retrim.control.actuator_tracking import ActuatorTracking
 from retrim.control.controller import PolicyController
 from retrim.control.gravity_frame import GravityFrame, SeenFrame
+from retrim.control.identified import IdentifiedFlight
 from retrim.control.monitor import Monitor
 from retrim.learn import policy_loss
 from retrim.physics.actuators import Lagged
@@ -38,6 +41,8 @@ from retrim.tasks import (
     StateObs,
     Track,
 )  # fmt: skip
+from retrim.tasks.hover import StiffHover
+from retrim.tasks.vehicle_obs import VehicleObs
 from retrim.tasks.view import ViewHover
 
 pytestmark = pytest.mark.usefixtures("optax_promotion")
@@ -83,6 +88,7 @@ def test_the_task_has_the_presets_numbers(built):
     preset, made = built
     kinds = {("hover", "paper"): Hover, ("hover", "l2"): L2Hover, ("vision", "paper"): Hover, ("vision", "l2"): L2Hover}
     kinds |= {
+        ("hover", "stiff"): StiffHover,
         ("vision", "view"): ViewHover,
         ("track", "paper"): Track,
         ("track", "l2"): L2Track,
@@ -105,6 +111,9 @@ def test_the_observation_has_the_presets_numbers(built):
     preset, made = built
     seen = made.env.task.observation
     vehicle = make_vehicle(preset.vehicle)
+    if preset.family is not None:
+        assert isinstance(seen, VehicleObs)
+        seen = seen.inner
     scales = seen.state if isinstance(seen, StateAndErrorObs) else seen
     np.testing.assert_array_equal(scales.omega_max, vehicle.omega_max)
     if preset.task == "vision":
@@ -152,7 +161,13 @@ def test_a_policy_has_the_presets_layers_and_the_vehicles_limits(built):
 def test_the_learner_has_the_presets_numbers(built):
     preset, made = built
     a, learner = preset.adapt, made.learner
-    assert learner.plant_delay_ticks == preset.plant_delay_ticks
+    if preset.family is None:
+        assert learner.plant_delay_ticks == preset.plant_delay_ticks
+        assert isinstance(learner.vehicles, OwnVehicle)
+    else:  # the identified path has the delay
+        assert learner.plant_delay_ticks == 0
+        assert isinstance(learner.vehicles, IdentifiedVehicle)
+        assert learner.vehicles.family is made.env.family
     assert learner.num_updates == a.num_updates
     assert learner.num_envs == a.num_envs
     assert float(learner.optimiser.rate) == a.learning_rate
@@ -210,6 +225,10 @@ def test_the_pilot_has_the_presets_schedule(built, latency, monkeypatch):
     ((controller, *numbers),) = pilots
     assert numbers == [[a.fit_every, a.update_every], preset.dt, a.window]
     flown = controller(made.learner.init(made.new_policy(random.key(0)), random.key(2)))
+    if preset.family is not None:
+        assert isinstance(flown, IdentifiedFlight)
+        assert isinstance(flown.inner, ActuatorTracking)
+        flown = flown.inner.inner
     if a.frame == "gravity" and preset.task == "vision":
         assert isinstance(flown, SeenFrame)
         flown = flown.inner
@@ -217,11 +236,16 @@ def test_the_pilot_has_the_presets_schedule(built, latency, monkeypatch):
         assert isinstance(flown, Monitor)
         flown = flown.frame
         assert isinstance(flown, GravityFrame)
-        assert float(flown.observer.path.delay) == pytest.approx(preset.plant_delay_ticks * preset.dt)
+        unknown = 0.5 * sum((0.0, 0.0) if preset.family is None else preset.family.delay)
+        declared = preset.plant_delay_ticks * preset.dt
+        assert float(flown.observer.path.delay) == pytest.approx(declared if preset.family is None else unknown)
         assert flown.known.model is made.learner.residual_model
         flown = flown.inner
     assert isinstance(flown, PolicyController)
-    assert flown.observation is made.flown.observation_in_flight
+    if preset.family is None:
+        assert flown.observation is made.flown.observation_in_flight
+    else:  # with the belief about the vehicle
+        assert flown.observation.inner is made.flown.observation.inner
 
 
 def test_methods(built):

@@ -74,6 +74,7 @@ def test_the_page_of_replay_tells_the_limits_and_every_map():
 def test_toml_files_of_pages_are_accepted(tmp_path):
     readers = {
         "my_quad": read_vehicle,
+        "slow": read_vehicle,
         "my_log": read_map,
         "study": read_sweep,
         "track100": lambda path: overlaid(PRESETS["track/preview"], path),

@@ -1,0 +1,54 @@
+"""A policy shifted at each tick commands hover where it rests, in every frame and with every belief."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import random
+
+from helpers import GOAL, random_state
+from retrim.control import Policy
+from retrim.control.controller import PolicyController
+from retrim.control.resting import RestingController
+from retrim.physics import Command, State, small, so3
+from retrim.physics.felt_frame import FeltFrame
+from retrim.physics.path_family import PathBelief
+from retrim.tasks import StateObs
+from retrim.tasks.vehicle_obs import VehicleObs
+
+
+@pytest.fixture(scope="module")
+def controller():
+    observation = VehicleObs.of(
+        StateObs(jnp.array(GOAL), small().omega_max, 2), small().omega_max, PathBelief.unknown()
+    )
+    policy = Policy.of(observation.size, small(), key=random.key(0), hidden=(16, 16))
+    layers = jax.tree.map(lambda leaf: leaf + 0.3 * jnp.cos(jnp.arange(leaf.size)).reshape(leaf.shape), policy.layers)
+    return RestingController(observation, policy.with_params(layers), jnp.array(GOAL))
+
+
+@eqx.filter_jit
+def command(controller, x):
+    return controller(controller.init(x), jnp.zeros(()), x)[0].vector()
+
+
+@pytest.mark.parametrize("heading", [0.0, 1.0, -3.0])
+@pytest.mark.parametrize("known", [0.0, 0.4, 1.0])
+def test_at_rest_it_commands_hover(controller, heading, known):
+    belief = PathBelief.between(-known * jnp.ones(4), known * jnp.ones(4))
+    told = eqx.tree_at(lambda c: c.observation.belief, controller, belief)
+    x = State(jnp.array(GOAL), so3.rotz(jnp.array(heading)), jnp.zeros(3))
+    np.testing.assert_allclose(command(told, x), Command.hover().vector(), atol=1e-6)
+    plain = PolicyController(told.observation, told.policy)
+    assert np.abs(command(plain, x) - Command.hover().vector()).max() > 0.01  # or the test shows nothing
+
+
+def test_it_turns_with_its_home(controller):
+    frame = FeltFrame.of(jnp.array([1.0, -2.0, 0.5]))
+    turned, x = controller.in_frame(frame), random_state(random.key(1))
+    home = frame.state(State.at(jnp.array(GOAL)))
+    heading = jnp.arctan2(home.R[1, 0], home.R[0, 0])
+    rest = State(home.p, so3.rotz(heading), jnp.zeros(3))
+    np.testing.assert_allclose(command(turned, rest), Command.hover().vector(), atol=1e-6)
+    assert np.all(np.isfinite(command(turned, frame.state(x))))
