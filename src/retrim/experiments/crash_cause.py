@@ -91,7 +91,7 @@ def _rates(log: Log, lateness: float) -> Iterator[str]:
     elif late > lateness + LATER:
         yield (
             f"the vehicle turned with {numbers}, and the policy was trained for {lateness:.2f} s: give its rate_lag "
-            f"and command_delay in the vehicle file"
+            f"and command_delay in the vehicle file, or fly a policy of hover/any, which identifies them"
         )
     elif gain > 1.4:
         yield f"the vehicle turned with {numbers}: its rate loop oscillates, or the rates are in another unit"
