@@ -92,6 +92,7 @@ def test_round_trip_is_exact(tmp_path, setup):
 SIZES = {"hover/fast": 23, "hover/released": 27, "hover/paper": 15, "hover/100hz": 31, "track/preview": 43}
 SIZES |= {
     "hover/retrim": 23,
+    "hover/any": 54,
     "track/paper": 21,
     "track/blind": 15,
     "track/retrim": 49,
