@@ -167,3 +167,19 @@ def test_a_preset_for_one_vehicle_identifies_none():
 def test_past_commands_must_cover_the_delays_of_the_family():
     with pytest.raises(ConfigError, match="5 ticks"):
         changed(load("hover/any"), command_history=4)
+
+
+def test_the_observer_is_as_fast_as_the_vehicle_permits(as_a_user):
+    setup = Setup.of(changed(load("hover/any"), pretrain=SHORT))
+    flight = setup.pilot(setup.new_policy(random.key(0)), "base-id").controller
+
+    def tau(low, high):
+        found = flight._flying(PathBelief.between(jnp.array(low), jnp.array(high)))
+        return float(found.inner.observer.tau)
+
+    fast, slow = [-1.0] * 4, [1.0] * 4
+    assert tau(fast, fast) == pytest.approx(0.015)
+    assert tau(slow, slow) == pytest.approx(0.05)
+    assert tau(fast, slow) == pytest.approx(0.05)  # an unknown vehicle may be slow
+    middle = tau([0.0] * 4, [0.0] * 4)  # 50 ms of delay and of lag
+    assert middle == pytest.approx(0.25 * 0.1, rel=1e-3)

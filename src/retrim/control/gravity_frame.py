@@ -24,6 +24,9 @@ from ..physics.state import Command, State
 from ..tasks.occluded import OccludedMemory
 from .controller import AbstractController, PolicyController
 
+SHARE_OF_LATENESS = 0.25  # of delay and rate lag: time constant of the observer for an identified vehicle
+FASTEST, SLOWEST = 0.015, 0.05  # [s], its limits
+
 
 class GravityFrameState(eqx.Module):
     """Memory of the observer and of the controller inside."""
@@ -61,8 +64,15 @@ class GravityFrame(AbstractController[GravityFrameState]):
         return dataclasses.replace(self, age=jnp.array(age))
 
     def with_vehicle(self, member: Member) -> "GravityFrame":
-        """Return the same for a vehicle that was identified: the observer uses its delay and the lag of its thrust."""
+        """Return the same for a vehicle that was identified.
+
+        The observer uses its delay and the lag of its thrust. It is as fast as the vehicle permits: the frame must not
+        turn much faster than the vehicle can follow.
+        """
         observer = dataclasses.replace(self.observer, path=member.path)
+        if member.lateness is not None:
+            tau = jnp.clip(SHARE_OF_LATENESS * member.lateness, FASTEST, SLOWEST)
+            observer = dataclasses.replace(observer, tau=tau.astype(self.observer.tau.dtype))
         return dataclasses.replace(self, inner=self.inner.with_vehicle(member), observer=observer)
 
     def acting(self, actuators: ActuatorState) -> "GravityFrame":

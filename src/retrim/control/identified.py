@@ -93,7 +93,9 @@ class IdentifiedFlight(AbstractController[IdentifiedState]):
         return dataclasses.replace(memory, path=path, inner=inner)
 
     def _flying(self, belief: PathBelief) -> AbstractController[Any]:
-        return self.inner.with_vehicle(Member(self.family.path(belief.centre), belief))
+        slowest = self.family.path(belief.ends[1])
+        lateness = slowest.delay + slowest.response.rate_lag[0]
+        return self.inner.with_vehicle(Member(self.family.path(belief.centre), belief, lateness))
 
 
 def believed(family: PathFamily, estimate: PathEstimate) -> PathBelief:

@@ -65,6 +65,8 @@ class Member(eqx.Module):
 
     path: CommandPath
     belief: PathBelief
+    lateness: Float[Array, ""] | None = None
+    """Longest sum of delay and rate lag that the belief allows [s]; None outside of a flight."""
 
 
 class PathFamily(eqx.Module):
