@@ -64,7 +64,7 @@ def test_with_the_commands_that_arrived_nothing_is_missing(window, vehicle):
 
     @eqx.filter_jit
     def residual(vehicles):
-        rows = residual_targets(vehicles.arrived(window), PointMass(DT))
+        rows = residual_targets(vehicles.apply_path(window), PointMass(DT))
         weight = rows.valid[:, None]
         return jnp.sqrt(jnp.sum(weight * rows.a_res**2) / jnp.sum(weight)), jnp.sum(rows.valid)
 
@@ -76,8 +76,11 @@ def test_with_the_commands_that_arrived_nothing_is_missing(window, vehicle):
 
 def test_starts_get_vehicles_from_the_belief(window, vehicle):
     x = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (4, 8, *leaf.shape)), State.at(jnp.zeros(3)))
-    starts = eqx.filter_jit(vehicle.assigned)(jax.vmap(jax.vmap(Start))(jnp.zeros((4, 8)), x), window, random.key(0))
-    belief = eqx.filter_jit(vehicle.identify)(window).belief
+    found = eqx.filter_jit(vehicle.identify)(window)
+    starts = eqx.filter_jit(vehicle.assign_vehicles)(
+        jax.vmap(jax.vmap(Start))(jnp.zeros((4, 8)), x), found, random.key(0)
+    )
+    belief = found.belief
     low, high = (vehicle.family.path(end).delay for end in belief.ends)
     delays = starts.member.path.delay
     assert delays.shape == (4, 8)
@@ -90,4 +93,4 @@ def test_a_window_without_flight_says_nothing(window, vehicle):
     empty = dataclasses.replace(window, valid=jnp.zeros(N, dtype=bool))
     belief = eqx.filter_jit(vehicle.identify)(empty).belief
     assert np.all(belief.half_width > 0.5)
-    assert not np.any(eqx.filter_jit(vehicle.arrived)(empty).valid)
+    assert not np.any(eqx.filter_jit(vehicle.apply_path)(empty).valid)

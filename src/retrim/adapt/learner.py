@@ -100,7 +100,7 @@ class OnlineLearner(eqx.Module):
             The new state, or ``state`` if the fit is not finite or had no data, and a report.
         """
         screening, delay = screen(window, self.env.dynamics.dt), self.plant_delay_ticks
-        window = self.vehicles.arrived(window)
+        window = self.vehicles.apply_path(window)
         rows = residual_targets(window, self.env.dynamics, delay_ticks=delay, consistent=screening.steps)
         fitted, rms = self.residual_model.fit(state, rows)
         accepted = all_finite(fitted) & jnp.any(rows.valid) & screening.trusted
@@ -137,7 +137,8 @@ class OnlineLearner(eqx.Module):
         corrected = self.view(self.env, FittedResidual(self.residual_model, residual))
         k_train, k_gate, k_window = random.split(key, 3)
         x0 = self.starts(self.env.task, window, k_train, self.num_updates, self.num_envs)
-        x0 = self.vehicles.assigned(x0, window, random.fold_in(k_train, VEHICLES))
+        vehicle = self.vehicles.identify(window)
+        x0 = self.vehicles.assign_vehicles(x0, vehicle, random.fold_in(k_train, VEHICLES))
         optimiser = (isinstance(state.policy, LoraPolicy) and self.low_rank_optimiser) or self.optimiser
         begun = optimiser.begin(state, self.num_updates)
         stepped, _ = bptt(begun, corrected, x0, optimiser=optimiser.transformation(self.num_updates))
@@ -148,7 +149,7 @@ class OnlineLearner(eqx.Module):
             drawn(window, k_window, (HELD_OUT // 2,)),
         )
         incumbent = state.policy if flown is None else flown
-        held_out = self.vehicles.assigned(held_out, window, random.fold_in(k_gate, VEHICLES))
+        held_out = self.vehicles.assign_vehicles(held_out, vehicle, random.fold_in(k_gate, VEHICLES))
         verdict = judge(trained.policy.merged(), incumbent.merged(), corrected, held_out)
         return trained, verdict.provided(screening.trusted)
 

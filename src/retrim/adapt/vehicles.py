@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import lax, random
 from jaxtyping import Array, Float, Key
 
-from ..control.identified import believed, bounded_gain
+from ..control.identified import belief_from, bounded_gain
 from ..estimation.command_path import PathEstimator, PathState
 from ..learn.window import Window
 from ..physics.command_path import CommandPath
@@ -24,7 +24,15 @@ class AbstractVehicles(eqx.Module):
     """What learners know of the vehicle."""
 
     @abc.abstractmethod
-    def arrived(self, window: Window) -> Window:
+    def identify(self, window: Window) -> "Identification | None":
+        """Return what a window says of the vehicle; None if the model knows it.
+
+        Args:
+            window: Ticks of flight.
+        """
+
+    @abc.abstractmethod
+    def apply_path(self, window: Window) -> Window:
         """Return the window with the commands that a model without delay and lag would have to be given.
 
         Args:
@@ -32,12 +40,12 @@ class AbstractVehicles(eqx.Module):
         """
 
     @abc.abstractmethod
-    def assigned(self, starts: Start, window: Window, key: Key[Array, ""]) -> Start:
+    def assign_vehicles(self, starts: Start, found: "Identification | None", key: Key[Array, ""]) -> Start:
         """Return starts with the vehicles that fly from them; the key is consumed.
 
         Args:
             starts: Starts of roll-outs, with any leading axes.
-            window: Ticks of flight.
+            found: Result of :meth:`identify`.
             key: Random key.
         """
 
@@ -45,11 +53,14 @@ class AbstractVehicles(eqx.Module):
 class OwnVehicle(AbstractVehicles):
     """The vehicle of the model, with the delay that is declared."""
 
-    def arrived(self, window: Window) -> Window:
+    def identify(self, window: Window) -> None:
+        """Return None."""
+
+    def apply_path(self, window: Window) -> Window:
         """Return the window as it is; the delay is a setting of the learner."""
         return window
 
-    def assigned(self, starts: Start, window: Window, key: Key[Array, ""]) -> Start:
+    def assign_vehicles(self, starts: Start, found: "Identification | None", key: Key[Array, ""]) -> Start:
         """Return the starts as they are."""
         return starts
 
@@ -85,12 +96,12 @@ class IdentifiedVehicle(AbstractVehicles):
         first = estimator.init(jax.tree.map(lambda leaf: leaf[0], window.x))
         last, _ = lax.scan(tick, first, (window.t, window.x, window.u, window.valid, age))
         estimate = estimator.estimated(last).estimate
-        belief = believed(self.family, estimate)
+        belief = belief_from(self.family, estimate)
         path = self.family.path(belief.centre)
         response = dataclasses.replace(path.response, thrust_gain=bounded_gain(estimate))
         return Identification(belief, dataclasses.replace(path, response=response))
 
-    def arrived(self, window: Window) -> Window:
+    def apply_path(self, window: Window) -> Window:
         """Return the window with thrust and rates behind the identified path; its first ticks do not count."""
         path, dt = self.identify(window).path, self.estimator.dt
         first: Command = jax.tree.map(lambda leaf: leaf[0], window.u)
@@ -105,9 +116,11 @@ class IdentifiedVehicle(AbstractVehicles):
         acting = jax.tree.map(lambda new, old: new.astype(old.dtype), acting, window.u)
         return dataclasses.replace(window, u=acting, valid=window.valid & (count > forgotten))
 
-    def assigned(self, starts: Start, window: Window, key: Key[Array, ""]) -> Start:
+    def assign_vehicles(self, starts: Start, found: "Identification | None", key: Key[Array, ""]) -> Start:
         """Return starts with vehicles that are drawn from the belief."""
-        belief, shape = self.identify(window).belief, starts.t.shape
+        if found is None:
+            raise ValueError("IdentifiedVehicle.assign_vehicles needs the result of identify, got None")
+        belief, shape = found.belief, starts.t.shape
         inside = random.uniform(key, (*shape, belief.centre.shape[0]), minval=-1.0, maxval=1.0)
 
         def assign(t: Float[Array, ""], x: State, inside: Float[Array, "4"]) -> Start:

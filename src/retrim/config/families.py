@@ -81,7 +81,7 @@ def policy_controller(preset: Preset, task: AbstractTask, policy: Policy) -> Pol
     return RestingController(observation, policy, task.home())
 
 
-def tracked(controller: AbstractController[Any], preset: Preset) -> AbstractController[Any]:
+def track_actuators(controller: AbstractController[Any], preset: Preset) -> AbstractController[Any]:
     """Return a controller that is told thrust and body rates, if its preset is for a family of vehicles.
 
     Args:
@@ -96,11 +96,11 @@ def tracked(controller: AbstractController[Any], preset: Preset) -> AbstractCont
     return ActuatorTracking(controller.with_vehicle(Member(path, prior)), path, preset.dt)
 
 
-def identified(controller: AbstractController[Any], preset: Preset) -> IdentifiedFlight:
+def identify_vehicle(controller: AbstractController[Any], preset: Preset) -> IdentifiedFlight:
     """Return a controller that is told the vehicle as it is identified in flight.
 
     Args:
-        controller: Controller of a policy for a family; see :func:`tracked`.
+        controller: Controller of a policy for a family; see :func:`track_actuators`.
         preset: Preset of the policy.
 
     Raises:

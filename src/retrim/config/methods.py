@@ -21,7 +21,7 @@ from ..runtime.pilot import ControllerPilot, Pilot
 from ..tasks.keypoints import Keypoints
 from ..tasks.occluded import OccludedKeypoints
 from .baselines import BASELINES, Baseline, datt_of
-from .families import identified, policy_controller, tracked
+from .families import identify_vehicle, policy_controller, track_actuators
 from .learners import check_frame, felt_frame
 from .on_board import raptor
 from .registry import Registry
@@ -54,7 +54,7 @@ class MethodRequest:
             ConfigError: The task cannot be turned.
         """
         check_frame(self.setup.preset, self.setup.env.task)
-        return tracked(felt_frame(self.controller(), self.setup.preset, self.setup.vehicle), self.setup.preset)
+        return track_actuators(felt_frame(self.controller(), self.setup.preset, self.setup.vehicle), self.setup.preset)
 
     def by_state(self, controller: AbstractController[Any], called: str | None = None) -> AbstractController[Any]:
         """Return a controller that needs the state as it can be flown: by a pose filter where keypoints are seen.
@@ -125,14 +125,14 @@ def find_method(name: str) -> MethodEntry:
 
 
 def _base(request: MethodRequest) -> Pilot:
-    return ControllerPilot(tracked(request.controller(), request.setup.preset))
+    return ControllerPilot(track_actuators(request.controller(), request.setup.preset))
 
 
 def _integral(request: MethodRequest) -> Pilot:
     if isinstance(request.setup.env.task.observation, Keypoints):
         raise ConfigError("method 'base-i' shifts the measured position; a policy that sees keypoints is shown none")
     integral = IntegralAction(request.controller(), request.setup.flown, gain=jnp.array(0.8), limit=jnp.array(2.0))
-    return ControllerPilot(tracked(integral, request.setup.preset))
+    return ControllerPilot(track_actuators(integral, request.setup.preset))
 
 
 def _gravity_frame(request: MethodRequest) -> Pilot:
@@ -140,7 +140,7 @@ def _gravity_frame(request: MethodRequest) -> Pilot:
 
 
 def _identified(request: MethodRequest) -> Pilot:
-    return ControllerPilot(identified(request.in_felt_frame(), request.setup.preset))
+    return ControllerPilot(identify_vehicle(request.in_felt_frame(), request.setup.preset))
 
 
 def _without_policy(name: str, baseline: Baseline, request: MethodRequest) -> Pilot:

@@ -36,7 +36,7 @@ from ..tasks.motions import MOTIONS
 from ..tasks.reference import Reference
 from ..tasks.task import AbstractTask
 from .command_paths import delayed, longest_delay, model_path
-from .families import identified, make_family, policy_controller, tracked
+from .families import identify_vehicle, make_family, policy_controller, track_actuators
 from .fresh import flight_starts, low_rank, untrained
 from .learners import felt_frame, make_learner, nominal_model, pretraining_optimiser
 from .presets import Preset
@@ -213,13 +213,13 @@ class Setup:
         """
         plain = policy_controller(self.preset, self.flown, state.policy.policy.merged())
         if self.preset.adapt.frame == "world":
-            return tracked(plain, self.preset)
+            return track_actuators(plain, self.preset)
         known = FittedResidual(self.learner.residual_model, state.residual)
         frame = felt_frame(plain, self.preset, self.vehicle, known)
         if not isinstance(frame, GravityFrame):
             return frame
-        monitor = tracked(Monitor(frame, self.flown), self.preset)
-        return monitor if self.preset.family is None else identified(monitor, self.preset)
+        monitor = track_actuators(Monitor(frame, self.flown), self.preset)
+        return monitor if self.preset.family is None else identify_vehicle(monitor, self.preset)
 
     def low_rank(self, policy: Policy | LoraPolicy, key: Key[Array, ""]) -> LoraPolicy:
         """Return ``policy`` with a fresh low-rank delta (ranks 4, 10, 1 and scale 4, as in the paper).

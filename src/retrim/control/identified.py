@@ -79,7 +79,7 @@ class IdentifiedFlight(AbstractController[IdentifiedState]):
         """Identify, and return the command of the controller inside for the vehicle as it is known now."""
         dt = self.estimator.dt
         path = self.estimator.update(memory.path, t, x, self.omega, self.a, self.age)
-        belief = memory.belief.towards(believed(self.family, path.estimate), PACE * dt)
+        belief = memory.belief.towards(belief_from(self.family, path.estimate), PACE * dt)
         found = bounded_gain(path.estimate).astype(x.p.dtype)
         gain = memory.gain + jnp.clip(found - memory.gain, -GAIN_PACE * dt, GAIN_PACE * dt)
         u, inner = self._flying(belief)(memory.inner, t, x)
@@ -98,7 +98,7 @@ class IdentifiedFlight(AbstractController[IdentifiedState]):
         return self.inner.with_vehicle(Member(self.family.path(belief.centre), belief, lateness))
 
 
-def believed(family: PathFamily, estimate: PathEstimate) -> PathBelief:
+def belief_from(family: PathFamily, estimate: PathEstimate) -> PathBelief:
     """Return what an estimate says of the coordinates of a path: the 90 % interval of each.
 
     Args:
