@@ -81,7 +81,7 @@ WRONG = [
     ((*FLY, "--seed", "-1"), "seed -1: must be"),
     ((*FLY, "--starts", "0"), "0 starts: must be 1 to 100000"),
     ((*FLY, "--starts", BIG), f"{BIG} starts: must be"),
-    ((*FLY, "--thrust-error", "2"), "thrust error 2.0 must be between -0.5 and 0.5"),
+    ((*FLY, "--thrust-error", "2"), "thrust error 2.0 must be between -0.5 and 1"),
     ((*FLY, "--thrust-error", "nan"), "thrust error nan must be"),
     (("pretrain", "hover", "--seed", BIG), f"seed {BIG}: must be"),
     (("pretrain", "hover", "--updates", "0"), "pretrain.num_updates: Input should be greater than or equal to 1"),

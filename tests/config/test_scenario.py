@@ -271,7 +271,7 @@ def test_the_error_of_the_thrust_map_reaches_the_plant(plant, error, expected):
 
 def test_scenarios_that_cannot_be():
     for wrong, message in (
-        ({"thrust_error": 0.9}, "thrust error 0.9 must be between"),
+        ({"thrust_error": 1.2}, "thrust error 1.2 must be between"),
         ({"sensors": "mocap", "plant": "mujoco"}, "measures its true state"),
         ({"delay": -0.01}, "delay -0.01 s must be 0 to 0.2 s"),
         ({"delay": 0.3}, "delay 0.3 s must be 0 to 0.2 s"),

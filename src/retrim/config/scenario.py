@@ -1,6 +1,6 @@
 """Where a flight takes place."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from ..errors import ConfigError, RetrimError
@@ -76,8 +76,8 @@ class Scenario:
             )
         if not 0.0 <= self.delay <= LONGEST_DELAY:
             raise ConfigError(f"delay {self.delay} s must be 0 to {LONGEST_DELAY:g} s")
-        if not -0.5 <= self.thrust_error <= 0.5:
-            raise ConfigError(f"thrust error {self.thrust_error} must be between -0.5 and 0.5")
+        if not -0.5 <= self.thrust_error <= 1.0:
+            raise ConfigError(f"thrust error {self.thrust_error} must be between -0.5 and 1")
 
     @property
     def entry(self) -> PlantEntry:
@@ -95,6 +95,19 @@ class Scenario:
             has_thrust_error=True,
             has_delay=True,
         )
+
+    def without_numbers(self) -> tuple["Scenario", tuple[str, ...]]:
+        """Return what decides which program flies: everything but the numbers of vehicle, delay and thrust error.
+
+        Returns:
+            The scenario without these numbers, and the names of the numbers that the vehicle states.
+        """
+        stated = tuple[str, ...]()
+        vehicle = self.vehicle
+        if isinstance(vehicle, VehicleSpec):
+            stated = tuple(field.name for field in fields(vehicle) if getattr(vehicle, field.name) is not None)
+            vehicle = None
+        return replace(self, vehicle=vehicle, delay=DELAY, thrust_error=THRUST_ERROR), stated
 
     def vehicle_name(self, trained_for: str | VehicleSpec) -> str:
         """Return the name of the vehicle that flies a policy trained for ``trained_for``."""

@@ -91,9 +91,9 @@ class Fleet:
 
     def lots(self, specs: Sequence[FlightSpec]) -> list[Lot]:
         """Return specifications in lots: those that are flown together as one program, each other one by itself."""
-        groups: dict[tuple[Scenario, str], list[FlightSpec]] = {}
+        groups: dict[Hashable, list[FlightSpec]] = {}
         for spec in specs:
-            groups.setdefault((spec.scenario, spec.method), []).append(spec)
+            groups.setdefault(spec.group, []).append(spec)
 
         def program(group: list[FlightSpec]) -> Hashable | None:
             setup, policy = self.setups[group[0].scenario.reference], self.policies[group[0].seed]

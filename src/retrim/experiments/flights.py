@@ -1,5 +1,6 @@
 """One flight of a fleet: its specification, and what it leaves."""
 
+from collections.abc import Hashable
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,6 +28,11 @@ class FlightSpec:
     """Number of the start; it also seeds the learners, the gusts and the noise of the flight."""
     seed: int = 0
     """Seed of the policy; it also seeds all that ``start`` does."""
+
+    @property
+    def group(self) -> tuple[Hashable, str]:
+        """Key of the flights that one program can fly: they differ in numbers, start and seed only."""
+        return self.scenario.without_numbers(), self.method
 
     def key(self) -> Key[Array, ""]:
         """Return the key of the flight's learners."""

@@ -30,7 +30,7 @@ def in_lots(groups: Iterable[list[FlightSpec]], program: Callable[[list[FlightSp
     The first lot of each program comes first: while it compiles, another program's does.
 
     Args:
-        groups: Flights that differ in start and seed only.
+        groups: Flights that differ in numbers of the vehicle, start and seed only.
         program: It tells the program of a group apart; None if its flights are flown one by one.
     """
     first, others = dict[Hashable, Lot](), list[Lot]()

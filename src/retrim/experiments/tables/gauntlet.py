@@ -1,7 +1,7 @@
 """The gauntlet: one policy under everything that changes."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from ..recovery import change_times, recoveries
 from ..reporter import Reporter
 from ..run import Run
 from .document import Document, TableSection
+from .hidden import entrants_of, fly_hidden
 from .kept_flights import forget_flights
 from .promise import promise_rows, promise_section
 from .study import fly_all, refuse_misfits, table_presets, train_all
@@ -62,6 +63,9 @@ def gauntlet(
     starts: int = 4,
     sensors: str = "ideal",
     faults: bool = False,
+    vehicles: Literal["own", "hidden"] = "own",
+    count: int = 200,
+    draw: int = 0,
 ) -> None:
     """A policy under everything that changes: recovery, steady and worst error, as one heat map.
 
@@ -73,12 +77,22 @@ def gauntlet(
         methods: How the policies fly; by default base, base-i, base-do and full, and beside them geometric-i and indi;
             for vision base, base-do and full.
         seeds: Training seeds; each also seeds the starts, the gusts and the learners of its flights.
-        seconds: Length of a flight [s].
+        seconds: Length of a flight [s]; flights of hidden vehicles last 10 s.
         starts: Flights per condition, method and seed.
         sensors: What the conditions are measured with that name no sensors themselves: ideal, mocap, onboard or rough.
         faults: Fly faults of measurements and vehicle at hover instead, and check that adapting is never worse than not
             adapting; by default base, base-do, geometric-i, indi, full and lora.
+        vehicles: own: the vehicle of the preset under all conditions; hidden: many vehicles that no method is told, at
+            hover under a push. Without --methods, the page compares hover/any with the methods for a known vehicle.
+        count: Number of hidden vehicles.
+        draw: Seed of the hidden vehicles.
     """
+    if vehicles == "hidden":
+        if only or faults:
+            raise ConfigError("--vehicles hidden has one condition, so that --only and --faults do not apply to it")
+        entrants = entrants_of(preset, methods)
+        sizes: dict[str, Any] = {"count": count, "draw": draw, "seeds": seeds, "starts": starts, "sensors": sensors}
+        return fly_hidden(run, reporter, entrants=entrants, **sizes)
     task = load(preset).task
     if task not in METHODS:
         raise ConfigError(f"preset {preset!r} is for {task}; the gauntlet is flown for {', '.join(METHODS)}")

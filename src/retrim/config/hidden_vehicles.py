@@ -1,0 +1,123 @@
+"""Vehicles that no method knows: a benchmark population, drawn from one size factor.
+
+Small vehicles turn fast and large ones turn slowly, so mass, inertia, delay and lags grow together. Ranges that were
+drawn independently of each other would contain impossible vehicles.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..physics.state import STANDARD_GRAVITY
+from ..physics.vehicle import small
+from .scenario import Scenario
+from .vehicle_file import VehicleSpec
+
+LIGHTEST, HEAVIEST = 0.03, 3.0  # [kg]
+RATE_LAG = (0.015, 0.15)  # [s], of the lightest and the heaviest vehicle
+DELAY = (0.0, 0.06)  # [s]
+THRUST_LAG = (0.01, 0.08)  # [s]
+SPREAD, DELAY_SPREAD = 0.2, 0.012  # standard deviation of the logarithm of lags, and of the delay [s]
+DAMPING = (0.4, 1.2)
+THRUST_GAIN = (0.6, 1.6)  # thrust over commanded thrust
+THRUST_TO_WEIGHT = (1.6, 5.0)  # at full command, if the gain were 1
+LEAST_THRUST = 1.4  # thrust at full command over weight
+SEED_TAG = 46
+
+
+@dataclass(frozen=True)
+class HiddenVehicle:
+    """A vehicle of the population. No method is told any of its numbers."""
+
+    spec: VehicleSpec
+    """Mass, limits, lags and damping. It states the delay, too."""
+    size: float
+    """0 for the lightest, 1 for the heaviest."""
+    thrust_gain: float
+    """Thrust over commanded thrust."""
+
+    @property
+    def rate_lag(self) -> float:
+        """Time constant of roll and pitch rate [s]."""
+        assert self.spec.rate_lag is not None
+        return self.spec.rate_lag[0]
+
+    @property
+    def damping(self) -> float:
+        """Damping ratio of the rate loop."""
+        assert self.spec.rate_damping is not None
+        return self.spec.rate_damping[0]
+
+    @property
+    def delay(self) -> float:
+        """Delay of commands [s]."""
+        assert self.spec.command_delay is not None
+        return self.spec.command_delay
+
+    @property
+    def thrust_to_weight(self) -> float:
+        """Thrust at full command over weight."""
+        return self.thrust_gain * self.spec.thrust_max / (self.spec.mass * STANDARD_GRAVITY)
+
+    def scenario(self, disturbance: str, *, sensors: str = "ideal") -> Scenario:
+        """Return a flight of the vehicle on the second-order plant.
+
+        Args:
+            disturbance: Name of a disturbance.
+            sensors: Name of a sensor model.
+        """
+        return Scenario(
+            disturbance,
+            plant="second-order",
+            vehicle=self.spec,
+            sensors=sensors,
+            thrust_error=self.thrust_gain - 1.0,
+            delay=self.delay,
+        )
+
+
+def draw_vehicles(count: int, seed: int = 0) -> list[HiddenVehicle]:
+    """Draw vehicles.
+
+    Args:
+        count: Number of vehicles.
+        seed: The first ``count`` vehicles of a seed are the same for every count.
+    """
+    return [_draw(np.random.default_rng((SEED_TAG, seed, n)), n) for n in range(count)]
+
+
+def _draw(draw: np.random.Generator, number: int) -> HiddenVehicle:
+    size = draw.uniform()
+
+    def grow(low: float, high: float) -> float:
+        value = low * (high / low) ** size * np.exp(draw.normal(0.0, SPREAD))
+        return _rounded(np.clip(value, low, high))
+
+    like = small()
+    mass = _rounded(LIGHTEST * (HEAVIEST / LIGHTEST) ** size)
+    length = (mass / float(like.mass)) ** (1.0 / 3.0)
+    rate_lag, thrust_lag = grow(*RATE_LAG), grow(*THRUST_LAG)
+    delay = float(np.clip(DELAY[1] * size + draw.normal(0.0, DELAY_SPREAD), *DELAY))
+    damping = _rounded(draw.uniform(*DAMPING))
+    gain = _rounded(np.exp(draw.uniform(*np.log(THRUST_GAIN))))
+    ratio = max(np.exp(draw.uniform(*np.log(THRUST_TO_WEIGHT))), LEAST_THRUST / gain)
+    inertia = mass * length**2 / float(like.mass) * np.asarray(like.inertia, dtype=float)
+    rates = np.asarray(like.omega_max, dtype=float)
+    spec = VehicleSpec(
+        name=f"hidden-{number}",
+        mass=mass,
+        inertia=(float(inertia[0]), float(inertia[1]), float(inertia[2])),
+        arm=(float(like.arm[0]) * length, float(like.arm[1]) * length),
+        thrust_max=float(ratio * mass * STANDARD_GRAVITY),
+        rates_max=(float(rates[0]), float(rates[1]), float(rates[2])),
+        motor_tau=thrust_lag,
+        rate_lag=(rate_lag, rate_lag, rate_lag),
+        rate_damping=(damping, damping, damping),
+        command_delay=round(delay, 4),
+    )
+    return HiddenVehicle(spec, float(size), gain)
+
+
+def _rounded(value: float) -> float:
+    """Return three digits, as a vehicle file would state."""
+    return float(f"{value:.3g}")

@@ -1,0 +1,63 @@
+"""Maps of vehicles: lag across, delay up, and how well each vehicle was flown."""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .plots import INK
+from .sheet import sheet
+
+if TYPE_CHECKING:
+    import matplotlib.figure
+
+SMALLEST, LARGEST = 1e-3, 1.0  # [m], ends of the colour scale
+ACROSS = 4  # panels in a row
+LOST = "#D55E00"
+
+
+def vehicle_map(
+    title: str, lag: np.ndarray, delay: np.ndarray, errors: Mapping[str, np.ndarray]
+) -> "matplotlib.figure.Figure":
+    """Draw one panel per method, with a dot for each vehicle.
+
+    Args:
+        title: Title of the figure.
+        lag: Time constant of the body rates of each vehicle [s].
+        delay: Command delay of each vehicle [s].
+        errors: Error of each vehicle by method [m]; infinite for a vehicle that was lost.
+    """
+    from matplotlib.colors import LogNorm
+
+    down, across = -(-len(errors) // ACROSS), min(ACROSS, len(errors))
+    with sheet((2.9 * across + 0.8, 2.9 * down + 0.6), 9.0, boxed=True) as figure:
+        grid = figure.subplots(down, across, squeeze=False, sharex=True, sharey=True)
+        figure.suptitle(title, fontsize=12, fontweight="bold", color=INK)
+        shown = None
+        for axes, (name, values) in zip(grid.flat, errors.items(), strict=False):
+            lost = ~np.isfinite(values)
+            shown = axes.scatter(
+                1000 * lag[~lost],
+                1000 * delay[~lost],
+                c=np.clip(values[~lost], SMALLEST, LARGEST),
+                norm=LogNorm(SMALLEST, LARGEST),
+                cmap="viridis_r",
+                s=16,
+                linewidths=0,
+            )
+            axes.scatter(1000 * lag[lost], 1000 * delay[lost], color=LOST, marker="x", s=22, linewidths=1.2)
+            axes.set_title(f"{name}: {int(lost.sum())} of {len(values)} lost", fontsize=9, color=INK)
+            axes.set_xscale("log")
+            axes.set_xticks([15, 30, 60, 100, 150], ["15", "30", "60", "100", "150"])
+            axes.minorticks_off()
+            axes.grid(alpha=0.25)
+        for axes in grid[-1]:
+            axes.set_xlabel("lag of the body rates [ms]")
+        for axes in grid[:, 0]:
+            axes.set_ylabel("delay of commands [ms]")
+        for axes in grid.flat[len(errors) :]:
+            axes.set_visible(False)
+        if shown is not None:
+            bar = figure.colorbar(shown, ax=grid, shrink=0.8, label="error 5 s after the push [m], worst flight")
+            bar.set_ticks([1e-3, 1e-2, 1e-1, 1.0], labels=["0.001", "0.01", "0.1", "1"])
+    return figure
