@@ -197,6 +197,7 @@ OURS["track/fast"] = OURS["track/retrim"] | {
 }
 OURS["hover/any"] = OURS["hover/retrim"] | {
     "reward": "stiff",
+    "axes": "heading",
     "command_history": 6,
     "jump_cost": 0.05,
     "family": {

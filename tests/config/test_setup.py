@@ -41,6 +41,7 @@ from retrim.tasks import (
     StateObs,
     Track,
 )  # fmt: skip
+from retrim.tasks.heading_obs import HeadingObs
 from retrim.tasks.hover import StiffHover
 from retrim.tasks.vehicle_obs import VehicleObs
 from retrim.tasks.view import ViewHover
@@ -114,6 +115,8 @@ def test_the_observation_has_the_presets_numbers(built):
     if preset.family is not None:
         assert isinstance(seen, VehicleObs)
         seen = seen.inner
+    assert isinstance(seen, HeadingObs) == (preset.axes == "heading")
+    seen = seen.inner if isinstance(seen, HeadingObs) else seen
     scales = seen.state if isinstance(seen, StateAndErrorObs) else seen
     np.testing.assert_array_equal(scales.omega_max, vehicle.omega_max)
     if preset.task == "vision":

@@ -57,6 +57,7 @@ ANY = dataclasses.replace(
     name="hover/any",
     reward="stiff",
     command_history=6,
+    axes="heading",
     jump_cost=0.05,
     family=Family(),
     pretrain=dataclasses.replace(

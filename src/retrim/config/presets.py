@@ -172,6 +172,9 @@ class Preset:
     """Where to hover, world [m]."""
     termination_box: Positive = 5.0
     """A vehicle farther than this from the goal or reference along an axis is terminated [m]."""
+    axes: Literal["world", "heading"] = "world"
+    """Axes of the observed state. heading: they turn with the vehicle, so that a hover policy flies alike at every
+    heading."""
     command_history: int = Field(default=0, ge=0, le=50, strict=True)
     """Past commands in the observation."""
     delay_ticks: int = Field(default=0, ge=0, le=20, strict=True)
@@ -200,6 +203,8 @@ class Preset:
         for reward, task in (("stiff", "hover"), ("sharp", "track"), ("view", "vision")):
             if self.reward == reward and self.task != task:
                 raise ValueError(f"reward = {reward!r} is for task = {task!r}, not for {self.task!r}")
+        if self.axes == "heading" and self.task != "hover":
+            raise ValueError(f"axes = 'heading' is for task = 'hover', not for {self.task!r}")
         if self.family is not None:
             if self.task == "vision":
                 raise ValueError("a table [family] is for a task with a measured state, not for 'vision'")

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from ..errors import ConfigError
 from ..physics.path_family import PathBelief
 from ..physics.vehicle import Vehicle
+from ..tasks.heading_obs import HeadingObs
 from ..tasks.hover import AbstractHover, Hover, L2Hover, StiffHover
 from ..tasks.keypoints import Keypoints
 from ..tasks.observation import AbstractObservation, StateObs
@@ -55,9 +56,11 @@ class TaskRequest:
         """The free table of the preset, for custom tasks."""
         return self.preset.options
 
-    def state_observation(self) -> StateObs:
-        """Return the paper's observation, o = [p, R, v], with the preset's past commands."""
-        return StateObs(jnp.array(self.preset.goal), *self.observed_commands())
+    def state_observation(self) -> AbstractObservation[Any]:
+        """Return the paper's observation, o = [p, R, v], with the preset's past commands, in the preset's axes."""
+        origin = jnp.array(self.preset.goal)
+        seen = StateObs(origin, *self.observed_commands())
+        return HeadingObs(seen, origin) if self.preset.axes == "heading" else seen
 
     def of_vehicle(self, observation: AbstractObservation[Any]) -> AbstractObservation[Any]:
         """Return an observation that shows the vehicle, too, if the preset is for a family of vehicles."""

@@ -1,0 +1,55 @@
+"""Observation in axes that turn with the heading: a vehicle at another heading observes the same numbers."""
+
+import dataclasses
+from typing import Any, TypeVar
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..physics import so3
+from ..physics.felt_frame import FeltFrame
+from ..physics.state import Command, State
+from .observation import AbstractObservation
+
+M = TypeVar("M")
+SMALLEST = 1e-6  # of the length of the heading; it is zero where the vehicle is upside down
+
+
+class HeadingObs(AbstractObservation[M]):
+    """Show the state turned about the vertical through ``origin``, so that the heading is zero.
+
+    Hover looks the same from every heading: thrust and body rates are commands in body axes, and the reward does not
+    depend on the heading. A policy that observes headings must learn each of them, and it oscillates at some headings
+    and rests at others. The heading is the twist of the attitude about the vertical, which is smooth up to a tilt of
+    180 degrees.
+    """
+
+    inner: AbstractObservation[M]
+    origin: Float[Array, "3"]
+    """A point of the vertical, world [m]."""
+
+    @property
+    def size(self) -> int:
+        """Length of the observation inside."""
+        return self.inner.size
+
+    def init(self, x: State) -> M:
+        """Return the memory of the observation inside."""
+        return self.inner.init(self._turned(x))
+
+    def __call__(self, memory: M, t: Float[Array, ""], x: State, last: Command) -> tuple[Float[Array, " o"], M]:
+        """Observe the turned state."""
+        return self.inner(memory, t, self._turned(x), last)
+
+    def in_frame(self, frame: FeltFrame) -> "HeadingObs[M]":
+        """Return the observation about the vertical of another frame."""
+        turned: AbstractObservation[Any] = self.inner.in_frame(frame)
+        return dataclasses.replace(self, inner=turned, origin=frame.vector(self.origin))
+
+    def _turned(self, x: State) -> State:
+        cosine, sine = x.R[0, 0] + x.R[1, 1], x.R[1, 0] - x.R[0, 1]
+        length = jnp.sqrt(cosine**2 + sine**2 + SMALLEST**2)
+        c, s, zero = cosine / length, sine / length, jnp.zeros_like(length)
+        back = jnp.array([[c, s, zero], [-s, c, zero], [zero, zero, zero + 1.0]])
+        origin = self.origin.astype(x.p.dtype)
+        return State(origin + so3.act(back, x.p - origin), so3.mul(back, x.R), so3.act(back, x.v))
