@@ -208,6 +208,12 @@ OURS["hover/any"] = OURS["hover/retrim"] | {
     | {"num_updates": 1000, "num_envs": 64, "learning_rate": 5e-3, "hidden_sizes": (256, 256)},
     "adapt": OURS["hover/retrim"]["adapt"] | {"window": 150, "trim": "free"},
 }  # fmt: skip
+OURS["track/any"] = OURS["track/retrim"] | {
+    "command_history": 6,
+    "jump_cost": 0.05,
+    "family": OURS["hover/any"]["family"],
+    "pretrain": OURS["track/retrim"]["pretrain"] | {"num_updates": 1500, "num_envs": 64, "hidden_sizes": (256, 256)},
+}
 OURS["vision/occluded"] = OURS["vision/ideal"] | {
     "vision": {"occlusion": True, "pixel_noise": 1.0, "dropout": 0.05, "whiten_pixels": True}
     | {"encoder_steps": 3000, "encoder_motions": "near"}

@@ -75,7 +75,7 @@ def test_the_model_has_the_presets_delay_and_lag(built):
     assert preset.delay_ticks == delays.get(preset.name, 1)
     for env in (made.env, made.learner.env):
         assert float(env.delay) == pytest.approx(preset.delay_ticks * preset.dt)
-        if preset.name in ("track/preview", "track/retrim", "track/fast", "vision/retrim"):
+        if preset.name in ("track/preview", "track/retrim", "track/any", "track/fast", "vision/retrim"):
             assert isinstance(env.dynamics, Lagged)
             assert preset.actuator_tau == 0.033
             assert {float(env.dynamics.response.thrust_lag), *env.dynamics.response.rate_lag.tolist()} == {0.033}

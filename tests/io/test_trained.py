@@ -96,6 +96,7 @@ SIZES |= {
     "track/paper": 21,
     "track/blind": 15,
     "track/retrim": 49,
+    "track/any": 80,
     "track/fast": 49,
     "vision/ideal": 89,
     "vision/occluded": 89,

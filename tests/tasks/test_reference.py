@@ -15,11 +15,12 @@ from retrim.tasks import REFERENCES, Reference, joined, smooth_start
 from retrim.tasks.reference import POINTS
 from retrim.tasks.shapes import AT_SPEED, circle, figure8, star
 
-PERIODS = {"circle": 3.0, "figure8": 5.0, "star": 6.0}
+PERIODS = {"circle": 3.0, "figure8": 5.0, "lissajous": 5.5, "star": 6.0}
 RAMP = 3.0
 BOUNDS = {  # of the lap: lowest and highest x, then y
     "circle": ((0.0, 2.0), (-1.0, 1.0)),
     "figure8": ((0.0, 3.0), (-0.5, 0.5)),
+    "lissajous": ((0.0, 2.0), (-0.5, 0.5)),
     "star": ((0.0, 1.0 + math.cos(math.radians(36.0))), (-math.sin(math.radians(72.0)), math.sin(math.radians(72.0)))),
 }
 CORNERS = [1.0 + np.exp(1j * (math.pi + k * math.radians(72.0))) for k in range(5)]  # of the star, x + i y
@@ -443,7 +444,7 @@ def test_starts_of_a_family_never_straddle(tables):
     for k, (first, last) in enumerate(np.asarray(family.joins)):
         assert 8.0 * k <= first < last
         assert last + 4.0 + 0.5 < 8.0 * (k + 1) - 0.02
-    assert family.joins.shape == (3, 2)
+    assert family.joins.shape == (len(tables), 2)
 
 
 def test_a_family_needs_members_and_time(tables):
@@ -497,6 +498,13 @@ def test_size_and_period_can_be_chosen(make):
 
 
 # ---- with a top speed
+
+
+def test_a_slow_lissajous_takes_ten_seconds():
+    reference = AT_SPEED["lissajous"](0.8886)
+    start, end = np.asarray(reference.lap)
+    assert end - start == pytest.approx(10.0, abs=2e-3)
+    assert np.ptp(np.asarray(reference.rows)[:, 0]) == pytest.approx(2.0, abs=1e-3)
 
 
 @pytest.mark.parametrize("speed", [1.5, 4.0, 8.0])

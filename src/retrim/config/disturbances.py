@@ -83,9 +83,7 @@ _BUILT_IN: dict[str, DisturbanceFactory] = {
         jnp.array([_bounded(size, 2.0, -10.0, 10.0, "m/s^2"), 0.0, 0.0])
     ),
     "step": lambda key, size: Step(jnp.full(3, _bounded(size, 2.0, -10.0, 10.0, "m/s^2")), jnp.array(8.0)),
-    "early-step": lambda key, size: Step(
-        jnp.full(3, _bounded(size, 2.0, -10.0, 10.0, "m/s^2")), jnp.array(4.0)
-    ),
+    "early-step": lambda key, size: Step(jnp.full(3, _bounded(size, 2.0, -10.0, 10.0, "m/s^2")), jnp.array(4.0)),
     "kick": lambda key, size: Kick(  # a speed gained within 0.1 s, level and diagonal
         10.0 * _diagonal(_bounded(size, 3.0, 0.0, 10.0, "m/s")), jnp.array(8.0), jnp.array(0.1)
     ),

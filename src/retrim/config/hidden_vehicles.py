@@ -59,18 +59,20 @@ class HiddenVehicle:
         """Thrust at full command over weight."""
         return self.thrust_gain * self.spec.thrust_max / (self.spec.mass * STANDARD_GRAVITY)
 
-    def scenario(self, disturbance: str, *, sensors: str = "ideal") -> Scenario:
+    def scenario(self, disturbance: str, *, sensors: str = "ideal", reference: str | None = None) -> Scenario:
         """Return a flight of the vehicle on the second-order plant.
 
         Args:
             disturbance: Name of a disturbance.
             sensors: Name of a sensor model.
+            reference: Reference of a tracking policy.
         """
         return Scenario(
             disturbance,
             plant="second-order",
             vehicle=self.spec,
             sensors=sensors,
+            reference=reference,
             thrust_error=self.thrust_gain - 1.0,
             delay=self.delay,
         )

@@ -81,6 +81,15 @@ TRACK_RETRIM = dataclasses.replace(
     ),
 )
 
+TRACK_ANY = dataclasses.replace(
+    TRACK_RETRIM,
+    name="track/any",
+    command_history=6,
+    jump_cost=0.05,
+    family=Family(),
+    pretrain=dataclasses.replace(TRACK_RETRIM.pretrain, num_updates=1500, num_envs=64, hidden_sizes=(256, 256)),
+)
+
 TRACK_FAST = dataclasses.replace(
     TRACK_RETRIM,
     name="track/fast",
@@ -117,6 +126,8 @@ PRESETS: dict[str, Preset] = {
     "hover/any": ANY,
     # The same for tracking: trained on references as they are and as they are felt under a push.
     "track/retrim": TRACK_RETRIM,
+    # The same for any vehicle of a family, which is identified in flight.
+    "track/any": TRACK_ANY,
     # The same at up to 8 m/s, for the kingfisher.
     "track/fast": TRACK_FAST,
     # The paper's loop with one tick of delay, the last two commands, and a small budget that reaches the same error.

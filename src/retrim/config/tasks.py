@@ -56,11 +56,15 @@ class TaskRequest:
         """The free table of the preset, for custom tasks."""
         return self.preset.options
 
-    def state_observation(self) -> AbstractObservation[Any]:
-        """Return the paper's observation, o = [p, R, v], with the preset's past commands, in the preset's axes."""
-        origin = jnp.array(self.preset.goal)
-        seen = StateObs(origin, *self.observed_commands())
-        return HeadingObs(seen, origin) if self.preset.axes == "heading" else seen
+    def state_observation(self) -> StateObs:
+        """Return the paper's observation, o = [p, R, v], with the preset's past commands."""
+        return StateObs(jnp.array(self.preset.goal), *self.observed_commands())
+
+    def in_axes(self, observation: AbstractObservation[Any]) -> AbstractObservation[Any]:
+        """Return an observation in the axes of the preset."""
+        if self.preset.axes == "world":
+            return observation
+        return HeadingObs(observation, jnp.array(self.preset.goal))
 
     def of_vehicle(self, observation: AbstractObservation[Any]) -> AbstractObservation[Any]:
         """Return an observation that shows the vehicle, too, if the preset is for a family of vehicles."""
@@ -120,7 +124,7 @@ def _hover(request: TaskRequest) -> AbstractTask:
     kind = HOVER_REWARDS.get(p.reward, Hover)
     return kind(
         jnp.array(p.goal),
-        request.of_vehicle(request.state_observation()),
+        request.of_vehicle(request.in_axes(request.state_observation())),
         jnp.array(p.termination_box),
         jnp.array(p.pretrain.max_start_yaw),
         p.dt,

@@ -76,19 +76,41 @@ def star(radius: float = 1.0, period: float = 6.0, ramp: float = RAMP) -> Refere
     return Reference.of(path, seconds=ramp + period, lap=ramp)
 
 
+def lissajous(period: float = 5.5, ramp: float = RAMP) -> Reference:
+    """Return a horizontal figure-8 of 2 m x 1 m from (0, 0, 1), the size that RAPTOR was flown at (5.5 s, 10 s).
+
+    Args:
+        period: Time of a lap [s].
+        ramp: Time of the smooth start [s].
+    """
+    return figure8(2.0, 1.0, period, ramp)
+
+
 def circle_at(speed: float) -> Reference:
     """Return the circle, flown at ``speed`` [m/s]; it is as large as the vehicle's acceleration needs."""
     radius = max(1.0, speed**2 / SIDEWAYS)
     return circle(radius, 2.0 * math.pi * radius / speed, ramp=max(RAMP, speed))
 
 
-def figure8_at(speed: float) -> Reference:
-    """Return the figure-8 with a top speed of ``speed`` [m/s]; it is as large as the vehicle's acceleration needs."""
-    phi = [2.0 * math.pi * k / 1000 for k in range(1000)]  # of a figure-8 of 3 m x 1 m
-    fastest = max(math.hypot(1.5 * math.sin(p), math.cos(2.0 * p)) for p in phi)
-    sharpest = max(math.hypot(1.5 * math.cos(p), 2.0 * math.sin(2.0 * p)) for p in phi)
+def figure8_at(speed: float, length: float = 3.0, width: float = 1.0) -> Reference:
+    """Return a figure-8 with a top speed; it grows until the vehicle's acceleration suffices.
+
+    Args:
+        speed: Top speed [m/s].
+        length: Smallest extent along x [m].
+        width: Smallest extent along y [m].
+    """
+    phi = [2.0 * math.pi * k / 1000 for k in range(1000)]
+    fastest = max(math.hypot(0.5 * length * math.sin(p), width * math.cos(2.0 * p)) for p in phi)
+    sharpest = max(math.hypot(0.5 * length * math.cos(p), 2.0 * width * math.sin(2.0 * p)) for p in phi)
     scale = max(1.0, (speed / fastest) ** 2 * sharpest / SIDEWAYS)
-    return figure8(3.0 * scale, scale, 2.0 * math.pi * scale * fastest / speed, ramp=max(RAMP, speed))
+    period = 2.0 * math.pi * scale * fastest / speed
+    return figure8(length * scale, width * scale, period, ramp=max(RAMP, speed))
+
+
+def lissajous_at(speed: float) -> Reference:
+    """Return :func:`lissajous` with a top speed of ``speed`` [m/s]; it grows as :func:`figure8_at` does."""
+    return figure8_at(speed, 2.0, 1.0)
 
 
 def star_at(speed: float) -> Reference:
@@ -97,8 +119,18 @@ def star_at(speed: float) -> Reference:
     return star(1.0, 5.0 * edge / speed)
 
 
-REFERENCES: dict[str, Callable[[], Reference]] = {"circle": circle, "figure8": figure8, "star": star}
+REFERENCES: dict[str, Callable[[], Reference]] = {
+    "circle": circle,
+    "figure8": figure8,
+    "lissajous": lissajous,
+    "star": star,
+}
 """What makes each built-in trajectory, by name."""
-AT_SPEED: dict[str, Callable[[float], Reference]] = {"circle": circle_at, "figure8": figure8_at, "star": star_at}
+AT_SPEED: dict[str, Callable[[float], Reference]] = {
+    "circle": circle_at,
+    "figure8": figure8_at,
+    "lissajous": lissajous_at,
+    "star": star_at,
+}
 """What makes it with a top speed [m/s]."""
 FASTEST = 20.0  # [m/s]

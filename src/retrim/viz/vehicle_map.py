@@ -17,7 +17,7 @@ LOST = "#D55E00"
 
 
 def vehicle_map(
-    title: str, lag: np.ndarray, delay: np.ndarray, errors: Mapping[str, np.ndarray]
+    title: str, lag: np.ndarray, delay: np.ndarray, errors: Mapping[str, np.ndarray], colour: str
 ) -> "matplotlib.figure.Figure":
     """Draw one panel per method, with a dot for each vehicle.
 
@@ -26,6 +26,7 @@ def vehicle_map(
         lag: Time constant of the body rates of each vehicle [s].
         delay: Command delay of each vehicle [s].
         errors: Error of each vehicle by method [m]; infinite for a vehicle that was lost.
+        colour: Label of the colour scale.
     """
     from matplotlib.colors import LogNorm
 
@@ -58,6 +59,6 @@ def vehicle_map(
         for axes in grid.flat[len(errors) :]:
             axes.set_visible(False)
         if shown is not None:
-            bar = figure.colorbar(shown, ax=grid, shrink=0.8, label="error 5 s after the push [m], worst flight")
+            bar = figure.colorbar(shown, ax=grid, shrink=0.8, label=colour)
             bar.set_ticks([1e-3, 1e-2, 1e-1, 1.0], labels=["0.001", "0.01", "0.1", "1"])
     return figure

@@ -77,23 +77,24 @@ def gauntlet(
         methods: How the policies fly; by default base, base-i, base-do and full, and beside them geometric-i and indi;
             for vision base, base-do and full.
         seeds: Training seeds; each also seeds the starts, the gusts and the learners of its flights.
-        seconds: Length of a flight [s]; flights of hidden vehicles last 10 s.
+        seconds: Length of a flight [s]; those of hidden vehicles last 10 s, or 25 s on figure-8s.
         starts: Flights per condition, method and seed.
         sensors: What the conditions are measured with that name no sensors themselves: ideal, mocap, onboard or rough.
         faults: Fly faults of measurements and vehicle at hover instead, and check that adapting is never worse than not
             adapting; by default base, base-do, geometric-i, indi, full and lora.
         vehicles: own: the vehicle of the preset under all conditions; hidden: many vehicles that no method is told, at
-            hover under a push. Without --methods, the page compares hover/any with the methods for a known vehicle.
+            hover under a push, or on figure-8s with a preset for tracking. Without --methods, the page compares
+            hover/any or track/any with methods for a known vehicle.
         count: Number of hidden vehicles.
         draw: Seed of the hidden vehicles.
     """
+    task = load(preset).task
     if vehicles == "hidden":
         if only or faults:
             raise ConfigError("--vehicles hidden has one condition, so that --only and --faults do not apply to it")
-        entrants = entrants_of(preset, methods)
+        entrants = entrants_of(task, preset, methods)
         sizes: dict[str, Any] = {"count": count, "draw": draw, "seeds": seeds, "starts": starts, "sensors": sensors}
-        return fly_hidden(run, reporter, entrants=entrants, **sizes)
-    task = load(preset).task
+        return fly_hidden(run, reporter, task=task, entrants=entrants, **sizes)
     if task not in METHODS:
         raise ConfigError(f"preset {preset!r} is for {task}; the gauntlet is flown for {', '.join(METHODS)}")
     if faults and (task != "hover" or sensors != "ideal"):
