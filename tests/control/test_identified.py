@@ -17,6 +17,7 @@ from retrim.control.finite_controller import FiniteController
 from retrim.control.identified import IdentifiedFlight
 from retrim.control.integral import IntegralAction
 from retrim.control.near_target import NearTarget
+from retrim.control.vehicle_report import VehicleEstimate
 from retrim.errors import ConfigError
 from retrim.estimation.command_path import PathEstimator, ringing_of
 from retrim.physics import ActuatorResponse, Command, CommandPath, small
@@ -88,6 +89,7 @@ def x0(as_a_user):
 def test_the_vehicle_is_identified_in_flight(x0, delay, lag, gain):
     controller = IdentifiedFlight(Weak(), PathEstimator.of(DT), family(), PathBelief.unknown())
     _, memory = fly(simulation(delay, lag, gain=gain), controller, x0)
+    memory = memory.flight
     last = jax.tree.map(lambda leaf: np.asarray(leaf)[-1], memory)
     true = family().coordinates(jnp.array(delay), jnp.array(lag), ringing_of(jnp.array(1.0)), jnp.array(0.03))
     assert abs(last.belief.centre[0] - true[0]) * 0.05 < 0.01  # [s]
@@ -99,6 +101,7 @@ def test_the_vehicle_is_identified_in_flight(x0, delay, lag, gain):
 def test_belief_and_gain_never_jump(x0):
     controller = IdentifiedFlight(Weak(), PathEstimator.of(DT), family(), PathBelief.unknown())
     _, memory = fly(simulation(0.08, 0.2, gain=0.6), controller, x0)
+    memory = memory.flight
     low, high = jax.vmap(lambda each: each.ends)(memory.belief)
     for ends in (low, high):
         assert np.abs(np.diff(np.asarray(ends), axis=0)).max() <= 2.0 * DT + 1e-5
@@ -174,7 +177,8 @@ def test_the_observer_is_as_fast_as_the_vehicle_permits(as_a_user):
     flight = setup.pilot(setup.new_policy(random.key(0)), "base-id").controller
 
     def tau(low, high):
-        found = flight._flying(PathBelief.between(jnp.array(low), jnp.array(high)))
+        belief = PathBelief.between(jnp.array(low), jnp.array(high))
+        found = flight.follow(VehicleEstimate(belief, jnp.array(1.0)))._flying(belief)
         return float(found.inner.observer.tau)
 
     fast, slow = [-1.0] * 4, [1.0] * 4

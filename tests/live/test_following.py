@@ -252,10 +252,10 @@ def test_what_leaves_the_fence_or_is_not_taken_is_told(made, tmp_path, monkeypat
 
 
 def test_only_who_sees_its_reference_has_a_choice(made):
-    assert choices(made[0], "circle") == ("circle", "figure8", "star")
-    assert choices(made[0], "my.csv") == ("my.csv", "circle", "figure8", "star")
+    assert choices(made[0], "circle") == ("circle", "figure8", "lissajous", "star")
+    assert choices(made[0], "my.csv") == ("my.csv", "circle", "figure8", "lissajous", "star")
     assert choices(Setup.of(load("track/blind")), "figure8") == ()
-    assert choices(Setup.of(load("track/paper")), "figure8") == ("figure8", "circle", "star")
+    assert choices(Setup.of(load("track/paper")), "figure8") == ("figure8", "circle", "lissajous", "star")
     assert choices(Setup.of(load("hover/retrim")), "") == ()
     drawn = paths(("circle", "star"), 20.0)
     np.testing.assert_allclose(drawn["circle"][-1], circle()(jnp.array(19.95)).p, atol=1e-9)

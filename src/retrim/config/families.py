@@ -113,10 +113,10 @@ def identify_vehicle(controller: AbstractController[Any], preset: Preset) -> Ide
             "with a table [family], such as hover/any"
         )
     prior = prior_belief(preset, family)
-    return IdentifiedFlight(controller, PathEstimator.of(preset.dt), family, prior, _declared(preset))
+    return IdentifiedFlight(controller, PathEstimator.of(preset.dt), family, prior, declared_vehicle(preset))
 
 
-def _declared(preset: Preset) -> Float[Array, "2"] | None:
+def declared_vehicle(preset: Preset) -> Float[Array, "2"] | None:
     """Return command delay and rate lag of the vehicle file [s], if it states both."""
     vehicle = preset.vehicle
     if not isinstance(vehicle, VehicleSpec) or vehicle.command_delay is None or vehicle.rate_lag is None:

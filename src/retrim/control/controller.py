@@ -16,7 +16,7 @@ from ..physics.state import Command, State
 from ..tasks.observation import AbstractObservation
 from .condition import Condition
 from .policy import Policy
-from .vehicle_report import VehicleReport
+from .vehicle_report import VehicleEstimate, VehicleReport
 
 M = TypeVar("M")
 
@@ -83,6 +83,20 @@ class AbstractController(eqx.Module, Generic[M]):
         """Return how far the controller has stepped back from its full function; None if it never does."""
         del memory
         return None
+
+    @property
+    def identifies(self) -> bool:
+        """Whether the controller identifies its vehicle in flight."""
+        return False
+
+    def follow(self, estimate: VehicleEstimate) -> "AbstractController[Any]":
+        """Return the controller for a vehicle that another process identifies; by default it does not use it.
+
+        Args:
+            estimate: Vehicle as it is identified now.
+        """
+        del estimate
+        return self
 
     def vehicle(self, memory: M) -> VehicleReport | None:
         """Return the vehicle that was identified; None for a controller that identifies none."""

@@ -1,4 +1,4 @@
-"""Identify the vehicle in flight, and tell the controller inside.
+"""Identify the vehicle in flight, and fly by the result.
 
 The estimator of the command path (:mod:`retrim.estimation.command_path`) sees every measurement and command. Its 90 %
 intervals become the belief of a policy that is trained for a family of vehicles, and the gain of the thrust scales the
@@ -19,17 +19,16 @@ from ..physics.path_family import Member, PathBelief, PathFamily
 from ..physics.state import Command, State
 from .condition import Condition
 from .controller import AbstractController
-from .vehicle_report import VehicleReport
+from .vehicle_report import VehicleEstimate, VehicleReport
 
 PACE = 2.0  # [1/s]: an unknown coordinate is known after half a second at the earliest
 GAIN_PACE = 1.0  # [1/s], change of the gain of the thrust
 GAINS = (0.4, 2.5)
 
 
-class IdentifiedState(eqx.Module):
-    """Memory of the identification and of the controller inside."""
+class BeliefState(eqx.Module):
+    """Memory of a flight by a belief, and of the controller inside."""
 
-    path: EstimatorState
     belief: PathBelief
     """Belief of the last command."""
     gain: Float[Array, ""]
@@ -37,8 +36,63 @@ class IdentifiedState(eqx.Module):
     inner: Any
 
 
+class BeliefFlight(AbstractController[BeliefState]):
+    """Flies a controller for a family of vehicles by a belief, which follows the identified vehicle slowly."""
+
+    inner: AbstractController[Any]
+    family: PathFamily
+    prior: PathBelief
+    """Belief at take-off."""
+    estimate: VehicleEstimate
+    """Vehicle that the belief follows."""
+    dt: float = eqx.field(static=True)
+    """Control tick [s]."""
+
+    def aged(self, age: float | Float[Array, ""]) -> "BeliefFlight":
+        """Return the same for measurements that are ``age`` old [s]."""
+        return dataclasses.replace(self, inner=self.inner.aged(age))
+
+    def sensing(self, omega: Float[Array, "3"], a: Float[Array, "3"]) -> "BeliefFlight":
+        """Return the same for a tick in which body rates and acceleration were measured."""
+        return dataclasses.replace(self, inner=self.inner.sensing(omega, a))
+
+    def condition(self, memory: BeliefState) -> Condition | None:
+        """Return the condition of the controller inside."""
+        return self.inner.condition(memory.inner)
+
+    def init(self, x: State) -> BeliefState:
+        """Return the memory at the start of a flight."""
+        return BeliefState(self.prior, jnp.ones_like(x.p[0]), self._flying(self.prior).init(x))
+
+    def __call__(self, memory: BeliefState, t: Float[Array, ""], x: State) -> tuple[Command, BeliefState]:
+        """Return the command of the controller inside for the vehicle as it is believed now."""
+        dt = self.dt
+        belief = memory.belief.towards(self.estimate.belief, PACE * dt)
+        change = jnp.clip(self.estimate.gain.astype(x.p.dtype) - memory.gain, -GAIN_PACE * dt, GAIN_PACE * dt)
+        gain = memory.gain + change
+        u, inner = self._flying(belief)(memory.inner, t, x)
+        return Command(u.c / gain, u.omega), BeliefState(belief, gain, inner)
+
+    def accepted(self, memory: BeliefState, u: Command) -> BeliefState:
+        """Remember the accepted command."""
+        inner = self._flying(memory.belief).accepted(memory.inner, Command(u.c * memory.gain, u.omega))
+        return dataclasses.replace(memory, inner=inner)
+
+    def _flying(self, belief: PathBelief) -> AbstractController[Any]:
+        slowest = self.family.path(belief.ends[1])
+        lateness = slowest.delay + slowest.response.rate_lag[0]
+        return self.inner.with_vehicle(Member(self.family.path(belief.centre), belief, lateness))
+
+
+class IdentifiedState(eqx.Module):
+    """Memory of the identification and of the flight by its result."""
+
+    path: EstimatorState
+    flight: BeliefState
+
+
 class IdentifiedFlight(AbstractController[IdentifiedState]):
-    """Flies a controller for a family of vehicles, and tells it which vehicle it is."""
+    """Flies a controller for a family of vehicles, and identifies which vehicle it is."""
 
     inner: AbstractController[Any]
     estimator: PathEstimator
@@ -64,7 +118,7 @@ class IdentifiedFlight(AbstractController[IdentifiedState]):
 
     def condition(self, memory: IdentifiedState) -> Condition | None:
         """Return the condition of the controller inside."""
-        return self.inner.condition(memory.inner)
+        return self.inner.condition(memory.flight.inner)
 
     def vehicle(self, memory: IdentifiedState) -> VehicleReport:
         """Return the vehicle as it is known now."""
@@ -72,30 +126,44 @@ class IdentifiedFlight(AbstractController[IdentifiedState]):
 
     def init(self, x: State) -> IdentifiedState:
         """Return the memory at the start of a flight."""
-        one = jnp.ones_like(x.p[0])
-        return IdentifiedState(self.estimator.init(x), self.prior, one, self._flying(self.prior).init(x))
+        path = self.estimator.init(x)
+        return IdentifiedState(path, self.follow(vehicle_estimate(self.family, path.estimate)).init(x))
 
     def __call__(self, memory: IdentifiedState, t: Float[Array, ""], x: State) -> tuple[Command, IdentifiedState]:
         """Identify, and return the command of the controller inside for the vehicle as it is known now."""
-        dt = self.estimator.dt
         path = self.estimator.update(memory.path, t, x, self.omega, self.a, self.age)
-        belief = memory.belief.towards(belief_from(self.family, path.estimate), PACE * dt)
-        found = bounded_gain(path.estimate).astype(x.p.dtype)
-        gain = memory.gain + jnp.clip(found - memory.gain, -GAIN_PACE * dt, GAIN_PACE * dt)
-        u, inner = self._flying(belief)(memory.inner, t, x)
-        issued = Command(u.c / gain, u.omega)
-        return issued, IdentifiedState(self.estimator.issued(path, issued), belief, gain, inner)
+        u, flight = self.follow(vehicle_estimate(self.family, path.estimate))(memory.flight, t, x)
+        return u, IdentifiedState(self.estimator.issued(path, u), flight)
 
     def accepted(self, memory: IdentifiedState, u: Command) -> IdentifiedState:
         """Remember the accepted command."""
         path = self.estimator.accepted(memory.path, u)
-        inner = self._flying(memory.belief).accepted(memory.inner, Command(u.c * memory.gain, u.omega))
-        return dataclasses.replace(memory, path=path, inner=inner)
+        return IdentifiedState(
+            path, self.follow(vehicle_estimate(self.family, path.estimate)).accepted(memory.flight, u)
+        )
 
-    def _flying(self, belief: PathBelief) -> AbstractController[Any]:
-        slowest = self.family.path(belief.ends[1])
-        lateness = slowest.delay + slowest.response.rate_lag[0]
-        return self.inner.with_vehicle(Member(self.family.path(belief.centre), belief, lateness))
+    @property
+    def identifies(self) -> bool:
+        """True."""
+        return True
+
+    def follow(self, estimate: VehicleEstimate) -> BeliefFlight:
+        """Return the flight by the result of an identification, here or in another process.
+
+        Args:
+            estimate: Vehicle as it is identified now.
+        """
+        return BeliefFlight(self.inner, self.family, self.prior, estimate, self.estimator.dt)
+
+
+def vehicle_estimate(family: PathFamily, estimate: PathEstimate) -> VehicleEstimate:
+    """Return the vehicle of an estimate of its command path.
+
+    Args:
+        family: Family of the vehicle.
+        estimate: Estimate of the command path.
+    """
+    return VehicleEstimate(belief_from(family, estimate), bounded_gain(estimate))
 
 
 def belief_from(family: PathFamily, estimate: PathEstimate) -> PathBelief:

@@ -1,12 +1,21 @@
-"""The vehicle that a controller has identified, as a line for the log."""
+"""The vehicle that was identified: for the controller that flies it, and as a line for the log."""
 
 import equinox as eqx
 from jaxtyping import Array, Float
 
 from ..estimation.command_path import PathEstimate, describe_path
+from ..physics.path_family import PathBelief
 
 REPORTS = (1.0, 5.0)
 """Times of a flight at which the identified vehicle is reported [s]."""
+
+
+class VehicleEstimate(eqx.Module):
+    """The vehicle as it is identified now."""
+
+    belief: PathBelief
+    gain: Float[Array, ""]
+    """Thrust over commanded thrust."""
 
 
 class VehicleReport(eqx.Module):

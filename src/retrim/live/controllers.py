@@ -9,14 +9,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..adapt.learner import LearnerState
+from ..config.families import make_family
 from ..config.setup import Setup
 from ..control.condition import Condition
 from ..control.controller import AbstractController
+from ..control.identified import vehicle_estimate
 from ..control.policy import Policy
+from ..estimation.command_path import PathEstimator
 from ..learn.bptt import PolicyState
 from ..learn.residuals.model import FittedResidual
 from ..onboard.pilot import ControllerSource
-from ..onboard.topics import REFERENCE
+from ..onboard.topics import REFERENCE, VEHICLE
 from ..physics.dynamics import f_a
 from ..physics.state import Command, State
 from ..transport import wire
@@ -43,6 +46,7 @@ def adaptive_source(setup: Setup, state: LearnerState) -> ControllerSource:
     given = {"policy": parts[0][0], "residual": parts[0][1]}
     if setup.followed is not None:
         given[REFERENCE] = setup.followed
+    given |= vehicle_half(setup, setup.controller(state))
 
     def whole(parameters: dict[str, Any]) -> tuple[Policy, Any]:
         found: tuple[Policy, Any] = eqx.combine((parameters["policy"], parameters["residual"]), parts[1])
@@ -50,7 +54,8 @@ def adaptive_source(setup: Setup, state: LearnerState) -> ControllerSource:
 
     def controller(parameters: dict[str, Any]) -> AbstractController[Any]:
         policy, residual = whole(parameters)
-        return _on(setup, parameters).controller(LearnerState(PolicyState(policy, ()), residual))
+        made = _on(setup, parameters).controller(LearnerState(PolicyState(policy, ()), residual))
+        return made.follow(parameters[VEHICLE]) if VEHICLE in parameters else made
 
     def predicted(parameters: dict[str, Any], inputs: tuple[State, Command]) -> Any:
         model = FittedResidual(setup.learner.residual_model, whole(parameters)[1])
@@ -65,12 +70,31 @@ def plain_source(setup: Setup, controller: AbstractController[Any]) -> Controlle
     Raises:
         ConfigError: It has an operation without a NumPy form.
     """
+    half = vehicle_half(setup, controller)
     arrays, fixed = eqx.partition(controller, eqx.is_array)
 
     def predicted(parameters: dict[str, Any], inputs: tuple[State, Command]) -> Any:
         return f_a(*inputs, jnp.zeros_like(inputs[0].p)).v
 
-    return _source(setup, lambda found: eqx.combine(found["policy"], fixed), predicted, {"policy": arrays})
+    def whole(parameters: dict[str, Any]) -> AbstractController[Any]:
+        made: AbstractController[Any] = eqx.combine(parameters["policy"], fixed)
+        return made.follow(parameters[VEHICLE]) if VEHICLE in parameters else made
+
+    return _source(setup, whole, predicted, {"policy": arrays} | half)
+
+
+def vehicle_half(setup: Setup, controller: AbstractController[Any]) -> dict[str, Any]:
+    """Return the parameters of the vehicle, for a controller that identifies it; nothing for another one.
+
+    Args:
+        setup: Of the flight.
+        controller: What flies.
+    """
+    family = make_family(setup.preset)
+    if not controller.identifies or family is None:
+        return {}
+    first = PathEstimator.of(setup.preset.dt).init(State.at(setup.flown.home()))
+    return {VEHICLE: vehicle_estimate(family, first.estimate)}
 
 
 def _source(setup: Setup, controller: Any, predicted: Any, parameters: dict[str, Any]) -> ControllerSource:

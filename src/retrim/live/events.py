@@ -36,6 +36,7 @@ class LiveEvents:
         self._next_excluded = 0.0  # [s]
         self._last_stage = -1.0  # [s], time of the last change that was told
         self._vehicle_notes: set[str] = set()
+        self._identified = 0
 
     def take(self, status: Status, others: Iterable[Event] = ()) -> list[Event]:
         """Return what is new, ``others`` included."""
@@ -54,6 +55,8 @@ class LiveEvents:
         for at, stage, cause in changes:
             self._last_stage = at
             new.append(Event(at, "stage", describe_condition(stage, cause)))
+        new += [Event(at, "vehicle", note) for at, note in status.vehicles[self._identified :]]
+        self._identified = max(self._identified, len(status.vehicles))
         if (excluded := describe_counts(status.excluded)) and t >= self._next_excluded:
             self._next_excluded = t + EXCLUDED_EVERY
             new.append(Event(t, "excluded", f"measurements that contradict each other, in the window: {excluded}"))

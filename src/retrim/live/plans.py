@@ -9,6 +9,7 @@ from ..onboard.plan import ControlPlan
 from ..onboard.recorder import RecorderPlan
 from ..onboard.watchdog import WatchdogPlan
 from .bridge_process import BridgePlan
+from .identifier_process import IdentifierPlan
 from .learner_process import LearnerPlan
 from .page import PagePlan
 from .plant_process import PlantPlan
@@ -43,6 +44,8 @@ def plan_of(role: str, spec: LiveSpec, start: Path, floor: int, bus: Path, cores
     if role == "page":
         assert s.page is not None
         return PagePlan(bus, s.page, parent)
+    if role == "identifier":
+        return IdentifierPlan(bus, start, s.controller.base, parent, s.trust)
     if role == "bridge":
         assert s.learners is not None
         return BridgePlan(bus, s.learners, parent)

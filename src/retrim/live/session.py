@@ -122,11 +122,6 @@ def live_spec(request: LiveRequest) -> LiveSpec:
         )
     if window > MOST_TICKS:
         raise ConfigError(f"adapt.window = {window} ticks: a live flight reports at most {MOST_TICKS}")
-    if preset.family is not None and request.method in (*LEARNING, "base-id"):
-        raise ConfigError(
-            f"--adapt {request.method}: preset {preset.name!r} identifies its vehicle in flight, which a live flight "
-            "cannot do yet; base-do flies the vehicle of the vehicle file, which may be wrong by a factor of two"
-        )
     start = request.folder / "start.safetensors"
     if find_method(request.method).on_board is not None:
         raise ConfigError(

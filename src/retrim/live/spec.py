@@ -21,6 +21,7 @@ MAINS = {
     "plant": "retrim.live.plant_process:simulate",
     "residual": "retrim.live.learner_process:learn",
     "policy": "retrim.live.learner_process:learn",
+    "identifier": "retrim.live.identifier_process:identify",
     "page": "retrim.live.page:show",
     "bridge": "retrim.live.bridge_process:carry",
 }

@@ -38,3 +38,5 @@ class Status:
     """Why the log is another file than it was, and which; empty while it is not."""
     ticks: int = 0
     """Ticks that the plant has sent so far."""
+    vehicles: list[tuple[float, str]] = field(default_factory=list)
+    """Times of the flight [s], and the vehicle as it was identified then."""

@@ -18,6 +18,7 @@ from ..onboard.note_fields import plain
 from ..onboard.pulses import SILENCE, Pulses
 from ..onboard.realtime import cores_of
 from ..onboard.recorder import Recorder
+from ..onboard.topics import VEHICLE
 from ..transport.message import describe
 from ..transport.shared_memory import SharedMemoryBus
 from .plans import plan_of
@@ -30,10 +31,10 @@ from .topics import topics
 LANDING = 60.0  # [s], after which processes are ended wherever the vehicle is
 LAST = 5  # ticks in which what control said last is written down, once it has nothing left to fly
 ATTEMPTS = 5  # to bring a process back
-LEARN = ("residual", "policy", "recorder", "page", "bridge")
+LEARN = ("residual", "policy", "identifier", "recorder", "page", "bridge")
 """Roles that stay off the core of those that must be on time."""
 READY_S = 300.0  # [s], compiling included
-RESTARTED = ("residual", "policy", "watchdog", "recorder", "page", "bridge")
+RESTARTED = ("residual", "policy", "identifier", "watchdog", "recorder", "page", "bridge")
 
 
 @dataclass
@@ -103,6 +104,8 @@ class Supervisor:
             self._remote.announce(self.start)
         for role in ("control", "plant", *(self.spec.layers if self._remote is None else ("bridge",))):
             self._start(role)
+        if VEHICLE in self.spec.controller.parameters:
+            self._start("identifier")
         self._start("watchdog")
         self._start("recorder")
         if self.spec.page is not None:
@@ -203,7 +206,7 @@ class Supervisor:
         return Status(
             t, control, world, alive, dict(self.restarts), ended, said, by_watchdog, ticks, log.get("failed"), stalls,
             self._notes.look(), self._notes.count, excluded.get("excluded", []), dict(self.hangs), self._moved,
-            ticks_of(self.bus),
+            ticks_of(self.bus), last_note(self.bus, "identified").get("reports", []),
         )  # fmt: skip
 
     def finish(self, patience: float = 3.0) -> None:

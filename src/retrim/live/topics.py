@@ -5,8 +5,8 @@ from ..onboard.topics import LAYERS, REFERENCE, SLOTS, slot
 from .spec import LiveSpec
 
 SMALL = ("sample", "setpoint", "fallback", "order", "ended", "world", "knobs", "wish", "learning", "ground",
-         "airborne", "followed", "refusals.page", "refusals.network")  # fmt: skip
-ROLES = ("control", "plant", "watchdog", "recorder", "page", "bridge", *LAYERS)
+         "airborne", "followed", "identified", "refusals.page", "refusals.network")  # fmt: skip
+ROLES = ("control", "plant", "watchdog", "recorder", "page", "bridge", "identifier", *LAYERS)
 
 
 def topics(spec: LiveSpec) -> dict[str, int]:

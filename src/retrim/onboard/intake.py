@@ -8,7 +8,7 @@ from ..transport.bus import Bus
 from .messages import Parameters, StaleError
 from .pilot import LivePilot
 from .rollback import FlownError
-from .topics import REFERENCE
+from .topics import REFERENCE, UNLEARNED, VEHICLE
 
 AHEAD = 1.0  # [s] that parameters may seem to come from the time to come
 IN_TIME = 0.7  # [s] in which a reference must be taken, before it leaves the one that is followed
@@ -60,7 +60,7 @@ class Intake:
     def poll(self, t: float) -> None:
         """Take what has come by time ``t`` of the flight [s], if it may be flown."""
         for half in self._known:
-            if half != REFERENCE and not self._open:
+            if half not in UNLEARNED and not self._open:
                 continue
             message = self._bus.latest(f"parameters.{half}", self._known[half])
             if message is None:
@@ -108,6 +108,8 @@ class Intake:
         self.pilot.swap(found)
         if found.half == REFERENCE:
             self._flown = FlownError(self._dt)  # an error on another reference says nothing of the policies before it
+            return
+        if found.half == VEHICLE:
             return
         self.swaps.append([t, found.half, found.version, t - found.computed_from])
         if found.half == "policy":

@@ -101,6 +101,7 @@ FIELDS: Mapping[str, Mapping[str, Read]] = {
     "ended": {"reason": text},
     "followed": {"name": text},
     "ground": {"base": text, "alive": map_of(flag), "failed": text, "over": flag},
+    "identified": {"reports": list_of(list_of(_time, text))},
     "knobs": {
         **dict.fromkeys(("push", "wind", "kick"), list_of(number(), length=3)),
         **{"load": number(), "rotor": number(), "kicks": whole()},

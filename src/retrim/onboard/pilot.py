@@ -8,7 +8,7 @@ import numpy as np
 
 from .messages import STATE, Parameters
 from .program import Arrays, NumpyProgram, ProgramSource
-from .topics import REFERENCE
+from .topics import UNLEARNED, VEHICLE
 
 BLEND = 5  # ticks over which a jump of the command at a swap dies away
 
@@ -28,8 +28,8 @@ class ControllerSource:
     predicted: ProgramSource
     """(parameters, [state, command]) -> acceleration by the corrected model"""
     parameters: Mapping[str, Mapping[str, Any]]
-    """Parameters at the start, by half (``policy``, ``residual``, ``reference``) and name, in the order of the
-    programs."""
+    """Parameters at the start, by half (``policy``, ``residual``, ``reference``, ``vehicle``) and name, in the order
+    of the programs."""
     base: str
     """Hash of the programs and of the shapes of their parameters."""
     dtype: np.dtype[Any]
@@ -103,21 +103,27 @@ class LivePilot:
         return np.asarray(self._predicted.step(self._prepared[3], [*self._state(x), *command])[0], dtype=float)
 
     def swap(self, parameters: Parameters) -> None:
-        """Fly with new parameters from the next tick on; the command goes over to theirs within a few ticks."""
+        """Fly with new parameters from the next tick on.
+
+        The command goes over to theirs within a few ticks; the controller itself follows an identified vehicle slowly.
+        """
         half = parameters.half
         self._parameters[half] = list(parameters.arrays.values())
         self.versions[half] = parameters.version
         if half == "policy":
             self._policies[parameters.version] = self._parameters[half]
-        self._change()
+        if half == VEHICLE:
+            self._prepared = self._prepare()
+        else:
+            self._change()
 
     def restart(self) -> None:
         """Fly with what had been learnt at take-off from the next tick on."""
         self._parked = self._parameters, self.versions, self._policies
-        followed = {half: leaves for half, leaves in self._parameters.items() if half == REFERENCE}
+        followed = {half: leaves for half, leaves in self._parameters.items() if half in UNLEARNED}
         first = {half: list(arrays.values()) for half, arrays in self._source.parameters.items()}
         self._parameters = first | followed
-        self.versions = {half: self.versions[half] if half == REFERENCE else 0 for half in first}
+        self.versions = {half: self.versions[half] if half in UNLEARNED else 0 for half in first}
         self._policies = {0: self._parameters["policy"]}
         self._change()
 
@@ -125,8 +131,8 @@ class LivePilot:
         """Fly again with what had been learnt before :meth:`restart`."""
         if self._parked is not None:
             (parameters, versions, self._policies), self._parked = self._parked, None
-            self._parameters |= {half: leaves for half, leaves in parameters.items() if half != REFERENCE}
-            self.versions |= {half: version for half, version in versions.items() if half != REFERENCE}
+            self._parameters |= {half: leaves for half, leaves in parameters.items() if half not in UNLEARNED}
+            self.versions |= {half: version for half, version in versions.items() if half not in UNLEARNED}
             self._change()
 
     def expected(self, half: str) -> Mapping[str, Any]:

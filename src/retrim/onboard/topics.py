@@ -12,6 +12,10 @@ def slot(layer: str, version: int) -> str:
 
 REFERENCE = "reference"
 """Half of the parameters of a controller that says what it follows; no learner changes it."""
+VEHICLE = "vehicle"
+"""Half of the parameters of a controller that says which vehicle it flies; it is identified beside the flight."""
+UNLEARNED = (REFERENCE, VEHICLE)
+"""Halves that stay when what was learnt is not flown."""
 OUT = ("mission", "flight", "status", "ended", "learning", f"parameters.{REFERENCE}")
 """Topics from the flight to the learners."""
 INTO = (

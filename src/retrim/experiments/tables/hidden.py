@@ -123,7 +123,7 @@ ENTRANTS: dict[str, tuple[Entrant, ...]] = {
     task: (
         *(Entrant(f"{task}/retrim", method) for method in (*OPPONENTS, "full")),
         Entrant(f"{task}/retrim", "indi", told=True),
-        Entrant(f"{task}/any", "base-id"),
+        *(Entrant(f"{task}/any", method) for method in ("base", "base-do", "base-id")),
     )
     for task in COURSES
 }

@@ -1,0 +1,155 @@
+"""The process that identifies the vehicle beside a flight: rows of flight come in, the identified vehicle goes out."""
+
+import contextlib
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..config.families import declared_vehicle, make_family
+from ..config.presets import Preset
+from ..control.identified import vehicle_estimate
+from ..control.vehicle_report import REPORTS, VehicleEstimate, VehicleReport
+from ..errors import ConfigError, MessageError
+from ..estimation.command_path import PathEstimator
+from ..estimation.command_path import PathState as EstimatorState
+from ..experiments.compile_cache import enable_compile_cache
+from ..io.trained import load_learnt
+from ..onboard.heart import Pacemaker
+from ..onboard.messages import COMMAND, MEASURED, FlightRows, Parameters, pack_note
+from ..onboard.realtime import Lifeline
+from ..onboard.topics import VEHICLE
+from ..physics.path_family import PathFamily
+from ..physics.state import Command, State
+from ..transport import wire
+from ..transport.bus import Bus
+from ..transport.shared_memory import SharedMemoryBus
+from .states import state_of
+
+EVERY = 0.1  # [s] between two estimates
+CHECK_EVERY = 0.005  # [s]
+ALLOWANCE = 5.0  # [s] that a look at the bus, with all its rows, may take
+SMALL = 1e-3  # a smaller change of all numbers is not published
+
+
+@dataclass(frozen=True)
+class IdentifierPlan:
+    """Everything that the process is started with."""
+
+    folder: Path
+    """Of the bus."""
+    start: Path
+    """File with the preset."""
+    base: str
+    """Hash of the controller that flies."""
+    parent: int
+    trust: tuple[str, ...] = ()
+    """Python names that ``start`` may hold."""
+
+
+class IdentifierLoop:
+    """Identification beside one flight. :meth:`step` is the whole of it."""
+
+    def __init__(self, preset: Preset, base: str, bus: Bus) -> None:
+        """Build it.
+
+        Args:
+            preset: Of the policy; it has a family of vehicles.
+            base: Hash of the controller that flies.
+            bus: Of the flight.
+
+        Raises:
+            ConfigError: The preset is for one vehicle.
+        """
+        family = make_family(preset)
+        if family is None:
+            raise ConfigError(f"preset {preset.name!r} is for one vehicle, and none is identified")
+        self.bus, self._base, self._family = bus, base, family
+        self._estimator, self._declared = PathEstimator.of(preset.dt), declared_vehicle(preset)
+        self._state: EstimatorState | None = None
+        self._known, self._tick, self._due = 0, -1, -np.inf
+        self._published: np.ndarray | None = None
+        self._reports: list[tuple[float, str]] = []
+        message = bus.latest(f"parameters.{VEHICLE}")
+        self._version = 0 if message is None else message.version  # of an earlier process
+
+    def warm_up(self) -> None:
+        """Compile what a flight needs."""
+        x = State.at(jnp.zeros(3))
+        state = _measure(self._estimator, self._estimator.init(x), jnp.array(0.0), x, jnp.array(0.0), Command.hover())
+        jax.block_until_ready(_estimate(self._estimator, self._family, state))
+
+    def step(self) -> bool:
+        """Take the rows that are new; return whether there were any."""
+        message = self.bus.latest("flight", self._known)
+        if message is None:
+            return False
+        self._known = message.version
+        try:
+            rows = FlightRows.unpack(message.data).rows
+        except MessageError:
+            return False
+        new = rows[rows[:, 0] > self._tick]
+        for row in new:
+            self._take(row)
+        if len(new) and (t := float(new[-1, 1])) >= self._due:
+            self._due = t + EVERY
+            self._conclude(t)
+        return bool(len(new))
+
+    def _take(self, row: np.ndarray) -> None:
+        dtype = np.dtype(np.float32)
+        t, age = (jnp.asarray(value, dtype) for value in (row[1], row[2]))
+        x, u = state_of(row[MEASURED], dtype), Command.of(jnp.asarray(row[COMMAND], dtype))
+        state = self._estimator.init(x) if self._state is None else self._state
+        self._state = _measure(self._estimator, state, t, x, age, u)
+        self._tick = int(row[0])
+
+    def _conclude(self, t: float) -> None:
+        """Publish the estimate if it has changed, and report it when a report is due."""
+        assert self._state is not None
+        self._state, found = _estimate(self._estimator, self._family, self._state)
+        arrays = wire.names(found)
+        numbers = np.concatenate([np.ravel(np.asarray(leaf, dtype=float)) for leaf in arrays.values()])
+        if self._published is None or np.abs(numbers - self._published).max() > SMALL:
+            self._published, self._version = numbers, self._version + 1
+            self.bus.publish(f"parameters.{VEHICLE}", Parameters(VEHICLE, self._version, self._base, t, arrays).pack())
+        if len(self._reports) < len(REPORTS) and t >= REPORTS[len(self._reports)]:
+            self._reports.append((t, VehicleReport(self._state.estimate, self._declared).note()))
+            self.bus.publish("identified", pack_note("identified", reports=self._reports))
+
+
+@eqx.filter_jit
+def _measure(
+    estimator: PathEstimator, s: EstimatorState, t: Float[Array, ""], x: State, age: Float[Array, ""], u: Command
+) -> EstimatorState:
+    return estimator.issued(estimator.measured(s, t, x, age=age), u)
+
+
+@eqx.filter_jit
+def _estimate(
+    estimator: PathEstimator, family: PathFamily, s: EstimatorState
+) -> tuple[EstimatorState, VehicleEstimate]:
+    s = estimator.estimated(s)
+    return s, vehicle_estimate(family, s.estimate)
+
+
+def identify(plan: IdentifierPlan) -> None:
+    """Identify until the flight is over: the main function of the process."""
+    enable_compile_cache()
+    bus, parent = SharedMemoryBus(plan.folder), Lifeline(plan.parent)
+    preset: Any = load_learnt(plan.start, trust=plan.trust)[1]
+    loop = IdentifierLoop(preset, plan.base, bus)
+    loop.warm_up()
+    bus.publish("ready.identifier", pack_note("ready", base=plan.base))
+    with contextlib.suppress(KeyboardInterrupt), Pacemaker(bus, "identifier") as heart:
+        while not parent.gone() and bus.latest("ended") is None:
+            heart.touch(ALLOWANCE)
+            if not loop.step():
+                time.sleep(CHECK_EVERY)

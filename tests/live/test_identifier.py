@@ -1,0 +1,153 @@
+"""Identification beside a live flight: rows of flight in, the vehicle out, and a controller that follows it."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from live_helpers import TOPICS
+from retrim import ConfigError, Scenario, Setup, changed, load
+from retrim.config.vehicle_file import VehicleSpec
+from retrim.experiments.fleet import Fleet
+from retrim.live.controllers import plain_source, vehicle_half
+from retrim.live.identifier_process import IdentifierLoop
+from retrim.onboard.messages import COLUMNS, COMMAND, MEASURED, FlightRows, Parameters, last_note
+from retrim.onboard.pilot import LivePilot
+from retrim.onboard.topics import VEHICLE
+from retrim.physics.path_family import PathBelief
+from retrim.transport.in_process import InProcessBus
+
+pytestmark = pytest.mark.usefixtures("as_a_user")
+
+SHORT = {"num_updates": 10, "num_envs": 2, "horizon": 20, "hidden_sizes": (16, 16)}
+BASE = "controller"
+AT_REST = np.concatenate([[0.0, 0.0, 1.0], np.eye(3).ravel(), np.zeros(3)])
+
+
+@pytest.fixture(scope="module")
+def setup(as_a_user):
+    return Setup.of(changed(load("hover/any"), pretrain=SHORT))
+
+
+@pytest.fixture(scope="module")
+def rows(setup):
+    """A vehicle with 40 ms of delay, 80 ms of lag and four fifths of the thrust, flown by a geometric controller."""
+    vehicle = VehicleSpec(
+        name="slow", mass=1.0, inertia=(0.01, 0.01, 0.02), arm=(0.1, 0.1), thrust_max=40.0,
+        rates_max=(6.0, 6.0, 4.0), motor_tau=0.03, rate_lag=(0.08, 0.08, 0.08), rate_damping=(1.0, 1.0, 1.0),
+    )  # fmt: skip
+    scenario = Scenario("small", plant="second-order", vehicle=vehicle, delay=0.04, thrust_error=-0.2)
+    known = dataclasses.replace(setup.preset, vehicle=dataclasses.replace(vehicle, command_delay=0.04))
+    policy = setup.new_policy(jax.random.key(0))
+    (flight,) = Fleet(known, policy, [scenario], methods=("geometric",), starts=1, seconds=6.0).run().flown
+    log = flight.log
+    found = np.zeros((len(log.t) - 1, len(COLUMNS)))
+    found[:, 0], found[:, 1] = np.arange(len(found)), log.t[:-1]
+    states = log.measured
+    found[:, MEASURED] = np.concatenate([states.p, states.R.reshape(-1, 9), states.v], axis=1)[:-1]
+    found[:, COMMAND] = log.u[1:]
+    return found
+
+
+def bus():
+    return InProcessBus(TOPICS | {f"parameters.{VEHICLE}": 8192, "identified": 8192, "flight": 2_000_000})
+
+
+def feed(loop, rows, every=7):
+    """Publish rows as control does: the last ones again and again, some of them new."""
+    for end in range(every, len(rows) + 1, every):
+        loop.bus.publish("flight", FlightRows(rows[max(0, end - 150) : end]).pack())
+        assert loop.step()
+        assert not loop.step()  # nothing new
+
+
+@pytest.fixture(scope="module")
+def identified(setup, rows):
+    loop = IdentifierLoop(setup.preset, BASE, bus())
+    feed(loop, rows)
+    return loop
+
+
+def parameters(loop, expected, after=0):
+    data = loop.bus.latest(f"parameters.{VEHICLE}").data
+    return Parameters.unpack(data, expected, half=VEHICLE, base=BASE, after=after)
+
+
+def test_the_vehicle_is_found(setup, identified):
+    controller = setup.pilot(setup.new_policy(jax.random.key(0)), "base-id").controller
+    expected = plain_source(setup, controller).parameters[VEHICLE]
+    found = parameters(identified, expected)
+    centre, half_width, gain = (np.asarray(a) for a in found.arrays.values())
+    family = setup.env.family
+    path = family.path(jnp.asarray(centre))
+    assert float(path.delay) == pytest.approx(0.04, abs=0.004)
+    assert float(path.response.rate_lag[0]) == pytest.approx(0.08, rel=0.1)
+    assert float(gain) == pytest.approx(0.8, abs=0.03)
+    assert half_width[:2].max() < 0.3
+    assert found.computed_from == pytest.approx(6.0, abs=0.3)
+
+
+def test_it_is_reported_after_one_and_after_five_seconds(identified):
+    reports = last_note(identified.bus, "identified")["reports"]
+    assert [t for t, _ in reports] == [pytest.approx(1.0, abs=0.2), pytest.approx(5.0, abs=0.2)]
+    assert all(text.startswith("thrust gain 0.") and "rate delay" in text for _, text in reports)
+
+
+def test_pieces_of_any_length_give_vehicles_that_agree(setup, rows, identified):
+    other = IdentifierLoop(setup.preset, BASE, bus())
+    feed(other, rows, every=50)
+    (centre, width, gain), (centre_50, width_50, gain_50) = (
+        tuple(map(np.asarray, parameters(loop, _shapes(setup)).arrays.values())) for loop in (identified, other)
+    )
+    assert (np.abs(centre - centre_50) < width + width_50).all()
+    assert abs(gain - gain_50) < 0.02
+
+
+def test_a_process_that_was_started_again_counts_on(setup, rows, identified):
+    before = identified.bus.latest(f"parameters.{VEHICLE}").version
+    again = IdentifierLoop(setup.preset, BASE, identified.bus)
+    again.bus.publish("flight", FlightRows(rows[-150:]).pack())
+    assert again.step()
+    assert parameters(again, _shapes(setup), after=before).version == before + 1
+
+
+def test_damaged_rows_are_ignored(setup):
+    loop = IdentifierLoop(setup.preset, BASE, bus())
+    loop.bus.publish("flight", b"no rows")
+    assert not loop.step()
+
+
+def test_a_preset_for_one_vehicle_is_refused():
+    with pytest.raises(ConfigError, match="is for one vehicle"):
+        IdentifierLoop(load("hover/retrim"), BASE, bus())
+
+
+def test_only_a_controller_that_identifies_has_the_half(setup):
+    policy = setup.new_policy(jax.random.key(0))
+    assert vehicle_half(setup, setup.pilot(policy, "base-id").controller).keys() == {VEHICLE}
+    assert vehicle_half(setup, setup.pilot(policy, "base-do").controller) == {}
+
+
+def test_the_controller_follows_slowly_and_keeps_the_vehicle_when_learning_is_switched_off(setup):
+    policy = setup.new_policy(jax.random.key(0))
+    source = plain_source(setup, setup.pilot(policy, "base-id").controller)
+    pilot = LivePilot(source)
+    pilot.reset(AT_REST)
+    steady = [pilot.act(0.02 * k, 0.0, AT_REST) for k in range(50)][-1]
+    told = PathBelief.between(jnp.full(4, -1.0), jnp.full(4, -0.9))
+    arrays = dict(zip(source.parameters[VEHICLE], (told.centre, told.half_width, jnp.array(0.5)), strict=True))
+    pilot.swap(Parameters(VEHICLE, 1, source.base, 1.0, {n: np.asarray(a) for n, a in arrays.items()}))
+    after = [pilot.act(0.02 * k, 0.0, AT_REST) for k in range(50, 100)]
+    steps = np.abs(np.diff([steady, *after], axis=0))[:, 0]
+    assert steps.max() < 0.1 * 9.81  # [m/s^2]
+    assert after[-1][0] > 1.5 * steady[0]  # half of the thrust: twice the command
+    pilot.restart()
+    assert pilot.versions[VEHICLE] == 1
+    assert pilot.act(2.0, 0.0, AT_REST)[0] > 1.5 * steady[0]
+
+
+def _shapes(setup):
+    controller = setup.pilot(setup.new_policy(jax.random.key(0)), "base-id").controller
+    return plain_source(setup, controller).parameters[VEHICLE]
