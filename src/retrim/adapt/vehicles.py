@@ -2,7 +2,7 @@
 
 import abc
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -18,6 +18,9 @@ from ..physics.command_path import PathState as QueueState
 from ..physics.path_family import Member, PathBelief, PathFamily
 from ..physics.state import Command, State
 from ..tasks.task import Start
+
+# Ticks between two estimates: each one says how noisy the measurements after it are, and rarer ones cost accuracy.
+PIECE = 5
 
 
 class AbstractVehicles(eqx.Module):
@@ -93,9 +96,12 @@ class IdentifiedVehicle(AbstractVehicles):
             seen = estimator.issued(estimator.measured(s, t, x, age=age), u)
             return jax.tree.map(lambda new, old: jnp.where(valid, new, old), seen, s), None
 
+        def piece(s: PathState, rows: tuple[Array, State, Command, Array, Array]) -> tuple[PathState, None]:
+            return estimator.estimated(lax.scan(tick, s, rows)[0]), None
+
         first = estimator.init(jax.tree.map(lambda leaf: leaf[0], window.x))
-        last, _ = lax.scan(tick, first, (window.t, window.x, window.u, window.valid, age))
-        estimate = estimator.estimated(last).estimate
+        rows = _in_pieces((window.t, window.x, window.u, window.valid, age), PIECE)
+        estimate = lax.scan(piece, first, rows)[0].estimate
         belief = belief_from(self.family, estimate)
         path = self.family.path(belief.centre)
         response = dataclasses.replace(path.response, thrust_gain=bounded_gain(estimate))
@@ -130,3 +136,14 @@ class IdentifiedVehicle(AbstractVehicles):
         for _ in shape:
             assign = jax.vmap(assign)
         return assign(starts.t, starts.x, inside)
+
+
+def _in_pieces(rows: Any, size: int) -> Any:
+    """Return rows with a leading axis of pieces; rows that are not valid fill the first one up."""
+    missing = -len(jax.tree.leaves(rows)[0]) % size
+
+    def divide(leaf: Array) -> Array:
+        before = jnp.zeros_like(leaf, shape=(missing, *leaf.shape[1:]))
+        return jnp.concatenate([before, leaf]).reshape(-1, size, *leaf.shape[1:])
+
+    return jax.tree.map(divide, rows)

@@ -32,7 +32,7 @@ from ..transport.bus import Bus
 from ..transport.shared_memory import SharedMemoryBus
 from .states import state_of
 
-EVERY = 0.1  # [s] between two estimates
+EVERY = 0.1  # [s] between two messages
 CHECK_EVERY = 0.005  # [s]
 ALLOWANCE = 5.0  # [s] that a look at the bus, with all its rows, may take
 SMALL = 1e-3  # a smaller change of all numbers is not published
@@ -83,7 +83,7 @@ class IdentifierLoop:
         """Compile what a flight needs."""
         x = State.at(jnp.zeros(3))
         state = _measure(self._estimator, self._estimator.init(x), jnp.array(0.0), x, jnp.array(0.0), Command.hover())
-        jax.block_until_ready(_estimate(self._estimator, self._family, state))
+        jax.block_until_ready(_vehicle(self._family, state))
 
     def step(self) -> bool:
         """Take the rows that are new; return whether there were any."""
@@ -114,8 +114,7 @@ class IdentifierLoop:
     def _conclude(self, t: float) -> None:
         """Publish the estimate if it has changed, and report it when a report is due."""
         assert self._state is not None
-        self._state, found = _estimate(self._estimator, self._family, self._state)
-        arrays = wire.names(found)
+        arrays = wire.names(_vehicle(self._family, self._state))
         numbers = np.concatenate([np.ravel(np.asarray(leaf, dtype=float)) for leaf in arrays.values()])
         if self._published is None or np.abs(numbers - self._published).max() > SMALL:
             self._published, self._version = numbers, self._version + 1
@@ -129,15 +128,12 @@ class IdentifierLoop:
 def _measure(
     estimator: PathEstimator, s: EstimatorState, t: Float[Array, ""], x: State, age: Float[Array, ""], u: Command
 ) -> EstimatorState:
-    return estimator.issued(estimator.measured(s, t, x, age=age), u)
+    return estimator.issued(estimator.update(s, t, x, age=age), u)
 
 
 @eqx.filter_jit
-def _estimate(
-    estimator: PathEstimator, family: PathFamily, s: EstimatorState
-) -> tuple[EstimatorState, VehicleEstimate]:
-    s = estimator.estimated(s)
-    return s, vehicle_estimate(family, s.estimate)
+def _vehicle(family: PathFamily, s: EstimatorState) -> VehicleEstimate:
+    return vehicle_estimate(family, s.estimate)
 
 
 def identify(plan: IdentifierPlan) -> None:
