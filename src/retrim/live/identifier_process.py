@@ -2,6 +2,7 @@
 
 import contextlib
 import time
+from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..adapt.vehicles import PIECE
 from ..config.families import declared_vehicle, make_family
 from ..config.presets import Preset
 from ..control.identified import vehicle_estimate
@@ -22,7 +24,7 @@ from ..estimation.command_path import PathState as EstimatorState
 from ..experiments.compile_cache import enable_compile_cache
 from ..io.trained import load_learnt
 from ..onboard.heart import Pacemaker
-from ..onboard.messages import COMMAND, MEASURED, FlightRows, Parameters, pack_note
+from ..onboard.messages import COLUMNS, COMMAND, MEASURED, FlightRows, Parameters, pack_note
 from ..onboard.realtime import Lifeline
 from ..onboard.topics import VEHICLE
 from ..physics.path_family import PathFamily
@@ -35,6 +37,7 @@ from .states import state_of
 EVERY = 0.1  # [s] between two messages
 CHECK_EVERY = 0.005  # [s]
 ALLOWANCE = 5.0  # [s] that a look at the bus, with all its rows, may take
+AT_ONCE = 5 * PIECE  # rows
 SMALL = 1e-3  # a smaller change of all numbers is not published
 
 
@@ -73,35 +76,46 @@ class IdentifierLoop:
         self.bus, self._base, self._family = bus, base, family
         self._estimator, self._declared = PathEstimator.of(preset.dt), declared_vehicle(preset)
         self._state: EstimatorState | None = None
-        self._known, self._tick, self._due = 0, -1, -np.inf
+        self._rows: deque[np.ndarray] = deque()
+        self._known, self._newest, self._taken, self._t, self._due = 0, -1.0, 0, 0.0, -np.inf
         self._published: np.ndarray | None = None
         self._reports: list[tuple[float, str]] = []
         message = bus.latest(f"parameters.{VEHICLE}")
         self._version = 0 if message is None else message.version  # of an earlier process
 
     def warm_up(self) -> None:
-        """Compile what a flight needs."""
-        x = State.at(jnp.zeros(3))
-        state = _measure(self._estimator, self._estimator.init(x), jnp.array(0.0), x, jnp.array(0.0), Command.hover())
-        jax.block_until_ready(_vehicle(self._family, state))
+        """Compile what a flight needs, with rows of a vehicle that hovers; they are forgotten."""
+        row = np.zeros(len(COLUMNS))
+        row[MEASURED] = np.concatenate([np.zeros(3), np.eye(3).ravel(), np.zeros(3)])
+        row[COMMAND] = np.asarray(Command.hover().vector())
+        for _ in range(2 * PIECE):
+            self._take(row)
+        assert self._state is not None
+        jax.block_until_ready(_vehicle(self._family, self._state))
+        self._state, self._taken, self._t = None, 0, 0.0
 
     def step(self) -> bool:
-        """Take the rows that are new; return whether there were any."""
+        """Take some of the rows that are new; return whether there were any."""
+        self._look()
+        if not self._rows:
+            return False
+        for _ in range(min(AT_ONCE, len(self._rows))):
+            self._take(self._rows.popleft())
+        if not self._rows and self._t >= self._due:
+            self._due = self._t + EVERY
+            self._conclude(self._t)
+        return True
+
+    def _look(self) -> None:
         message = self.bus.latest("flight", self._known)
         if message is None:
-            return False
+            return
         self._known = message.version
-        try:
+        with contextlib.suppress(MessageError):
             rows = FlightRows.unpack(message.data).rows
-        except MessageError:
-            return False
-        new = rows[rows[:, 0] > self._tick]
-        for row in new:
-            self._take(row)
-        if len(new) and (t := float(new[-1, 1])) >= self._due:
-            self._due = t + EVERY
-            self._conclude(t)
-        return bool(len(new))
+            new = rows[rows[:, 0] > self._newest]
+            self._rows.extend(new)
+            self._newest = max([self._newest, *new[:, 0].tolist()])
 
     def _take(self, row: np.ndarray) -> None:
         dtype = np.dtype(np.float32)
@@ -109,11 +123,14 @@ class IdentifierLoop:
         x, u = state_of(row[MEASURED], dtype), Command.of(jnp.asarray(row[COMMAND], dtype))
         state = self._estimator.init(x) if self._state is None else self._state
         self._state = _measure(self._estimator, state, t, x, age, u)
-        self._tick = int(row[0])
+        self._t, self._taken = float(row[1]), self._taken + 1
+        if self._taken % PIECE == 0:
+            self._state = _estimate(self._estimator, self._state)
 
     def _conclude(self, t: float) -> None:
         """Publish the estimate if it has changed, and report it when a report is due."""
         assert self._state is not None
+        self._state = _estimate(self._estimator, self._state)
         arrays = wire.names(_vehicle(self._family, self._state))
         numbers = np.concatenate([np.ravel(np.asarray(leaf, dtype=float)) for leaf in arrays.values()])
         if self._published is None or np.abs(numbers - self._published).max() > SMALL:
@@ -128,7 +145,12 @@ class IdentifierLoop:
 def _measure(
     estimator: PathEstimator, s: EstimatorState, t: Float[Array, ""], x: State, age: Float[Array, ""], u: Command
 ) -> EstimatorState:
-    return estimator.issued(estimator.update(s, t, x, age=age), u)
+    return estimator.issued(estimator.measured(s, t, x, age=age), u)
+
+
+@eqx.filter_jit
+def _estimate(estimator: PathEstimator, s: EstimatorState) -> EstimatorState:
+    return estimator.estimated(s)
 
 
 @eqx.filter_jit
