@@ -86,7 +86,7 @@ def test_indi_believes_the_accelerometer():
     plain = made("indi", task)
     _, memory = plain(plain.init(x), jnp.array(0.0), x)  # before the first tick there is nothing to compare
     level, _ = plain(memory, jnp.array(DT), x)
-    pulled, _ = plain.sensing(jnp.zeros(3), jnp.array([0.0, 0.0, -1.0]))(memory, jnp.array(DT), x)
+    pulled, _ = plain.with_inertial(jnp.zeros(3), jnp.array([0.0, 0.0, -1.0]))(memory, jnp.array(DT), x)
     share = 1.0 - np.exp(-DT / 0.08)  # of 1 m/s^2; and the vehicle will have fallen a little until it is answered
     assert share < float(pulled.c - level.c) < 1.2 * share
 

@@ -51,7 +51,7 @@ class Weak(AbstractController[Command]):
         pull = -2.0 * (x.p[2] - 1.0) - 2.0 * x.v[2] + 0.5 * jnp.sin(11.0 * t)
         return Command(9.81 + pull, 2.0 * level + wobble), (self.told, self.member)
 
-    def acting(self, actuators):
+    def with_actuators(self, actuators):
         return dataclasses.replace(self, told=actuators)
 
     def with_vehicle(self, member):
@@ -73,7 +73,7 @@ def fly(plant, controller, x0, ticks=200, *, senses=True):
 
     def tick(carry, k):
         sim, memory = carry
-        now = controller.sensing(*plant.inertial(sim, k)) if senses else controller
+        now = controller.with_inertial(*plant.inertial(sim, k)) if senses else controller
         u, memory = now(memory, plant.time(k, sim.a.dtype), plant.measured(sim))
         return (plant.advance(sim, plant.within_limits(u), k), memory), (plant.true(sim), memory)
 
@@ -139,7 +139,7 @@ def test_controllers_around_another_one_pass_the_vehicle_on(wrap, x0):
     inner = next(getattr(found, name) for name in ("inner", "base") if hasattr(found, name))
     np.testing.assert_array_equal(inner.member.belief.centre, np.ones(4))
     if wrap != "tracking":  # it tells the controller inside itself
-        told = outer.acting(ActuatorState.at(Command(jnp.array(5.0), jnp.ones(3))))
+        told = outer.with_actuators(ActuatorState.at(Command(jnp.array(5.0), jnp.ones(3))))
         inner = next(getattr(told, name) for name in ("inner", "base") if hasattr(told, name))
         assert float(inner.told.command.c) == 5.0
 

@@ -42,7 +42,7 @@ def test_it_hovers_and_rejects_a_step_by_what_the_camera_sees(setup, name):
     def tick(carry, k):
         s, last, memory, waiting = carry
         x = model.state(s)
-        now = controller.sensing(waiting.omega, (x.v - last.v) / DT)
+        now = controller.with_inertial(waiting.omega, (x.v - last.v) / DT)
         u, memory = now(memory, DT * k.astype(float), x)
         push = jnp.where(k >= 300, jnp.array([1.0, -0.5, 0.5]), 0.0)
         return (model.step(s, waiting, push), x, memory, u), x
@@ -69,7 +69,7 @@ def test_an_inertial_unit_does_not_tell_the_attitude(setup, key):
     blind = made(setup, "indi", dropout=jnp.array(1.0))
     memory, felt = blind.init(HERE), random.normal(key, (3,)) + jnp.array([0.0, 0.0, STANDARD_GRAVITY])
     gravity = jnp.array([0.0, 0.0, -STANDARD_GRAVITY])
-    call = eqx.filter_jit(lambda omega, a, x: blind.sensing(omega, a)(memory, jnp.array(0.0), x)[0].vector())
+    call = eqx.filter_jit(lambda omega, a, x: blind.with_inertial(omega, a)(memory, jnp.array(0.0), x)[0].vector())
     omega = jnp.array([0.3, -0.1, 0.2])
     turned = [random_state(k, 0.5) for k in random.split(key, 2)]
     one, other = (call(omega, so3.act(x.R, felt) + gravity, x) for x in turned)
@@ -85,7 +85,7 @@ def test_accepted_commands_and_ages_reach_the_controller_inside(setup):
     assert eqx.tree_equal(accepted.last, u)
     assert eqx.tree_equal(accepted.inner, controller.inner.accepted(memory.inner, u))
     assert not eqx.tree_equal(accepted.inner, memory.inner)
-    assert float(controller.aged(0.015).inner.prediction.age) == pytest.approx(0.015)
+    assert float(controller.with_age(0.015).inner.prediction.age) == pytest.approx(0.015)
 
 
 def test_without_a_filter_there_is_no_state():

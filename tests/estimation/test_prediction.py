@@ -52,6 +52,6 @@ def test_an_old_measurement_is_brought_to_now(key):
     prediction = Prediction(jnp.array(1e-6), DT, 0)
     memory = prediction.issued(prediction.init(x), u)
     now = PointMass(DT).step(x, u, jnp.zeros(3))
-    late, _ = prediction.aged(DT)(memory, x, jnp.zeros(3))
+    late, _ = prediction.with_age(DT)(memory, x, jnp.zeros(3))
     np.testing.assert_allclose(late.R, now.R, atol=1e-9)
     np.testing.assert_allclose(late.p, now.p, atol=5e-3)  # its acceleration is taken as constant

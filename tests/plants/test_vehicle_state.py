@@ -91,7 +91,7 @@ def at(t):
 def worked_with(x, age):
     """What a controller that looks ahead takes for the present state."""
     acting = Command(jnp.array(THRUST), jnp.array(SPIN))
-    prediction = Prediction(jnp.array(1e-6), 0.02).aged(age)
+    prediction = Prediction(jnp.array(1e-6), 0.02).with_age(age)
     return prediction(Underway(acting, (acting,)), x, jnp.zeros(3))[0]
 
 

@@ -17,7 +17,7 @@ from retrim.errors import LogError
 from retrim.io.logs import FlightLog
 from retrim.replay import identification
 from retrim.replay.identification import identify
-from retrim.replay.rows import acting
+from retrim.replay.rows import acting_commands
 from retrim.replay.vehicle import vehicle_toml
 
 DT, SUB = 0.02, 20
@@ -142,4 +142,4 @@ def test_an_acting_command_is_what_a_fine_integration_gives(delay, lag):
         k = max(0, i - round(delay / h)) // fine
         y = y + (command[k] - y) * (1 - np.exp(-h / lag)) if lag else command[k]
         means[i // fine] += y / fine
-    np.testing.assert_allclose(acting(command, DT, delay, lag)[5:], means[5:], atol=0.01)
+    np.testing.assert_allclose(acting_commands(command, DT, delay, lag)[5:], means[5:], atol=0.01)

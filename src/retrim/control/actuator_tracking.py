@@ -38,13 +38,13 @@ class ActuatorTracking(AbstractController[TrackingState]):
     age: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(0.0))
     """Age of measurements [s]."""
 
-    def aged(self, age: float | Float[Array, ""]) -> "ActuatorTracking":
+    def with_age(self, age: float | Float[Array, ""]) -> "ActuatorTracking":
         """Return the same for measurements that are ``age`` old [s]."""
-        return dataclasses.replace(self, inner=self.inner.aged(age), age=jnp.array(age))
+        return dataclasses.replace(self, inner=self.inner.with_age(age), age=jnp.array(age))
 
-    def sensing(self, omega: Float[Array, "3"], a: Float[Array, "3"]) -> "ActuatorTracking":
+    def with_inertial(self, omega: Float[Array, "3"], a: Float[Array, "3"]) -> "ActuatorTracking":
         """Return the same for a tick in which body rates and acceleration were measured."""
-        return dataclasses.replace(self, inner=self.inner.sensing(omega, a), omega=omega)
+        return dataclasses.replace(self, inner=self.inner.with_inertial(omega, a), omega=omega)
 
     def with_vehicle(self, member: Member) -> "ActuatorTracking":
         """Return the same for a vehicle that was identified."""
@@ -61,7 +61,7 @@ class ActuatorTracking(AbstractController[TrackingState]):
     def __call__(self, memory: TrackingState, t: Float[Array, ""], x: State) -> tuple[Command, TrackingState]:
         """Return the command of the controller inside, which is told what acts."""
         rates = memory.rates.measured(x, self.age, self.path, self.dt, self.omega)
-        u, inner = self.inner.acting(rates.path.actuators)(memory.inner, t, x)
+        u, inner = self.inner.with_actuators(rates.path.actuators)(memory.inner, t, x)
         return u, TrackingState(rates.issued(u, self.path, self.dt), inner)
 
     def accepted(self, memory: TrackingState, u: Command) -> TrackingState:

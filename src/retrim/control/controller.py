@@ -46,12 +46,12 @@ class AbstractController(eqx.Module, Generic[M]):
         del u
         return memory
 
-    def aged(self, age: float | Float[Array, ""]) -> "AbstractController[M]":
+    def with_age(self, age: float | Float[Array, ""]) -> "AbstractController[M]":
         """Return the same controller for measurements ``age`` old [s]; by default they are taken as they are."""
         del age
         return self
 
-    def sensing(self, omega: Float[Array, "3"], a: Float[Array, "3"]) -> "AbstractController[M]":
+    def with_inertial(self, omega: Float[Array, "3"], a: Float[Array, "3"]) -> "AbstractController[M]":
         """Return the same controller for a tick in which more was measured; by default it is not looked at.
 
         Args:
@@ -70,7 +70,7 @@ class AbstractController(eqx.Module, Generic[M]):
         del member
         return self
 
-    def acting(self, actuators: ActuatorState) -> "AbstractController[M]":
+    def with_actuators(self, actuators: ActuatorState) -> "AbstractController[M]":
         """Return the same controller for a tick in which thrust and rates are known; by default it does not use them.
 
         Args:
@@ -137,11 +137,11 @@ class PolicyController(AbstractController[tuple[Any, Command]]):
 
     def with_vehicle(self, member: Member) -> "PolicyController":
         """Return the same policy behind the observation of a vehicle that was identified."""
-        return dataclasses.replace(self, observation=self.observation.believing(member.belief))
+        return dataclasses.replace(self, observation=self.observation.with_belief(member.belief))
 
-    def acting(self, actuators: ActuatorState) -> "PolicyController":
+    def with_actuators(self, actuators: ActuatorState) -> "PolicyController":
         """Return the same policy behind the observation of a vehicle whose thrust and rates are known."""
-        return dataclasses.replace(self, observation=self.observation.acting(actuators))
+        return dataclasses.replace(self, observation=self.observation.with_actuators(actuators))
 
     def in_frame(self, frame: FeltFrame) -> "PolicyController":
         """Return the same policy behind the turned observation."""

@@ -115,9 +115,9 @@ class Datt(AbstractController[DattState]):
     low: Command
     high: Command
 
-    def aged(self, age: float | Float[Array, ""]) -> "Datt":
+    def with_age(self, age: float | Float[Array, ""]) -> "Datt":
         """Return the same for measurements that are ``age`` old [s]."""
-        return dataclasses.replace(self, prediction=self.prediction.aged(age))
+        return dataclasses.replace(self, prediction=self.prediction.with_age(age))
 
     def init(self, x: State) -> DattState:
         """Return the memory at the start of a flight."""

@@ -58,13 +58,13 @@ class FiniteController(AbstractController[FiniteMemory[Any]]):
         """Remember ``u`` as the last command."""
         return FiniteMemory(self.base.accepted(memory.inner, u), u, memory.is_finite)
 
-    def aged(self, age: float | Float[Array, ""]) -> "FiniteController":
+    def with_age(self, age: float | Float[Array, ""]) -> "FiniteController":
         """Return the same for measurements that are ``age`` old [s]."""
-        return FiniteController(self.base.aged(age))
+        return FiniteController(self.base.with_age(age))
 
-    def sensing(self, omega: Float[Array, "3"], a: Float[Array, "3"]) -> "FiniteController":
+    def with_inertial(self, omega: Float[Array, "3"], a: Float[Array, "3"]) -> "FiniteController":
         """Return the same for a tick in which body rates and acceleration were measured."""
-        return FiniteController(self.base.sensing(omega, a))
+        return FiniteController(self.base.with_inertial(omega, a))
 
     def vehicle(self, memory: FiniteMemory[Any]) -> VehicleReport | None:
         """Return the vehicle that the controller inside has identified."""
@@ -74,9 +74,9 @@ class FiniteController(AbstractController[FiniteMemory[Any]]):
         """Return the same for a vehicle that was identified."""
         return FiniteController(self.base.with_vehicle(member))
 
-    def acting(self, actuators: ActuatorState) -> "FiniteController":
+    def with_actuators(self, actuators: ActuatorState) -> "FiniteController":
         """Return the same for a tick in which thrust and body rates are known."""
-        return FiniteController(self.base.acting(actuators))
+        return FiniteController(self.base.with_actuators(actuators))
 
     def in_frame(self, frame: FeltFrame) -> "FiniteController":
         """Return the same for states and commands of ``frame``."""

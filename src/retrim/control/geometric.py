@@ -64,9 +64,9 @@ class Geometric(AbstractController[GeometricState]):
     high: Command
     """Largest command that it accepts."""
 
-    def aged(self, age: float | Float[Array, ""]) -> "Geometric":
+    def with_age(self, age: float | Float[Array, ""]) -> "Geometric":
         """Return the same for measurements that are ``age`` old [s]."""
-        return dataclasses.replace(self, prediction=self.prediction.aged(age))
+        return dataclasses.replace(self, prediction=self.prediction.with_age(age))
 
     def init(self, x: State) -> GeometricState:
         """Return the memory at the start of a flight."""

@@ -59,7 +59,7 @@ class GravityFrame(AbstractController[GravityFrameState]):
     steady: Float[Array, "3"] = eqx.field(default_factory=lambda: jnp.zeros(3))
     """Disturbance that turns the frame beside the estimated one, world [m/s^2]."""
 
-    def aged(self, age: float | Float[Array, ""]) -> "GravityFrame":
+    def with_age(self, age: float | Float[Array, ""]) -> "GravityFrame":
         """Return the same for measurements that are ``age`` old [s]."""
         return dataclasses.replace(self, age=jnp.array(age))
 
@@ -75,7 +75,7 @@ class GravityFrame(AbstractController[GravityFrameState]):
             observer = dataclasses.replace(observer, tau=tau.astype(self.observer.tau.dtype))
         return dataclasses.replace(self, inner=self.inner.with_vehicle(member), observer=observer)
 
-    def acting(self, actuators: ActuatorState) -> "GravityFrame":
+    def with_actuators(self, actuators: ActuatorState) -> "GravityFrame":
         """Return the same for a tick in which thrust and body rates are known."""
         return dataclasses.replace(self, actuators=actuators)
 
@@ -101,7 +101,7 @@ class GravityFrame(AbstractController[GravityFrameState]):
         bias, last = self._bias(x.p.dtype), observer.arrival(memory.observer)
         acting, flying = Command(last.c, last.omega + bias), self.inner
         if self.actuators is not None:
-            acting, flying = self.actuators.command, flying.acting(frame.actuators(self.actuators))
+            acting, flying = self.actuators.command, flying.with_actuators(frame.actuators(self.actuators))
         x = ahead(x, acting, frame.d, self.age.astype(x.p.dtype))
         u, inner = flying.in_frame(frame)(memory.inner, t, frame.state(x))
         u = frame.world_command(u)

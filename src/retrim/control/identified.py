@@ -48,13 +48,13 @@ class BeliefFlight(AbstractController[BeliefState]):
     dt: float = eqx.field(static=True)
     """Control tick [s]."""
 
-    def aged(self, age: float | Float[Array, ""]) -> "BeliefFlight":
+    def with_age(self, age: float | Float[Array, ""]) -> "BeliefFlight":
         """Return the same for measurements that are ``age`` old [s]."""
-        return dataclasses.replace(self, inner=self.inner.aged(age))
+        return dataclasses.replace(self, inner=self.inner.with_age(age))
 
-    def sensing(self, omega: Float[Array, "3"], a: Float[Array, "3"]) -> "BeliefFlight":
+    def with_inertial(self, omega: Float[Array, "3"], a: Float[Array, "3"]) -> "BeliefFlight":
         """Return the same for a tick in which body rates and acceleration were measured."""
-        return dataclasses.replace(self, inner=self.inner.sensing(omega, a))
+        return dataclasses.replace(self, inner=self.inner.with_inertial(omega, a))
 
     def condition(self, memory: BeliefState) -> Condition | None:
         """Return the condition of the controller inside."""
@@ -108,13 +108,13 @@ class IdentifiedFlight(AbstractController[IdentifiedState]):
     age: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(0.0))
     """Age of measurements [s]."""
 
-    def aged(self, age: float | Float[Array, ""]) -> "IdentifiedFlight":
+    def with_age(self, age: float | Float[Array, ""]) -> "IdentifiedFlight":
         """Return the same for measurements that are ``age`` old [s]."""
-        return dataclasses.replace(self, inner=self.inner.aged(age), age=jnp.array(age))
+        return dataclasses.replace(self, inner=self.inner.with_age(age), age=jnp.array(age))
 
-    def sensing(self, omega: Float[Array, "3"], a: Float[Array, "3"]) -> "IdentifiedFlight":
+    def with_inertial(self, omega: Float[Array, "3"], a: Float[Array, "3"]) -> "IdentifiedFlight":
         """Return the same for a tick in which body rates and acceleration were measured."""
-        return dataclasses.replace(self, inner=self.inner.sensing(omega, a), omega=omega, a=a)
+        return dataclasses.replace(self, inner=self.inner.with_inertial(omega, a), omega=omega, a=a)
 
     def condition(self, memory: IdentifiedState) -> Condition | None:
         """Return the condition of the controller inside."""

@@ -51,11 +51,11 @@ class Incremental(AbstractController[IncrementalState]):
     a: Float[Array, "3"] | None = None
     """Measured acceleration, the mean over the last tick, world [m/s^2]; None: that of the measured velocities."""
 
-    def aged(self, age: float | Float[Array, ""]) -> "Incremental":
+    def with_age(self, age: float | Float[Array, ""]) -> "Incremental":
         """Return the same for measurements that are ``age`` old [s]."""
-        return dataclasses.replace(self, prediction=self.prediction.aged(age))
+        return dataclasses.replace(self, prediction=self.prediction.with_age(age))
 
-    def sensing(self, omega: Float[Array, "3"], a: Float[Array, "3"]) -> "Incremental":
+    def with_inertial(self, omega: Float[Array, "3"], a: Float[Array, "3"]) -> "Incremental":
         """Return the same for a tick in which body rates and acceleration were measured."""
         return dataclasses.replace(self, omega=omega, a=a)
 

@@ -52,6 +52,6 @@ class IntegralAction(AbstractController[IntegralState]):
         """Return the same for a vehicle that was identified."""
         return dataclasses.replace(self, inner=self.inner.with_vehicle(member))
 
-    def acting(self, actuators: ActuatorState) -> "IntegralAction":
+    def with_actuators(self, actuators: ActuatorState) -> "IntegralAction":
         """Return the same for a tick in which thrust and body rates are known."""
-        return dataclasses.replace(self, inner=self.inner.acting(actuators))
+        return dataclasses.replace(self, inner=self.inner.with_actuators(actuators))

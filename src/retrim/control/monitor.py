@@ -94,17 +94,17 @@ class Monitor(AbstractController[MonitorState]):
     path: CommandPath | None = None
     """Command path of the twin; None: it follows commands at once."""
 
-    def aged(self, age: float | Float[Array, ""]) -> "Monitor":
+    def with_age(self, age: float | Float[Array, ""]) -> "Monitor":
         """Return the same for measurements that are ``age`` old [s]."""
-        return dataclasses.replace(self, frame=self.frame.aged(age))
+        return dataclasses.replace(self, frame=self.frame.with_age(age))
 
     def with_vehicle(self, member: Member) -> "Monitor":
         """Return the same for a vehicle that was identified."""
         return Monitor(self.frame.with_vehicle(member), self.task, member.path)
 
-    def acting(self, actuators: ActuatorState) -> "Monitor":
+    def with_actuators(self, actuators: ActuatorState) -> "Monitor":
         """Return the same for a tick in which thrust and body rates are known."""
-        return dataclasses.replace(self, frame=self.frame.acting(actuators))
+        return dataclasses.replace(self, frame=self.frame.with_actuators(actuators))
 
     def init(self, x: State) -> MonitorState:
         """Return the memory at the start of a flight; the policy of now is the base policy from then on."""
@@ -208,7 +208,7 @@ class Monitor(AbstractController[MonitorState]):
             u, memory = base(memory, t, at)
             acting = u
         else:
-            u, memory = base.acting(path.actuators)(memory, t, at)
+            u, memory = base.with_actuators(path.actuators)(memory, t, at)
             acting, path = self.path(path, u, nominal.dt)
         after = nominal.state(nominal.step(nominal.init(at), acting, s.d))
         excess = s.twin.excess + jnp.where(near, excess, 0.0)

@@ -67,9 +67,9 @@ class Mppi(AbstractController[MppiState]):
     horizon: int = eqx.field(static=True, default=40)
     """Ticks of a sequence."""
 
-    def aged(self, age: float | Float[Array, ""]) -> "Mppi":
+    def with_age(self, age: float | Float[Array, ""]) -> "Mppi":
         """Return the same for measurements that are ``age`` old [s]."""
-        return dataclasses.replace(self, prediction=self.prediction.aged(age))
+        return dataclasses.replace(self, prediction=self.prediction.with_age(age))
 
     def init(self, x: State) -> MppiState:
         """Return the memory at the start of a flight: hover is planned."""

@@ -47,9 +47,9 @@ class NearTarget(AbstractController[Any]):
         """Return the same for a vehicle that was identified."""
         return NearTarget(self.inner.with_vehicle(member), self.task, self.reach)
 
-    def acting(self, actuators: ActuatorState) -> "NearTarget":
+    def with_actuators(self, actuators: ActuatorState) -> "NearTarget":
         """Return the same for a tick in which thrust and body rates are known."""
-        return NearTarget(self.inner.acting(actuators), self.task, self.reach)
+        return NearTarget(self.inner.with_actuators(actuators), self.task, self.reach)
 
     def in_frame(self, frame: FeltFrame) -> "NearTarget":
         """Return the same for states and commands of ``frame``."""

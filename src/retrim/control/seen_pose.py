@@ -36,11 +36,11 @@ class SeenPose(AbstractController[SeenPoseState]):
     a: Float[Array, "3"] | None = None
     """Acceleration, the mean over the last tick, world [m/s^2]; None: it is not measured."""
 
-    def aged(self, age: float | Float[Array, ""]) -> "SeenPose":
+    def with_age(self, age: float | Float[Array, ""]) -> "SeenPose":
         """Return the same for frames that are ``age`` old [s]."""
-        return dataclasses.replace(self, inner=self.inner.aged(age))
+        return dataclasses.replace(self, inner=self.inner.with_age(age))
 
-    def sensing(self, omega: Float[Array, "3"], a: Float[Array, "3"]) -> "SeenPose":
+    def with_inertial(self, omega: Float[Array, "3"], a: Float[Array, "3"]) -> "SeenPose":
         """Return the same for a tick in which body rates and acceleration were measured."""
         return dataclasses.replace(self, omega=omega, a=a)
 
@@ -56,7 +56,7 @@ class SeenPose(AbstractController[SeenPoseState]):
         if self.omega is not None and self.a is not None:
             gravity = jnp.array([0.0, 0.0, -STANDARD_GRAVITY], dtype=x.p.dtype)
             felt = so3.act(x.R.T, self.a - gravity)  # as an accelerometer measures it, in the body frame
-            controller = controller.sensing(self.omega, so3.act(here.R, felt) + gravity)
+            controller = controller.with_inertial(self.omega, so3.act(here.R, felt) + gravity)
         u, inner = controller(memory.inner, t, here)
         return u, SeenPoseState(seen, inner, u)
 

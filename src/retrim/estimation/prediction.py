@@ -33,7 +33,7 @@ class Prediction(eqx.Module):
     age: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(0.0))
     """How old measurements are [s]."""
 
-    def aged(self, age: float | Float[Array, ""]) -> "Prediction":
+    def with_age(self, age: float | Float[Array, ""]) -> "Prediction":
         """Return the same for measurements that are ``age`` old [s]."""
         return dataclasses.replace(self, age=jnp.array(age))
 

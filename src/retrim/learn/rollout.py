@@ -84,9 +84,9 @@ def _scan(env: Env, policy: Policy, start: Start, perturbations: Perturbations |
         frame, seen, x_seen = framed(x, issued)
         actuators, observation = dynamics.actuators(s), seen.observation
         if actuators is not None:
-            observation = observation.acting(actuators if frame is None else frame.actuators(actuators))
+            observation = observation.with_actuators(actuators if frame is None else frame.actuators(actuators))
         if start.member is not None:
-            observation = observation.believing(start.member.belief)
+            observation = observation.with_belief(start.member.belief)
         o, memory = observation(memory, t, x_seen, last)
         before = last
         last, inputs = (policy(o), ()) if perturbation is None else policy.perturbed(o, perturbation)

@@ -108,7 +108,7 @@ def _source(setup: Setup, controller: Any, predicted: Any, parameters: dict[str,
 
     def decide(parameters: Any, inputs: Any) -> Any:
         memory, t, age, x = inputs
-        now = controller(parameters).aged(age)
+        now = controller(parameters).with_age(age)
         u, after = now(memory, t, x)
         condition = now.condition(after) or Condition(jnp.array(0), jnp.array(0))
         return (u.c, u.omega, condition.stage, condition.cause), after

@@ -18,7 +18,7 @@ from ..io.logs import FlightLog
 from ..io.logs.on_one_clock import UP
 from .delayed_regression import DELAYS, LAGS, Channel, lowest
 from .path_of_log import path_of_log
-from .rows import acting
+from .rows import acting_commands
 
 BLOCK, DRAWS = 2.0, 200  # [s] of a block, and how many samples the bootstrap draws
 INSIDE = (5.0, 95.0)  # percentiles of an interval
@@ -180,7 +180,7 @@ def _thrust(log: FlightLog, blocks: np.ndarray) -> Channel:
         return np.concatenate([(c[:, None] * axis)[:, :, None], drag, push], axis=2)
 
     a = np.diff(log.v, axis=0) / log.dt + UP
-    return Channel.of(features, lambda delay, lag: acting(log.c, log.dt, delay, lag)[:-1], a, blocks)
+    return Channel.of(features, lambda delay, lag: acting_commands(log.c, log.dt, delay, lag)[:-1], a, blocks)
 
 
 def _rates(log: FlightLog, command: np.ndarray, blocks: np.ndarray, axes: list[int]) -> Channel:
@@ -194,4 +194,6 @@ def _rates(log: FlightLog, command: np.ndarray, blocks: np.ndarray, axes: list[i
         return np.concatenate([told[:, :, None], bias], axis=2)
 
     chosen = command[:, axes]
-    return Channel.of(features, lambda delay, lag: acting(chosen, log.dt, delay, lag)[:-1], turned[:, axes], blocks)
+    return Channel.of(
+        features, lambda delay, lag: acting_commands(chosen, log.dt, delay, lag)[:-1], turned[:, axes], blocks
+    )

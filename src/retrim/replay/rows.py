@@ -10,7 +10,7 @@ from ..learn.residuals.targets import Targets
 from ..physics.state import Command, State
 
 
-def acting(command: np.ndarray, dt: float, delay: float, lag: float) -> np.ndarray:
+def acting_commands(command: np.ndarray, dt: float, delay: float, lag: float) -> np.ndarray:
     """Return the mean over each tick of a command as it acts: late, and behind a first-order lag.
 
     Args:
@@ -48,7 +48,7 @@ def rows_of(log: FlightLog, *, delay: float = 0.0, lag: float = 0.0) -> Targets:
     Returns:
         One row for each tick.
     """
-    c = acting(log.c, log.dt, delay, lag)
+    c = acting_commands(log.c, log.dt, delay, lag)
     told = log.rates if log.command is None else log.command
     missed = log.a + UP - c[:, None] * log.R[:, :, 2]
     x = jax.vmap(State)(jnp.asarray(log.p), jnp.asarray(log.R), jnp.asarray(log.v))

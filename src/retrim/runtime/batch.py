@@ -83,12 +83,12 @@ def fly_ticks(
         The flight, and what was flown.
     """
 
-    controller = controller.aged(simulation.age)
+    controller = controller.with_age(simulation.age)
 
     def tick(flight: InFlight) -> tuple[InFlight, Ticks]:
         s, k = flight.sim, flight.tick
         sensed = simulation.inertial(s, k)
-        now = controller if sensed is None else controller.sensing(*sensed)
+        now = controller if sensed is None else controller.with_inertial(*sensed)
         issued, memory = now(flight.memory, simulation.time(k, s.a.dtype), simulation.measured(s))
         accepted = simulation.within_limits(issued)
         limited = jnp.any(accepted.vector() != issued.vector())

@@ -89,9 +89,9 @@ class ControllerPilot(Pilot):
         """Call the controller once, with the time since the start of the flight."""
         x = measurement.x
         t = jnp.asarray(measurement.t - self._start, dtype=x.p.dtype)
-        controller = self.controller.aged(measurement.age)
+        controller = self.controller.with_age(measurement.age)
         if measurement.omega is not None and measurement.a is not None:
-            controller = controller.sensing(measurement.omega, measurement.a)
+            controller = controller.with_inertial(measurement.omega, measurement.a)
         before = self._t
         u, self._memory, condition, vehicle = _decide(controller, self._memory, t, x)
         self._t = float(t)

@@ -50,7 +50,7 @@ class AbstractObservation(eqx.Module, Generic[M]):
         o, _ = self(self.init(x), jnp.zeros_like(x.p[0]), x, Command.hover(x.p.dtype))
         return o
 
-    def believing(self, belief: PathBelief) -> "AbstractObservation[M]":
+    def with_belief(self, belief: PathBelief) -> "AbstractObservation[M]":
         """Return the same observation of a vehicle of which more is known; by default the policy does not observe it.
 
         Args:
@@ -59,7 +59,7 @@ class AbstractObservation(eqx.Module, Generic[M]):
         del belief
         return self
 
-    def acting(self, actuators: ActuatorState) -> "AbstractObservation[M]":
+    def with_actuators(self, actuators: ActuatorState) -> "AbstractObservation[M]":
         """Return the same observation while thrust and rates act that no command says; by default it has none of them.
 
         Args:

@@ -60,18 +60,18 @@ class VehicleObs(AbstractObservation[M]):
         scaled = (thrust, acting.omega / self.omega_max, slope / self.omega_max, self.belief.vector())
         return jnp.concatenate([seen, *(each.astype(seen.dtype) for each in scaled)]), memory
 
-    def believing(self, belief: PathBelief) -> "VehicleObs[M]":
+    def with_belief(self, belief: PathBelief) -> "VehicleObs[M]":
         """Return the same observation with another belief."""
         return dataclasses.replace(self, belief=belief)
 
-    def acting(self, actuators: ActuatorState) -> "VehicleObs[M]":
+    def with_actuators(self, actuators: ActuatorState) -> "VehicleObs[M]":
         """Return the same observation with the present thrust and body rates."""
         return dataclasses.replace(self, actuators=actuators)
 
     def at_rest(self, x: State) -> Float[Array, " o"]:
         """Return the observation of a vehicle that rests in ``x``."""
         hover = Command.hover(x.p.dtype)
-        still = self.acting(ActuatorState.at(hover))
+        still = self.with_actuators(ActuatorState.at(hover))
         return still(self.init(x), jnp.zeros_like(x.p[0]), x, hover)[0]
 
     def in_frame(self, frame: FeltFrame) -> "VehicleObs[M]":
