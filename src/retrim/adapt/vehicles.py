@@ -11,7 +11,7 @@ from jax import lax, random
 from jaxtyping import Array, Float, Key
 
 from ..control.identified import belief_from, bounded_gain
-from ..estimation.command_path import PathEstimator, PathState
+from ..estimation.command_path import PathEstimate, PathEstimator, PathState
 from ..learn.window import Window
 from ..physics.command_path import CommandPath
 from ..physics.command_path import PathState as QueueState
@@ -88,20 +88,7 @@ class IdentifiedVehicle(AbstractVehicles):
         Args:
             window: Ticks of flight.
         """
-        estimator = self.estimator
-        age = jnp.zeros_like(window.t) if window.age is None else window.age
-
-        def tick(s: PathState, row: tuple[Array, State, Command, Array, Array]) -> tuple[PathState, None]:
-            t, x, u, valid, age = row
-            seen = estimator.issued(estimator.measured(s, t, x, age=age), u)
-            return jax.tree.map(lambda new, old: jnp.where(valid, new, old), seen, s), None
-
-        def piece(s: PathState, rows: tuple[Array, State, Command, Array, Array]) -> tuple[PathState, None]:
-            return estimator.estimated(lax.scan(tick, s, rows)[0]), None
-
-        first = estimator.init(jax.tree.map(lambda leaf: leaf[0], window.x))
-        rows = _in_pieces((window.t, window.x, window.u, window.valid, age), PIECE)
-        estimate = lax.scan(piece, first, rows)[0].estimate
+        estimate = estimate_path(self.estimator, window)
         belief = belief_from(self.family, estimate)
         path = self.family.path(belief.centre)
         response = dataclasses.replace(path.response, thrust_gain=bounded_gain(estimate))
@@ -136,6 +123,29 @@ class IdentifiedVehicle(AbstractVehicles):
         for _ in shape:
             assign = jax.vmap(assign)
         return assign(starts.t, starts.x, inside)
+
+
+def estimate_path(estimator: PathEstimator, window: Window) -> PathEstimate:
+    """Return the command path that a window of flight shows.
+
+    Args:
+        estimator: Estimator of the path.
+        window: Ticks of flight.
+    """
+    age = jnp.zeros_like(window.t) if window.age is None else window.age
+
+    def tick(s: PathState, row: tuple[Array, State, Command, Array, Array]) -> tuple[PathState, None]:
+        t, x, u, valid, age = row
+        seen = estimator.issued(estimator.measured(s, t, x, age=age), u)
+        return jax.tree.map(lambda new, old: jnp.where(valid, new, old), seen, s), None
+
+    def piece(s: PathState, rows: tuple[Array, State, Command, Array, Array]) -> tuple[PathState, None]:
+        return estimator.estimated(lax.scan(tick, s, rows)[0]), None
+
+    first = estimator.init(jax.tree.map(lambda leaf: leaf[0], window.x))
+    rows = _in_pieces((window.t, window.x, window.u, window.valid, age), PIECE)
+    estimate: PathEstimate = lax.scan(piece, first, rows)[0].estimate
+    return estimate
 
 
 def _in_pieces(rows: Any, size: int) -> Any:

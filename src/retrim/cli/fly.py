@@ -21,6 +21,7 @@ from ..experiments.outlet import Outlet
 from ..experiments.run import INTERRUPTED, Run
 from ..experiments.tables.document import TableSection
 from .console import RichReporter, Trust, console, refuse, show_paths, show_table, started
+from .flight_vehicle import check_vehicle_file, save_flight_vehicle
 
 
 def fly(
@@ -35,6 +36,7 @@ def fly(
     seconds: float | None = None,
     starts: int = 1,
     seed: int = 0,
+    save_vehicle: Path | None = None,
     trust: Trust = (),
     out: Path | None = None,
 ) -> Callable[[threading.Event], int]:
@@ -55,12 +57,14 @@ def fly(
         seconds: Length of a flight; 30 s for hover, 60 s for tracking by default.
         starts: Number of flights, each from another start.
         seed: Seed of the starts, of the learners and of what is random in the scenario, 0 to 4294967295.
+        save_vehicle: Write the vehicle that the last flight shows to this vehicle file (TOML), to pretrain for.
         trust: Python name that a file may hold, as mine:task; its code is run. Once for each name.
         out: Folder for results.json, events.jsonl, logs/, what was learnt and the picture; a new one under runs/ by
             default.
     """
 
     def ordered(stop: threading.Event) -> int:
+        check_vehicle_file(save_vehicle)
         if where.is_vehicle:
             if delta or config or starts != 1 or latency != "fixed":
                 raise ConfigError("a vehicle is flown live: without --delta, --config, --starts and --latency")
@@ -74,6 +78,7 @@ def fly(
                 residual=residual,
                 seconds=seconds or 30.0,
                 seed=seed,
+                save_vehicle=save_vehicle,
                 trust=trust,
                 out=out,
             )(stop)
@@ -89,12 +94,12 @@ def fly(
         )  # fmt: skip
         run, setup = started(Run("fly", out, stop=stop)), fleet.setups[scenario.reference]
         _warn(setup, scenario)
-        return _fly(fleet, setup, scenario, run)
+        return _fly(fleet, setup, scenario, run, save_vehicle)
 
     return ordered
 
 
-def _fly(fleet: Fleet, setup: Setup, scenario: Scenario, run: Run) -> int:
+def _fly(fleet: Fleet, setup: Setup, scenario: Scenario, run: Run, vehicle_file: Path | None) -> int:
     flights = list[Flight]()  # a Ctrl-C may come before there are any
     with run.interruptible(), RichReporter().progress("flying") as advance:
         advance(0.0, "compiling the programs of a flight (kept in a cache for the next time)")
@@ -113,8 +118,9 @@ def _fly(fleet: Fleet, setup: Setup, scenario: Scenario, run: Run) -> int:
     show_table(TableSection(("disturbance", "method", "error"), lines, title))
     for note in notes(flights, preset):
         console.print(note, markup=False, soft_wrap=True)
-    show_paths([*drawn, *([] if results is None else [results])])
-    return run.exit_code or max((refuse(fault) for fault in outlet.faults), default=0)
+    saved, code = save_flight_vehicle(flights[-1], setup, vehicle_file)
+    show_paths([*drawn, *([] if results is None else [results]), *saved])
+    return run.exit_code or max((code, *(refuse(fault) for fault in outlet.faults)))
 
 
 def _warn(setup: Setup, scenario: Scenario) -> None:

@@ -30,6 +30,7 @@ from ..live.status import Status
 from ..runtime.events import Event
 from ..transport.remote import LOOPBACK
 from .console import RichReporter, Trust, console, refuse, show_paths, show_table, started
+from .flight_vehicle import check_vehicle_file, save_flight_vehicle
 
 LINE_EVERY = 5.0  # [s], where the output is no terminal
 
@@ -52,6 +53,7 @@ def live(
     page_host: str = LOOPBACK[0],
     page_port: int = 8080,
     record: Path | None = None,
+    save_vehicle: Path | None = None,
     trust: Trust = (),
     out: Path | None = None,
 ) -> Callable[[threading.Event], int]:
@@ -78,6 +80,7 @@ def live(
         page_host: Address that the page listens on; its printed address has a token, without which nothing is answered.
         page_port: Port of the page, or the next one that is free.
         record: FILE.mcap for Foxglove and PlotJuggler, by default flight.mcap in the folder; or FILE.rrd for rerun.
+        save_vehicle: Write the vehicle that the flight shows to this vehicle file (TOML), to pretrain for.
         trust: Python name that a file may hold, as mine:task; its code is run. Once for each name.
         out: Folder of what the flight leaves; a new one under runs/ by default.
     """
@@ -85,6 +88,7 @@ def live(
     def ordered(stop: threading.Event) -> int:
         check_seeds([seed])
         check_recording(record)
+        check_vehicle_file(save_vehicle)
         if page and no_page:
             raise ConfigError("--page and --no-page: choose one")
         check_limits(fence, seconds, policy_age)
@@ -107,12 +111,12 @@ def live(
             state, address, ground, policy_age=policy_age or float("inf"), record=record, until_stopped=seconds is None,
         )  # fmt: skip
         with interrupts_only_set(run.stop):  # a Ctrl-C lands the vehicle; whoever is in the air is not dropped
-            return _fly(request, run)
+            return _fly(request, run, save_vehicle)
 
     return ordered
 
 
-def _fly(request: LiveRequest, run: Run) -> int:
+def _fly(request: LiveRequest, run: Run, vehicle_file: Path | None) -> int:
     """Fly one flight, and show what it leaves."""
     done = fly_live(request, run, RichReporter(), _display, lambda url: _open_page(url, run.folder))
     if done is None:
@@ -120,9 +124,10 @@ def _fly(request: LiveRequest, run: Run) -> int:
     flights, setup = [done.flight], done.request.setup
     drawn = done.outlet.write("the picture", lambda out: picture(flights, setup, request.scenario, out, stem="live"))
     show_table(TableSection(("figure", "unit", "value"), figures(done.rows), f"live, {done.flight.log.t[-1]:.1f} s"))
-    show_paths([*(drawn or [])[:1], *done.paths])
+    saved, code = save_flight_vehicle(done.flight, setup, vehicle_file)
+    show_paths([*(drawn or [])[:1], *done.paths, *saved])
     codes = [refuse(fault) for fault in done.outlet.faults]
-    return run.exit_code or max(codes, default=int(not done.landed))
+    return run.exit_code or max(codes, default=int(not done.landed)) or code
 
 
 def _open_page(url: str, folder: Path) -> None:

@@ -65,6 +65,9 @@ class Identified:
     unexplained: float
     """Root mean square of the acceleration that is left, three axes [m/s^2]."""
 
+    rate_damping: Estimate | None = None
+    """Damping ratio of roll and pitch rate; None: the rate loop is described as one of first order."""
+
     @property
     def known(self) -> bool:
         """Whether the log says anything of the vehicle."""

@@ -10,7 +10,7 @@ from ..io.logs import FlightLog
 from ..physics.state import STANDARD_GRAVITY, Command, State
 
 MEMORY = 1e4  # [s]: the vehicle of a log is one vehicle
-BATCH = 50  # ticks from one estimate to the next
+BATCH = 5  # ticks from one estimate to the next: each one says how noisy the next measurements are
 
 
 def path_of_log(log: FlightLog) -> PathEstimate:

@@ -12,6 +12,7 @@ from .identification import Estimate, Identified
 SHORTEST, LONGEST = 0.002, 0.5  # [s] that a lag of a vehicle file may have
 SUFFIX = "-identified"
 MOST = 0.2  # [s] that a delay may have
+DAMPINGS = (0.1, 10.0)  # that a vehicle file may have
 
 
 def vehicle_toml(found: Identified, setup: Setup, log: str) -> str:
@@ -54,6 +55,10 @@ def vehicle_toml(found: Identified, setup: Setup, log: str) -> str:
         )
         lags = [_bounded(each.value) for each in (level, level, yaw or level)]
         lines.append(f"rate_lag = {_row(lags)}  # [s], identified: {said}")
+        if (damping := found.rate_damping) is not None:
+            least, most = DAMPINGS
+            ratio = min(max(damping.value, least), most)
+            lines.append(f"rate_damping = {_row([ratio] * 3)}  # identified: {damping.text('')}")
     elif known is not None:
         lines.append(f"rate_lag = {_row(known)}  # [s]")
         if base.rate_damping is not None:  # an identified lag is that of a loop of first order

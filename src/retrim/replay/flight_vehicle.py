@@ -1,0 +1,55 @@
+"""The vehicle of a flight that retrim has flown, as a vehicle file."""
+
+import jax
+import jax.numpy as jnp
+
+from ..adapt.vehicles import estimate_path
+from ..config.setup import Setup
+from ..errors import LogError
+from ..estimation.command_path import Estimate as PathParameter
+from ..estimation.command_path import PathEstimator
+from ..runtime.flight import Log
+from .identification import Estimate, Identified
+from .vehicle import vehicle_toml
+
+MEMORY = 1e4  # [s]: the vehicle of a flight is one vehicle
+LEAST = 1.0  # [s] of flight
+
+
+def flight_vehicle_toml(log: Log, setup: Setup, name: str) -> str:
+    """Return the vehicle of a flight as TOML: delay, lags and damping that it shows, the rest from the preset.
+
+    Args:
+        log: The flight.
+        setup: Set-up of the policy that flew.
+        name: Name of the flight, for the comment.
+
+    Raises:
+        LogError: The flight is too short, or says nothing of its vehicle.
+    """
+    ticks = len(log.t) - 1
+    if ticks * log.dt < LEAST:
+        raise LogError(f"the flight must be at least {LEAST:g} s long to identify its vehicle, got {log.t[-1]:.2f} s")
+    estimator = PathEstimator.of(log.dt, memory=MEMORY)
+    path = jax.jit(estimate_path)(estimator, jax.tree.map(jnp.asarray, log.window(ticks)))
+    found = Identified(
+        delay=_known(path.delay),
+        thrust_gain=_known(path.thrust_gain),
+        thrust_offset=None,
+        full_thrust=None,
+        thrust_lag=_known(path.thrust_lag),
+        rate_lag=_known(path.rate_lag),
+        rate_gain=_known(path.rate_gain),
+        yaw_lag=_known(path.yaw_lag),
+        yaw_gain=_known(path.yaw_gain),
+        drag=(None, None, None),
+        unexplained=0.0,
+        rate_damping=_known(path.rate_damping),
+    )
+    if found.delay is None and found.rate_lag is None and found.thrust_lag is None:
+        raise LogError("the flight moves too little to identify its vehicle: fly from farther away, or under a push")
+    return vehicle_toml(found, setup, name)
+
+
+def _known(each: PathParameter) -> Estimate | None:
+    return Estimate(float(each.mean), float(each.low), float(each.high)) if bool(each.excited) else None

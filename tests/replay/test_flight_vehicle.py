@@ -1,0 +1,67 @@
+"""The vehicle of a flight that retrim has flown, as a vehicle file."""
+
+import dataclasses
+
+import jax
+import pytest
+
+from retrim import Scenario, Setup, load
+from retrim.cli.flight_vehicle import check_vehicle_file, save_flight_vehicle
+from retrim.config.vehicle_file import VehicleSpec, read_vehicle
+from retrim.errors import ConfigError
+from retrim.experiments.fleet import Fleet
+
+pytestmark = pytest.mark.usefixtures("as_a_user")
+
+VEHICLE = VehicleSpec(
+    name="slow", mass=1.0, inertia=(0.01, 0.01, 0.02), arm=(0.1, 0.1), thrust_max=40.0, rates_max=(6.0, 6.0, 4.0),
+    motor_tau=0.04, rate_lag=(0.08, 0.08, 0.12), rate_damping=(0.7, 0.7, 0.7), command_delay=0.03,
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def flown(as_a_user):
+    """A flight of a vehicle of second order by a geometric controller, and a set-up that does not know the vehicle."""
+    scenario = Scenario("kick", plant="second-order", vehicle=VEHICLE, delay=0.03)
+    known = dataclasses.replace(load("hover/retrim"), vehicle=VEHICLE)
+    policy = Setup.of(known).new_policy(jax.random.key(0))
+    (flight,) = Fleet(known, policy, [scenario], methods=("geometric",), starts=1, seconds=12.0).run().flown
+    return flight, Setup.of(load("hover/retrim"))
+
+
+def test_the_file_has_the_delay_the_lags_and_the_damping_of_the_vehicle(flown, tmp_path):
+    flight, setup = flown
+    path = tmp_path / "found.toml"
+    assert save_flight_vehicle(flight, setup, path) == ([path], 0)
+    found = read_vehicle(path)
+    assert found.command_delay == pytest.approx(0.03, abs=0.002)
+    assert found.rate_lag[0] == pytest.approx(0.08, rel=0.05)
+    assert found.rate_damping[0] == pytest.approx(0.7, rel=0.1)
+    assert found.motor_tau == pytest.approx(0.04, rel=0.15)
+    assert found.mass == pytest.approx(float(setup.vehicle.mass))  # a flight does not show it
+
+
+def test_without_the_option_nothing_is_written(flown):
+    assert save_flight_vehicle(*flown, None) == ([], 0)
+    check_vehicle_file(None)
+
+
+def test_a_flight_that_is_too_short_is_refused_in_one_line(flown, tmp_path, capsys):
+    flight, setup = flown
+    log = flight.log
+    cut = lambda states: type(states)(*(part[:20] for part in states))  # noqa: E731
+    short = log._replace(
+        t=log.t[:20], u=log.u[:20], true=cut(log.true), measured=cut(log.measured), age=log.age, events=()
+    )
+    path = tmp_path / "found.toml"
+    assert save_flight_vehicle(dataclasses.replace(flight, log=short), setup, path) == ([], 1)
+    assert not path.exists()
+    assert "must be at least 1 s long to identify its vehicle" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("name", "message"), [("found.txt", "must end in .toml"), ("nowhere/found.toml", "does not exist; make it first")]
+)
+def test_a_file_that_cannot_be_written_is_refused_before_the_flight(tmp_path, name, message):
+    with pytest.raises(ConfigError, match=message):
+        check_vehicle_file(tmp_path / name)
