@@ -121,7 +121,7 @@ class Entrant:
 OPPONENTS = ("base", "base-do", "geometric-i", "indi")
 ENTRANTS: dict[str, tuple[Entrant, ...]] = {
     task: (
-        *(Entrant(f"{task}/retrim", method) for method in (*OPPONENTS, "full")),
+        *(Entrant(f"{task}/retrim", method) for method in OPPONENTS),
         Entrant(f"{task}/retrim", "indi", told=True),
         *(Entrant(f"{task}/any", method) for method in ("base", "base-do", "base-id")),
     )
