@@ -101,7 +101,7 @@ class FleetLearner:
         return done
 
     def _learnt(self, kind: Any, loops: list[LearnerLoop], windows: list[Window]) -> list[Update]:
-        """Learn for some vehicles of a kind; low-rank policies add their deltas to a base that learns from all vehicles."""
+        """Learn for some vehicles of a kind; low-rank policies share a base that learns from all of them."""
         workers, members = [loop.worker for loop in loops], self._kinds()[kind].values()
         low_rank = _low_rank(workers)
         if not low_rank or len(members) < 2:

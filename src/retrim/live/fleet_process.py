@@ -87,7 +87,7 @@ def _look(fleet: FleetLearner, folder: Path, done: set[str]) -> None:
 
 @dataclass
 class FleetProcess:
-    """Process of a :class:`FleetLearner`. It starts with the first vehicle and is restarted by the next one if it died."""
+    """Process of a :class:`FleetLearner`. It starts with the first vehicle, and again if it died."""
 
     folder: Path
     cores: set[int] | None = None
