@@ -46,7 +46,7 @@ class LiveFlight(NamedTuple):
     paths: list[Path]
     """Output files, the most interesting first."""
     request: LiveRequest
-    """Request, whose set-up has all references that were followed."""
+    """Request whose set-up follows the sequence of all references of the flight."""
     landed: bool
     """Whether the vehicle landed under control of this flight, rather than being lost or crashing."""
     outlet: Outlet
