@@ -246,8 +246,8 @@ class LearnerLoop:
     def _wanted(self) -> bool:
         """Return whether control accepts updates and learning is not paused.
 
-        After the end of policy mode control does not accept updates; an update then would overwrite the last update in
-        flight on the bus.
+        After the end of policy mode control does not accept updates, and a further update would displace the last one
+        that was in flight.
         """
         return self._status().get("mode", "policy") == "policy" and not last_note(self.bus, "learning").get(
             "paused", False

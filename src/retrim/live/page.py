@@ -200,7 +200,7 @@ class _Page:
             self._bus.publish(PAGE, pack_note(PAGE, count=self._refused, last=plain(why)))
 
     def _turn(self, turned: Callable[[Knobs], Knobs]) -> Knobs | None:
-        """Set knobs relative to their present positions, from any thread; return these positions if that is not possible."""
+        """Set knobs relative to their present positions, from any thread; return these positions if that fails."""
         with self._lock:
             before = self._knobs()
             try:
