@@ -69,7 +69,7 @@ def fly_live(
         The flight; None if it was interrupted before take-off.
 
     Raises:
-        ConfigError: The method cannot be flown live.
+        ConfigError: The method cannot be used in a live flight.
         PlantError: The flight could not begin, or did not write a log.
     """
     run.folder.mkdir(parents=True, exist_ok=True)

@@ -62,7 +62,7 @@ def free_port(host: str, wanted: int) -> int:
     """Return the first free port of ``host`` among the ten ports from ``wanted`` on.
 
     Raises:
-        ConfigError: None of the ports is free, or this machine does not have the address.
+        ConfigError: All ten ports are in use, or this machine does not have the address.
     """
     if not HOST.fullmatch(host):
         raise ConfigError(f"--page-host {excerpt(host)}: neither an address nor the name of a host")

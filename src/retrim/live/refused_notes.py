@@ -29,7 +29,7 @@ class RefusedNotes:
         self._refused, self._told_so_far = dict.fromkeys(self._known, 0), dict[str, int]()
 
     def look(self) -> list[str]:
-        """Return lines about refusals since the last call; a topic is reported at its 1st, 10th, 100th refusal and so on."""
+        """Return lines about new refusals; a topic is reported at its 1st, 10th, 100th refusal and so on."""
         said = []
         for topic, known in self._known.items():
             message = self._bus.latest(topic, known)

@@ -113,7 +113,7 @@ def results(
 
 
 def _stalls(status: Status, dt: float) -> dict[str, Any]:
-    """Return statistics of stalls of the machine and the ticks missed in them; None values without stall reports."""
+    """Return statistics of stalls of the machine and the ticks missed in them, or null values without stall reports."""
     seen = status.stalls
     if not seen:
         return dict.fromkeys(("missed_in_stalls", "stalls", "stall_max_ms"))

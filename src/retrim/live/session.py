@@ -82,7 +82,7 @@ class LiveRequest:
     state: LearnerState | None = None
     """Learned state of an earlier flight, from which learning continues."""
     page: tuple[str, int] | None = None
-    """Address and port of the page; None for a flight without a page."""
+    """Address and port of the page, if the flight has one."""
     learners: Address | None = None
     """Address of learners on another machine; None for learners on this machine."""
     policy_age: float = float("inf")

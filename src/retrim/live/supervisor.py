@@ -1,4 +1,4 @@
-"""Supervisor of a live flight: it starts the processes, arms the flight, restarts dead processes and ends the flight."""
+"""Supervisor of a live flight, which starts all processes, arms the flight, restarts dead processes and ends it."""
 
 import contextlib
 import json
@@ -28,7 +28,7 @@ from .spec import LiveSpec
 from .status import Status
 from .topics import topics
 
-LANDING = 60.0  # [s] for a landing; then the processes are ended at any position of the vehicle
+LANDING = 60.0  # [s] for a landing; afterwards the processes are ended wherever the vehicle is
 LAST = 5  # [ticks] for the log to receive the last reports of control after the plant has ended
 ATTEMPTS = 5  # restarts per process
 LEARN = ("residual", "policy", "identifier", "recorder", "page", "bridge")
@@ -151,7 +151,7 @@ class Supervisor:
             self.bus.publish("order", pack_note("order", epoch=self.epoch, order="land"))
 
     def learn(self, *, paused: bool, flown: bool) -> None:
-        """Run or pause the learners, and fly the learned parameters or those of the take-off."""
+        """Run or pause the learners, and fly the learned parameters or the initial ones."""
         self.bus.publish("learning", pack_note("learning", paused=paused, flown=flown))
 
     def learn_from(self, start: Path) -> None:
@@ -173,7 +173,7 @@ class Supervisor:
 
     @property
     def page_port(self) -> int | None:
-        """Port of the page; None if there is no page."""
+        """Port of the page, if there is one."""
         return last_note(self.bus, "ready.page", "ready").get("port")
 
     def watch(self) -> Status:

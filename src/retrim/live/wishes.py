@@ -1,4 +1,4 @@
-"""Requests of the user in flight: land, pause, change method, disable learned parameters, change reference."""
+"""Requests of the user in flight: land, pause, change method, fly the initial parameters, change reference."""
 
 import contextlib
 import time
