@@ -51,7 +51,7 @@ class FleetLearner:
             name: Name of the vehicle and layer.
             plan: Plan of the learner.
             bus: Bus of the flight.
-            wanted: Called before each publication; False if the flight has gone in the meantime.
+            wanted: Called before each publication; False if the vehicle has left in the meantime.
         """
         loop = LearnerLoop(plan, bus, self._clock, self._setup_of)
         loop.catch_up()

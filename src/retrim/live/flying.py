@@ -122,9 +122,7 @@ def _written(
         run, found, seeds=[request.seed], preset=preset.name, seconds=float(flight.log.t[-1]),
         ended=status.ended, scheduling=refused, histograms_ms=histograms(rows),
     )  # fmt: skip
-    for start in run.folder.glob(
-        "start*.safetensors"
-    ):  # initial states of the learners, which the learned state contains
+    for start in run.folder.glob("start*.safetensors"):  # initial states, contained in the learned state
         start.unlink(missing_ok=True)
     paths = [*recorded, *([] if path is None else [path]), log, *complaints(run.folder)]
     return LiveFlight(flight, found, paths, request, status.ended == "landed", outlet)

@@ -106,9 +106,7 @@ class Panel:
         if len(self._history) > 1:
             t, error, policies = np.array(self._history).T
             top = max(1.0, 1.1 * error.max())
-            marks = np.where(
-                np.append(False, np.diff(policies) > 0), error, -10.0 * top
-            )  # hide other points far below the axis
+            marks = np.where(np.append(False, np.diff(policies) > 0), error, -10.0 * top)  # others: below the axis
             self._plot.scales = _scales((t[0], t[-1]), top)
             self._plot.data = (t, error, marks)
 

@@ -121,7 +121,7 @@ def _flown(
 
 
 def answer(bus: Bus, tick: int, until: float) -> Setpoint | None:
-    """Return the setpoint for a sample, from control or the fallback; None if it does not arrive before ``until`` [s]."""
+    """Return the setpoint of control or fallback for a sample; None if it does not arrive before ``until`` [s]."""
     while True:
         for topic in ("setpoint", "fallback"):
             message = bus.latest(topic)

@@ -47,9 +47,8 @@ def _reduced(ufunc: str) -> Expression:
         axes, dtype = tuple(eqn.params["axes"]), np.dtype(eqn.outvars[0].aval.dtype)
         if ufunc.startswith("logical") and dtype.kind != "b":
             raise no_form("a bitwise reduction")
-        whole = (
-            f", dtype={dtype.name!r}" if ufunc in ("add", "multiply") and dtype.kind in "iu" else ""
-        )  # integer overflow must wrap
+        # integers must wrap on overflow
+        whole = f", dtype={dtype.name!r}" if ufunc in ("add", "multiply") and dtype.kind in "iu" else ""
         # the method of the ufunc takes half the time of the NumPy function
         return f"np.{ufunc}.reduce({x}, {axes[0] if len(axes) == 1 else axes}{whole})"
 

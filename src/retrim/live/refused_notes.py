@@ -10,7 +10,7 @@ NOTES = ("airborne", "beat.", "ended", "followed", "ground", "knobs", "learner."
          "refusals.", "stalls", "status", "wish", "world")  # fmt: skip
 """Topics of notes, or prefixes of their names."""
 PAGE, NETWORK = "refusals.page", "refusals.network"
-"""Topics of the inputs that the page refused from a browser and the bridge from the network."""
+"""Topics of refusals: of browser inputs by the page, and of network messages by the bridge."""
 
 
 class RefusedNotes:

@@ -26,9 +26,8 @@ class Scene:
             arm: Distance from the centre of the vehicle to a rotor [m].
             rate: Update rate of the scene [Hz].
         """
-        server.scene.configure_default_lights(
-            cast_shadow=False
-        )  # in software rendering the page then appears in a sixth of the time
+        # Without shadows the page appears in a sixth of the time in software rendering.
+        server.scene.configure_default_lights(cast_shadow=False)
         self._scene, self._trail = server.scene, deque[np.ndarray](maxlen=round(TRAIL_S * rate))
         middle, size = path.mean(0), float(np.ptp(path, axis=0).max())
         server.initial_camera.position = tuple(middle + (1.3 + size) * np.array([-0.8, -0.7, 0.35]))

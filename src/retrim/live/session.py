@@ -84,7 +84,7 @@ class LiveRequest:
     page: tuple[str, int] | None = None
     """Address and port of the page, if the flight has one."""
     learners: Address | None = None
-    """Address of learners on another machine; None for learners on this machine."""
+    """Address of learners on another machine, if they are not on this machine."""
     policy_age: float = float("inf")
     """Maximum age of the flight data from which the policy was learned [s]."""
     record: Path | None = None
@@ -210,7 +210,7 @@ def learner_state(request: LiveRequest, policy: Policy, method: str, residual: A
         request: Request of the flight.
         policy: Policy in flight.
         method: ``full`` or ``lora``.
-        residual: State of the fitted residual; None before the first fit.
+        residual: State of the fitted residual, if there is one.
     """
     key = request.flight.key()
     chosen = request.setup.low_rank(policy, key) if method == "lora" else policy

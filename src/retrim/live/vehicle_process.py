@@ -68,7 +68,7 @@ def _carried(plan: PlantPlan, plant: VehiclePlant, bus: Bus, parent: Lifeline, e
         setpoint = answer(bus, tick, epoch + (tick + SHARE) * plan.dt)
         unanswered = 0 if setpoint is not None else unanswered + 1
         if setpoint is None:
-            held += 1  # without a new command the autopilot keeps the last one, up to its own time limit
+            held += 1  # without a new command the autopilot keeps the last one for as long as it permits
             if unanswered * plan.dt > ALONE and parent.gone():
                 return "nobody commands, and the supervisor is gone"
         elif setpoint.landed:
