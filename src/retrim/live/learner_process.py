@@ -64,7 +64,7 @@ class LearnerPlan:
     trust: tuple[str, ...] = ()
     """Python names that ``start`` may contain. The user passed them to the process that wrote this plan."""
     out: Path | None = None
-    """Folder for the learned state if the supervisor has ended before it wrote it; None to discard the state."""
+    """Folder for the learned state if the supervisor is gone and cannot write it; None to discard the state."""
 
 
 class LearnerLoop:
