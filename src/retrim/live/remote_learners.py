@@ -47,7 +47,7 @@ class RemoteLearners:
         return last_note(self._bus, f"ready.{layer}", "ready").get("base") == self._spec.controller.base
 
     def failed(self) -> str | None:
-        """Return why learners cannot learn: a different key, or the last output of a permanently dead one; else None."""
+        """Return why learners cannot learn: a wrong key, or the last output of a permanently dead one; else None."""
         fault = last_note(self._bus, NETWORK).get("fault", "")
         self._distrust = (self._distrust or time.monotonic()) if fault else None
         if self._distrust is not None and time.monotonic() > self._distrust + DISTRUST:
