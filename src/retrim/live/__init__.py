@@ -1,1 +1,1 @@
-"""Flight against the clock: processes for control, learning and the plant, and the bus between them."""
+"""Live flight in real time: processes for control, learning and the plant, and the bus between them."""

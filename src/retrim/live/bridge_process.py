@@ -1,4 +1,4 @@
-"""The process that carries topics between a flight and its learners on another machine."""
+"""Process that transfers topics between a flight and its learners on another machine."""
 
 import signal
 import sys
@@ -18,24 +18,27 @@ from ..transport.shared_memory import SharedMemoryBus
 from .refused_notes import NETWORK
 
 IDLE = 0.002  # [s]
-SILENCE = 10.0  # [s] without a measurement, after which a flight without a supervisor is over; an autopilot may land it
-PATIENCE = 10.0  # [s] that a network may keep the bridge waiting
-LINGER = 2.0  # [s] after its end, for that to reach the learners
+SILENCE = 10.0  # [s] without a measurement until a flight without a supervisor is over; an autopilot may still land
+PATIENCE = 10.0  # [s], longest time that the network may block the bridge
+LINGER = 2.0  # [s] after the end of the flight, so that the note about the end reaches the learners
 
 
 @dataclass(frozen=True)
 class BridgePlan:
-    """Everything that the process is started with."""
+    """Arguments of the process."""
 
     folder: Path
-    """Of the bus of the flight."""
+    """Folder of the bus of the flight."""
     address: Address
     parent: int
 
 
 def carry(plan: BridgePlan) -> None:
-    """Carry until somebody ends the process, or until a flight without a supervisor is over: its main function."""
-    signal.signal(signal.SIGTERM, _ended)  # the network is left in order all the same
+    """Run the main function of the process: transfer messages until it is terminated.
+
+    Without a supervisor it returns when the flight is over.
+    """
+    signal.signal(signal.SIGTERM, _ended)  # so that the network is closed properly in this case, too
     bus, parent = SharedMemoryBus(plan.folder), Lifeline(plan.parent)
     network = plan.address.join(dict.fromkeys((*OUT, *INTO), MOST), listen=True, writes=OUT)
     try:
@@ -43,7 +46,7 @@ def carry(plan: BridgePlan) -> None:
         bus.publish("ready.bridge", pack_note("ready"))
         said, since, told = (0, 0), time.monotonic(), (0, "")
         with Pacemaker(bus, "bridge") as heart:
-            # A vehicle that has lost its supervisor still lands, and the learners wait until they are told.
+            # A vehicle without a supervisor still lands, and the learners wait for the note about the end.
             while not (parent.gone() and time.monotonic() > since + (LINGER if said[1] else SILENCE)):
                 heart.touch(PATIENCE)
                 if not bridge.step():
@@ -52,11 +55,11 @@ def carry(plan: BridgePlan) -> None:
                 if (now := _said(bus)) != said:
                     said, since = now, time.monotonic()
     finally:
-        network.close()  # its threads would keep the process alive
+        network.close()  # otherwise its threads would keep the process alive
 
 
 def _told(bus: Bus, network: Bus, before: tuple[int, str]) -> tuple[int, str]:
-    """Tell the flight what was refused of the network, and why nobody is heard there."""
+    """Publish the number of messages refused from the network and the reason why it receives no messages."""
     now = network.refused, network.fault
     if now != before:
         bus.publish(NETWORK, pack_note(NETWORK, count=now[0], last=now[1] or "a message that was none, forged or old",
@@ -65,7 +68,7 @@ def _told(bus: Bus, network: Bus, before: tuple[int, str]) -> tuple[int, str]:
 
 
 def _said(bus: Bus) -> tuple[int, int]:
-    """Return the versions of the newest measurement and of the word that the flight is over."""
+    """Return the versions of the newest measurement and of the note that the flight is over."""
     measured, ended = bus.latest("sample"), bus.latest("ended")
     return 0 if measured is None else measured.version, 0 if ended is None else ended.version
 

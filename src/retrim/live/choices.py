@@ -1,4 +1,4 @@
-"""References that a person may choose in flight."""
+"""References that a user may select in flight."""
 
 from collections.abc import Mapping, Sequence
 
@@ -16,13 +16,13 @@ from ..tasks.shapes import REFERENCES
 
 
 def choices(setup: Setup, present: str) -> tuple[str, ...]:
-    """Return the references that a person may choose in flight, the present one first; none if it is no choice.
+    """Return the references that a user may select in flight, the present one first.
 
-    A policy that does not see its reference cannot follow another one.
+    The result is empty if the policy does not observe its reference: such a policy cannot follow another one.
 
     Args:
-        setup: What flies.
-        present: Name of what it follows.
+        setup: Set-up of the flight.
+        present: Name of the present reference.
     """
     seen = jax.tree.leaves(setup.flown.observation_in_flight, is_leaf=lambda part: isinstance(part, Reference))
     if not any(isinstance(part, Reference) for part in seen):
@@ -31,7 +31,7 @@ def choices(setup: Setup, present: str) -> tuple[str, ...]:
 
 
 def paths(names: Sequence[str], seconds: float) -> Mapping[str, np.ndarray]:
-    """Return the places that references pass in so many seconds, world [m], (n, 3), by name."""
+    """Return the positions along each reference over ``seconds``, world [m], (n, 3), by name."""
     times = jnp.arange(0.0, seconds, 0.05)
     return {name: np.asarray(_places(make_reference(name), times), dtype=float) for name in names}
 

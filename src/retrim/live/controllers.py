@@ -1,4 +1,4 @@
-"""The controller of a set-up as programs for the process that flies."""
+"""Conversion of the controller of a set-up into programs for the control process."""
 
 import hashlib
 from typing import Any
@@ -27,19 +27,19 @@ from .numpy_code import numpy_program, plain
 
 
 def flown(policy: Policy, residual: Any) -> dict[str, Any]:
-    """Return the parameters of a controller that learns, by half."""
+    """Return the parameters of a learning controller, by group: ``policy`` and ``residual``."""
     return {"policy": eqx.filter(policy, eqx.is_array), "residual": eqx.filter(residual, eqx.is_array)}
 
 
 def adaptive_source(setup: Setup, state: LearnerState) -> ControllerSource:
-    """Return the controller of a policy that adapts.
+    """Return the source of the controller of an adaptive policy.
 
     Args:
-        setup: Its preset, on the reference that is flown.
-        state: What has been learnt before the flight.
+        setup: Set-up of the policy's preset with the reference of the flight.
+        state: Learned state from before the flight.
 
     Raises:
-        ConfigError: It has an operation without a NumPy form.
+        ConfigError: The controller has an operation without a NumPy form.
     """
     policy = state.policy.policy.merged()
     parts = eqx.partition((policy, state.residual), eqx.is_array)
@@ -65,10 +65,10 @@ def adaptive_source(setup: Setup, state: LearnerState) -> ControllerSource:
 
 
 def plain_source(setup: Setup, controller: AbstractController[Any]) -> ControllerSource:
-    """Return a controller that does not learn.
+    """Return the source of a controller that does not learn.
 
     Raises:
-        ConfigError: It has an operation without a NumPy form.
+        ConfigError: The controller has an operation without a NumPy form.
     """
     half = vehicle_half(setup, controller)
     arrays, fixed = eqx.partition(controller, eqx.is_array)
@@ -84,11 +84,11 @@ def plain_source(setup: Setup, controller: AbstractController[Any]) -> Controlle
 
 
 def vehicle_half(setup: Setup, controller: AbstractController[Any]) -> dict[str, Any]:
-    """Return the parameters of the vehicle, for a controller that identifies it; nothing for another one.
+    """Return the vehicle parameters of a controller that identifies its vehicle; empty for any other controller.
 
     Args:
-        setup: Of the flight.
-        controller: What flies.
+        setup: Set-up of the flight.
+        controller: Controller of the flight.
     """
     family = make_family(setup.preset)
     if not controller.identifies or family is None:
@@ -123,7 +123,7 @@ def _source(setup: Setup, controller: Any, predicted: Any, parameters: dict[str,
         "target": numpy_program(lambda parameters, t: _on(setup, parameters).flown.target(t), parameters, t),
         "predicted": numpy_program(predicted, parameters, (x, u)),
     }
-    # in the order in which JAX takes them
+    # sorted, since JAX flattens dictionaries in the order of their keys
     named = {half: {n: plain(a) for n, a in wire.names(parameters[half]).items()} for half in sorted(parameters)}
     digest = hashlib.sha256()
     for program in programs.values():
@@ -138,7 +138,7 @@ def _on(setup: Setup, parameters: dict[str, Any]) -> Setup:
 
 
 def _arrays(memory: Any) -> Any:
-    """Return a memory; raise ``TypeError`` if it holds more than arrays, which cannot be carried in NumPy."""
+    """Return a memory; raise ``TypeError`` if it has leaves that are not arrays, which NumPy programs cannot carry."""
     if not all(eqx.is_array(leaf) for leaf in jax.tree.leaves(memory)):
         raise TypeError("a controller's memory must be a pytree of arrays to fly live")
     return memory

@@ -1,4 +1,4 @@
-"""A live flight in words."""
+"""Text display of a live flight."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -10,7 +10,7 @@ UNITS = {"steady": "m", "recovery_5cm": "s", "flight_to_swap_s": "s", "simulatio
 
 
 def live_line(status: Status) -> str:
-    """Return how a flight stands, as one line."""
+    """Return the status of a flight as one line."""
     control = status.control
     flown_by = "watchdog" if status.watchdog_flies else control.get("mode", "not started")
     versions = ", ".join(f"{half} {n}" for half, n in control.get("versions", {}).items())
@@ -21,7 +21,7 @@ def live_line(status: Status) -> str:
 
 
 def live_rows(status: Status, events: LiveEvents) -> list[tuple[str, str]]:
-    """Return how a flight stands: what, and how it is now."""
+    """Return the status of a flight as rows of label and value."""
     control = status.control
     rows: list[tuple[str, str]] = []
     rows.append(("flown by", "watchdog" if status.watchdog_flies else control.get("mode", "not started")))
@@ -41,7 +41,7 @@ def live_rows(status: Status, events: LiveEvents) -> list[tuple[str, str]]:
 
 
 def figures(rows: Sequence[dict[str, Any]]) -> tuple[tuple[str, str, str], ...]:
-    """Return figure, unit and value of each row of the results."""
+    """Return metric, unit and value of each row of the results."""
     return tuple((row["metric"], UNITS.get(row["metric"], ""), _shown(row["value"])) for row in rows)
 
 

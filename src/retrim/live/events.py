@@ -1,4 +1,4 @@
-"""What happens in a live flight, as events: each once, from reports that repeat themselves."""
+"""Events of a live flight, each generated once from periodic reports."""
 
 from collections.abc import Iterable
 
@@ -8,23 +8,23 @@ from ..onboard.pulses import SILENCE
 from ..runtime.events import Event
 from .status import Status
 
-EXCLUDED_EVERY = 5.0  # [s] between two events about excluded measurements: a window is as long
+EXCLUDED_EVERY = 5.0  # [s] between two events about excluded measurements, the length of a window
 HUNG = f"hung: it said nothing for {SILENCE:g} s and was ended"
 WITHOUT = {
     "control": "the watchdog flies, holds and lands",
     "plant": "nobody measures any more, and the flight is over",
 }
-"""What becomes of a flight without a process that is not started again."""
+"""Consequence for the flight if a process that is not restarted ends, by role."""
 WATCHDOG = "watchdog: the process that flew is gone or hangs, the watchdog flies the fallback"
 
 
 class LiveEvents:
-    """Turns the reports of a flight into events."""
+    """Converts the status reports of a flight to events."""
 
     def __init__(self) -> None:
         self.all: list[Event] = []
         self.swaps: list[tuple[float, str, int, float]] = []
-        """Time [s], half, version, and how old the flight was that it was learnt from [s]."""
+        """Time [s], parameter group, version, and age of the flight data from which it was learned [s]."""
         self._newest: dict[str, int] = {}
         self._mode, self._watchdog, self._log_failed = "policy", False, False
         self._log_moved, self._watchdog_ticks = "", 0
@@ -34,12 +34,12 @@ class LiveEvents:
         self._refused: dict[str, int] = {}
         self._knobs_refused = ""
         self._next_excluded = 0.0  # [s]
-        self._last_stage = -1.0  # [s], time of the last change that was told
+        self._last_stage = -1.0  # [s], time of the last stage change that became an event
         self._vehicle_notes: set[str] = set()
         self._identified = 0
 
     def take(self, status: Status, others: Iterable[Event] = ()) -> list[Event]:
-        """Return what is new, ``others`` included."""
+        """Return the new events, including ``others``."""
         t, control = status.t, status.control
         new = list(others)
         for at, half, version, age in control.get("swaps", []):
@@ -93,7 +93,7 @@ class LiveEvents:
         return new
 
     def _processes(self, status: Status) -> list[Event]:
-        """Return which processes hang, and which were started again."""
+        """Return events for processes that hang or were restarted."""
         new = []
         for role in sorted(status.hangs.keys() | status.restarts.keys()):
             hung = status.hangs.get(role, 0) > self._hangs.get(role, 0)

@@ -1,4 +1,4 @@
-"""One process that learns for many vehicles: what is due at an instant is learnt as one program."""
+"""Learning for many vehicles in one process: the updates due at the same time run as one program."""
 
 import hashlib
 import time
@@ -23,14 +23,14 @@ from ..runtime.fleet_learning import learn_base, learn_together, refused_by_all,
 from ..transport.bus import Bus
 from .learner_process import LearnerLoop, LearnerPlan
 
-AT_ONCE, MANY = 4, 1024  # vehicles of one program: on a CPU, on an accelerator
+AT_ONCE, MANY = 4, 1024  # vehicles per program on a CPU and on an accelerator
 
 
 class FleetLearner:
-    """The learners of many vehicles. A vehicle whose window is late is not waited for."""
+    """Learners of many vehicles. They do not wait for a vehicle whose window is late."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        """Build one without vehicles; ``clock`` tells the time [s]."""
+        """Initialise without vehicles; ``clock`` returns the time [s]."""
         self._members: dict[str, _Member] = {}
         self._clock, self._setups = clock, dict[tuple[str, str | None], Setup]()
         self._taken_back = dict[Any, int]()
@@ -41,17 +41,17 @@ class FleetLearner:
 
     @property
     def loops(self) -> dict[str, LearnerLoop]:
-        """The loops by the name of a vehicle and layer, those first that have waited longest."""
+        """Loops by name of vehicle and layer, the longest waiting first."""
         return {name: member.loop for name, member in self._members.items()}
 
     def add(self, name: str, plan: LearnerPlan, bus: Bus, wanted: Callable[[], bool] = lambda: True) -> None:
-        """Learn for one more vehicle and layer, from now on.
+        """Add a vehicle and layer to learn for.
 
         Args:
-            name: Its name.
-            plan: What to learn.
-            bus: Of the flight.
-            wanted: Asked before something is published, since who wanted it may be gone meanwhile.
+            name: Name of the vehicle and layer.
+            plan: Plan of the learner.
+            bus: Bus of the flight.
+            wanted: Called before each publication; False if the vehicle has left in the meantime.
         """
         loop = LearnerLoop(plan, bus, self._clock, self._setup_of)
         loop.catch_up()
@@ -60,11 +60,11 @@ class FleetLearner:
         self._members[name] = _Member(loop, base, wanted)
 
     def drop(self, name: str) -> None:
-        """Learn no more for it."""
+        """Stop learning for a vehicle and layer."""
         self._members.pop(name, None)
 
     def warm_up(self) -> None:
-        """Compile what the present vehicles need, however many of them are due at once."""
+        """Compile the programs of the present vehicles for each number of them that may be due at once."""
         for kind, members in self._kinds().items():
             loops = [member.loop for member in members.values()]
             for n in (1 << k for k in range(room_for(min(len(loops), self._most)).bit_length())):
@@ -79,10 +79,10 @@ class FleetLearner:
                 self._compiled.add((kind, n, len(loops) > 1))
 
     def step(self) -> int:
-        """Learn for vehicles that are due, those first that have waited longest; return for how many.
+        """Learn for the vehicles that are due, the longest waiting first; return their number.
 
-        On a CPU a few of them fill a core, and more at once would only let each wait for the others. Those that are
-        left are due in the next step, and learn from a window that is as new as that.
+        On a CPU a few vehicles fill a core. With more of them in one program, each would only wait for the others. The
+        remaining vehicles are due in the next step and learn from the window of that time.
         """
         done = 0
         for kind, members in self._kinds().items():
@@ -96,19 +96,19 @@ class FleetLearner:
             for name, update in zip(windows, updates, strict=True):
                 if members[name].wanted():
                     members[name].loop.learnt(update)
-                self._members[name] = self._members.pop(name)  # to the end
+                self._members[name] = self._members.pop(name)  # move to the end of the queue
             done += len(windows)
         return done
 
     def _learnt(self, kind: Any, loops: list[LearnerLoop], windows: list[Window]) -> list[Update]:
-        """Learn for some vehicles of a kind; low-rank policies put their deltas on a base that learns from all."""
+        """Learn for some vehicles of a kind; low-rank policies share a base that learns from all of them."""
         workers, members = [loop.worker for loop in loops], self._kinds()[kind].values()
         low_rank = _low_rank(workers)
         if not low_rank or len(members) < 2:
             return learn_together(workers, windows)
         backs = sum(member.loop.taken_back for member in members)
         if backs != self._taken_back.get(kind, backs):
-            self._bases.pop(kind, None)  # control has taken a policy back: go on from what flies
+            self._bases.pop(kind, None)  # control has rolled back a policy: continue from the policy in flight
         self._taken_back[kind] = backs
         before = self._bases.get(kind) or shared_base(low_rank[0].learner, low_rank[0].state)
         self._key, key = random.split(self._key)
@@ -118,7 +118,10 @@ class FleetLearner:
         return updates
 
     def _setup_of(self, preset: Preset, reference: str | None) -> Setup:
-        """Vehicles with the same preset and reference share a learner, so that they can be one program."""
+        """Return the set-up of a preset and a reference.
+
+        Vehicles with the same preset and reference share a learner, so that their updates can run as one program.
+        """
         key = dump(preset), reference
         if key not in self._setups:
             self._setups[key] = Setup.of(preset, reference)
@@ -133,25 +136,25 @@ class FleetLearner:
 
 
 class _Member(NamedTuple):
-    """One vehicle and layer."""
+    """Vehicle and layer."""
 
     loop: LearnerLoop
     base: str
-    """Of what is learnt as a delta."""
+    """Fingerprint of the base of a low-rank policy; empty for other policies."""
     wanted: Callable[[], bool]
 
     @property
     def kind(self) -> tuple[str, int, str]:
-        """What is one program: the layer, the learner, whose reference may change in flight, and the base."""
+        """Key of vehicles that share a program: layer, set-up, whose reference may change in flight, and base."""
         return self.loop.plan.layer, id(self.loop.setup), self.base
 
 
 def _low_rank(workers: Sequence[Worker]) -> list[PolicyWorker]:
-    """Return workers that learn a delta; those of one kind all do, or none."""
+    """Return the workers that learn a low-rank delta: either all workers of a kind or an empty list."""
     return [each for each in workers if isinstance(each, PolicyWorker) and isinstance(each.policy, LoraPolicy)]
 
 
 def fingerprint(policy: Policy) -> str:
-    """Return what tells the weights of a policy apart from others."""
+    """Return a hash that identifies the weights of a policy."""
     leaves = jax.tree.leaves(eqx.filter(policy, eqx.is_array))
     return hashlib.sha256(b"".join(np.ascontiguousarray(leaf).tobytes() for leaf in leaves)).hexdigest()[:16]

@@ -1,4 +1,4 @@
-"""The process that learns for many vehicles, which come and go while it runs."""
+"""Process that learns for many vehicles. Vehicles may join and leave while it runs."""
 
 import contextlib
 import os
@@ -23,20 +23,20 @@ from .fleet_learner import FleetLearner
 from .learner_process import CHECK_EVERY, NICE, LearnerPlan
 
 FAILED = ".failed"
-LOOK_EVERY = 0.1  # [s] for vehicles that have come or gone
+LOOK_EVERY = 0.1  # [s] between two checks for vehicles that have joined or left
 
 
 @dataclass(frozen=True)
 class FleetPlan:
-    """Everything that the process is started with."""
+    """Arguments of the process."""
 
     folder: Path
-    """A plan for each vehicle and layer, ``NAME.plan``; they come and go."""
+    """Folder of plans, ``NAME.plan``, one for each vehicle and layer; files appear and disappear during the run."""
     parent: int
 
 
 def learn_for_all(plan: FleetPlan) -> None:
-    """Learn until the parent is gone: the main function of the process."""
+    """Run the main function of the process: learn until the parent has ended."""
     with contextlib.suppress(OSError, AttributeError):
         os.nice(NICE)
     enable_compile_cache()
@@ -50,12 +50,12 @@ def learn_for_all(plan: FleetPlan) -> None:
 
 
 def _look(fleet: FleetLearner, folder: Path, done: set[str]) -> None:
-    """Take vehicles that have come, and let those go that are gone or whose flight is over.
+    """Add vehicles that have joined; drop vehicles that have left or whose flight is over.
 
     Args:
-        fleet: The learners.
-        folder: With the plans.
-        done: Names of plans that are over or cannot be followed; it grows.
+        fleet: Learners.
+        folder: Folder of the plans.
+        done: Names of plans whose flight is over or that cannot be executed. This function adds names to it.
     """
     there = {path.stem: path for path in folder.glob("*.plan")}
     done |= {name for name, loop in fleet.loops.items() if loop.bus.latest("ended") is not None}
@@ -74,7 +74,7 @@ def _look(fleet: FleetLearner, folder: Path, done: set[str]) -> None:
             done.add(name)
             print(error, file=sys.stderr, flush=True)
             there[name].with_suffix(FAILED).touch()
-        except (OSError, EOFError):  # gone again
+        except (OSError, EOFError):  # the vehicle has left again
             continue
     if not new:
         return
@@ -87,17 +87,17 @@ def _look(fleet: FleetLearner, folder: Path, done: set[str]) -> None:
 
 @dataclass
 class FleetProcess:
-    """The process of a :class:`FleetLearner`, started when the first vehicle needs it, and again if it died."""
+    """Process of a :class:`FleetLearner`. It starts with the first vehicle, and again if it died."""
 
     folder: Path
     cores: set[int] | None = None
-    """Where it may run; None for anywhere."""
+    """Allowed CPU cores; None for any core."""
     process: "subprocess.Popen[bytes] | None" = None
     count: int = 0
     lock: threading.Lock = field(default_factory=threading.Lock)
 
     def start(self, layer: str, plan: LearnerPlan, complaints: Path) -> "Seat":
-        """Have it learn for a vehicle and layer; may be called from any thread."""
+        """Start learning for a vehicle and layer. This method may be called from any thread."""
         with self.lock:
             return self._start(layer, plan, complaints)
 
@@ -113,7 +113,7 @@ class FleetProcess:
         return Seat(self.process, path)
 
     def close(self) -> None:
-        """End it."""
+        """Kill the process."""
         if self.process is not None:
             self.process.kill()
             self.process.wait()
@@ -121,18 +121,18 @@ class FleetProcess:
 
 @dataclass(frozen=True)
 class Seat:
-    """One vehicle and layer in the process of all; to a ground station it looks like a process of its own."""
+    """One vehicle and layer in the shared process; for a ground station it has the interface of a separate process."""
 
     process: "subprocess.Popen[bytes]"
     path: Path
 
     def poll(self) -> int | None:
-        """Return the exit code of the process, or 1 if it cannot follow the plan; None while it learns."""
+        """Return the exit code of the process, or 1 if it cannot execute the plan; None while it learns."""
         return 1 if self.path.with_suffix(FAILED).exists() else self.process.poll()
 
     def kill(self) -> None:
-        """Have it learn for this vehicle no more."""
+        """Stop learning for this vehicle."""
         self.path.unlink(missing_ok=True)
 
     def wait(self) -> None:
-        """Return at once: the process goes on for the others."""
+        """Return immediately, since the process continues for the other vehicles."""

@@ -1,4 +1,4 @@
-"""One live flight from the warm-up to its files."""
+"""Live flight, from the warm-up to the output files."""
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager, ExitStack, closing
@@ -34,43 +34,43 @@ from .watching import watched
 from .wishes import Wishes
 
 Display = Callable[[LiveEvents], AbstractContextManager[Callable[[Status, list[Event]], None]]]
-"""From all events so far to a context in which a function is told how the flight stands and what is new."""
+"""Function from all events so far to a context manager; its value is called with the status and the new events."""
 
 
 class LiveFlight(NamedTuple):
-    """What a live flight was."""
+    """Result of a live flight."""
 
     flight: Flight
     rows: list[dict[str, Any]]
-    """Those of ``results.json``."""
+    """Rows of ``results.json``."""
     paths: list[Path]
-    """Files that it left, those that a person looks at first."""
+    """Output files, the most interesting first."""
     request: LiveRequest
-    """The request, on all that was followed."""
+    """Request whose set-up follows the sequence of all references of the flight."""
     landed: bool
-    """Whether the vehicle came down by this flight's own doing: it was not lost, and did not crash."""
+    """Whether the vehicle landed under control of this flight, rather than being lost or crashing."""
     outlet: Outlet
-    """Where its files are, and what is missing of them."""
+    """Location of the files, with faults for missing files."""
 
 
 def fly_live(
     request: LiveRequest, run: Run, reporter: Reporter, display: Display, opened: Callable[[str], None]
 ) -> LiveFlight | None:
-    """Fly, and write what the flight leaves.
+    """Fly, and write the output files.
 
     Args:
-        request: What is asked.
-        run: Its folder, and whether somebody interrupts it.
-        reporter: Told what happens before take-off and at the end.
-        display: Shows the flight.
-        opened: Called with where the page is, once it is there.
+        request: Request of the flight.
+        run: Run with the folder of the flight and the flag for interruptions.
+        reporter: Receives messages before take-off and at the end.
+        display: Display of the flight.
+        opened: Called with the address of the page when the page is ready.
 
     Returns:
         The flight; None if it was interrupted before take-off.
 
     Raises:
-        ConfigError: The method cannot be flown live.
-        PlantError: The flight could not begin, or left no log.
+        ConfigError: The method cannot be used in a live flight.
+        PlantError: The flight could not begin, or did not write a log.
     """
     run.folder.mkdir(parents=True, exist_ok=True)
     clear_outputs(run.folder)
@@ -78,7 +78,7 @@ def fly_live(
     for old in (*run.folder.glob("*.log"), *(run.folder / name for name in names)):
         old.unlink(missing_ok=True)
     events, outlet = LiveEvents(), Outlet(run.folder)
-    with ExitStack() as screen:  # it closes last, since a terminal that stands still would keep everything else waiting
+    with ExitStack() as screen:  # it closes last, since a blocked terminal would delay everything else
         with Supervisor(replace(live_spec(request), spare=outlet.spare)) as supervisor:
             if not _warmed_up(supervisor, run, reporter):
                 return None
@@ -89,10 +89,10 @@ def fly_live(
             with closing(Wishes(request, supervisor)) as wishes:
                 status = watched(supervisor, request.seconds, events, show, run.stop, wishes)
             if request.until_stopped and status.ended == "landed":
-                run.stop.clear()  # it ended as it was meant to
+                run.stop.clear()  # this is the intended end
             start, trust = supervisor.start, supervisor.spec.trust
             learnt = learnt_in(supervisor.bus, status, start, trust) if request.method in LEARNING else None
-        if len(pieces := wishes.following.pieces) > 1:  # errors and pictures are of all that was followed
+        if len(pieces := wishes.following.pieces) > 1:  # errors and figures cover all references of the flight
             request = replace(request, setup=request.setup.on(spliced(pieces)))
         done = _written(request, run, outlet, status, events, learnt, supervisor.refused)
     reporter.say(f"flight over: {status.ended}")
@@ -103,7 +103,7 @@ def _written(
     request: LiveRequest, run: Run, outlet: Outlet, status: Status, events: LiveEvents, learnt: LearnerState | None,
     refused: dict[str, list[str]],
 ) -> LiveFlight:  # fmt: skip
-    """Write what a flight leaves, what it learnt first."""
+    """Write the output files of a flight, the learned parameters first."""
     preset, log = request.setup.preset, log_path(run.folder / "flight.csv", outlet.spare)
     try:
         flight, rows = flight_of(request, events.all, status, learnt, log)
@@ -122,14 +122,14 @@ def _written(
         run, found, seeds=[request.seed], preset=preset.name, seconds=float(flight.log.t[-1]),
         ended=status.ended, scheduling=refused, histograms_ms=histograms(rows),
     )  # fmt: skip
-    for start in run.folder.glob("start*.safetensors"):  # what learners went on from; it is in what they learnt
+    for start in run.folder.glob("start*.safetensors"):  # initial states, contained in the learned state
         start.unlink(missing_ok=True)
     paths = [*recorded, *([] if path is None else [path]), log, *complaints(run.folder)]
     return LiveFlight(flight, found, paths, request, status.ended == "landed", outlet)
 
 
 def _recorded(request: LiveRequest, rows: np.ndarray, events: LiveEvents, outlet: Outlet) -> list[Path]:
-    """Write the flight, the landing too, as NPZ and for viewers; return where the recording is that was asked for."""
+    """Write the flight, including the landing, as NPZ and for viewers; return the path of the requested recording."""
     target = np.asarray(jax.jit(jax.vmap(request.setup.flown.target))(rows[:, 1]), dtype=float)
     recording = Recording(
         rows[:, 1], rows[:, MEASURED], rows[:, TRUE], rows[:, 2], rows[:, COMMAND],
@@ -152,7 +152,7 @@ def _recorded(request: LiveRequest, rows: np.ndarray, events: LiveEvents, outlet
 
 
 def _warmed_up(supervisor: Supervisor, run: Run, reporter: Reporter) -> bool:
-    """Wait until all are ready; return whether nobody interrupted that."""
+    """Wait until all processes are ready; return False if the user interrupted the wait."""
     with reporter.progress("warming up") as advance:
         for waiting, _ in supervisor.warm_up():
             advance(0.5, f"compiling; not ready: {waiting}")

@@ -1,4 +1,4 @@
-"""What a flight follows, one reference after another: a person chooses, the vehicle goes over smoothly."""
+"""Changes of the reference in flight: the user selects a reference, and the vehicle changes to it smoothly."""
 
 from concurrent.futures import Executor, Future
 
@@ -17,22 +17,22 @@ from .session import LiveRequest
 from .status import Status
 from .supervisor import Supervisor
 
-LEAD = 0.8 * BEFORE  # [s] from a table that is sent to the transition in it
+LEAD = 0.8 * BEFORE  # [s] between the publication of a table and the start of its transition
 ATTEMPTS = 3
 TOLD = "followed"
-"""Topic of the name of what is followed."""
+"""Topic of the name of the present reference."""
 
 
 class Following:
-    """Goes over to another reference when it is asked for; tables are made beside the flight."""
+    """Changes the reference on request. It computes the tables in a separate thread."""
 
     def __init__(self, request: LiveRequest, supervisor: Supervisor, work: Executor) -> None:
-        """Build it for a flight.
+        """Initialise for a flight.
 
         Args:
-            request: Of the flight.
-            supervisor: Of its processes.
-            work: What makes tables.
+            request: Request of the flight.
+            supervisor: Supervisor of its processes.
+            work: Executor that computes the tables.
         """
         self._supervisor, self._work = supervisor, work
         self._vehicle = request.scenario.make_vehicle(request.setup.preset.vehicle)
@@ -46,10 +46,10 @@ class Following:
         self._sent: tuple[str, float, Reference] | None = None
 
     def ask(self, name: str, t: float) -> list[Event]:
-        """Begin to go over to another reference, once nothing else is on its way; return that as an event.
+        """Begin a change to another reference as soon as no other change is pending; return the events.
 
         Args:
-            name: One of the choices; what was asked for last already is not asked for again.
+            name: Name of the reference, one of the choices. Repeated requests for the same one have no effect.
             t: Time of the flight [s].
         """
         if name in self._choices:
@@ -57,7 +57,7 @@ class Following:
         return self._begun(t)
 
     def obey(self, status: Status) -> list[Event]:
-        """Send a table that has been made, and take note of one that is followed."""
+        """Publish a table that is complete, and register one that control has accepted; return the events."""
         new = list[Event]()
         if self._coming is not None and self._coming[1].done():
             (name, made), self._coming = self._coming, None
@@ -74,12 +74,12 @@ class Following:
                 self.pieces.append((at, table))
                 self._supervisor.bus.publish(TOLD, pack_note(TOLD, name=name))
                 new = [Event(at, "reference", f"it goes over to {name}")]
-            elif (t := self._now()) > at:  # it came too late to be taken
+            elif (t := self._now()) > at:  # control received it too late
                 self._sent = None
                 if self._attempts < ATTEMPTS:
                     self._make(name)
                 else:
-                    self._publish(self.pieces[-1][1], t)  # learners go back to what is flown
+                    self._publish(self.pieces[-1][1], t)  # learners return to the reference in flight
                     new = [Event(status.t, "asked", f"reference {name} cannot be followed: it was not taken")]
         return new + self._begun(status.t)
 
@@ -97,7 +97,10 @@ class Following:
         self._coming = name, self._work.submit(self._table, name)
 
     def _table(self, name: str) -> tuple[float, Reference]:
-        """Return when the transition begins, and the table; compiled before the time is taken."""
+        """Return the start of the transition and the table.
+
+        The first call compiles, so that the compile time does not shift the start.
+        """
         old, new = self.pieces[-1][1], make_reference(name)
         transition_between(old, new, 0.0, self._vehicle)
         at = self._now() + LEAD
@@ -110,9 +113,9 @@ class Following:
         return at, table
 
     def _now(self) -> float:
-        """Return the time by which the table is flown: that of control [s].
+        """Return the time of the control process, which evaluates the table [s].
 
-        A simulated plant that a busy machine holds up falls behind the wall, and control keeps to the plant.
+        On a busy machine a simulated plant falls behind wall-clock time, and control uses the time of the plant.
         """
         message = self._supervisor.bus.latest("flight")
         try:

@@ -1,4 +1,4 @@
-"""Learners on another machine than the one that flies: a ground station."""
+"""Ground station: learners on another machine than the control process."""
 
 import os
 import tempfile
@@ -26,25 +26,25 @@ from .learner_process import LearnerPlan
 from .mission import Mission
 from .spec import MAINS
 
-IDLE, SELDOM = 0.002, 0.05  # [s] between two looks at a bus, while a flight goes on and before it begins
+IDLE, SELDOM = 0.002, 0.05  # [s] between two reads of a bus, during a flight and before it
 BEAT_EVERY = TOLD_EVERY = 0.25  # [s]
-SILENCE = 5.0  # [s] without a word of the flight, after which it is told
-STARTING, ATTEMPTS = 300.0, 5  # [s] until a learner that compiles first beats; times to bring one back
+SILENCE = 5.0  # [s] without a message from the flight until this is reported
+STARTING, ATTEMPTS = 300.0, 5  # [s] for a learner to compile and send its first heartbeat; restarts per learner
 
 
 class Ground:
-    """The learners of one flight, which is elsewhere. Leaving it as a context ends them."""
+    """Learners of one flight on another machine. Exit from the context ends them."""
 
     def __init__(self, address: Address, fleet: FleetProcess | None = None, trust: tuple[str, ...] = ()) -> None:
         """Join the bus.
 
         Args:
-            address: Where the flight is.
-            fleet: The process that learns for all of several flights; None: processes of this one alone.
-            trust: Python names that the flight may name, as ``mine:task``; they are imported here.
+            address: Address of the flight.
+            fleet: Process that learns for several flights; None for separate processes for this flight.
+            trust: Python names that the flight may use, as ``mine:task``; this machine imports them.
 
         Raises:
-            ConfigError: It cannot be joined.
+            ConfigError: The bus cannot be joined.
         """
         self._network = address.join(dict.fromkeys((*OUT, *INTO), MOST), listen=False, writes=INTO)
         self._place = tempfile.TemporaryDirectory(prefix="retrim-ground-")
@@ -57,7 +57,7 @@ class Ground:
         self._bus: SharedMemoryBus | None = None
         self._bridge: Bridge | None = None
         self.carried = False
-        """Whether anything was carried in the last step; if not, there is time to sleep."""
+        """Whether the last step transferred a message; if not, the caller may sleep."""
         self._known, self._beaten, self._standing = 0, float("-inf"), "waiting for a flight"
         self._heard = (0, time.monotonic())
 
@@ -74,10 +74,10 @@ class Ground:
             self._place.cleanup()
 
     def wait(self) -> Iterator[str]:
-        """Yield how it stands until there is a flight to learn for.
+        """Yield the status until there is a flight to learn for.
 
         Raises:
-            ConfigError: Somebody is there, and has another key or none.
+            ConfigError: The other machine has a different key, or does not have a key.
         """
         while not self._look():
             if (fault := self._network.fault) and self._distrust is None:
@@ -87,9 +87,9 @@ class Ground:
             yield self._standing
 
     def learn(self) -> Iterator[str]:
-        """Learn until the flight is over; yield how it stands, after each step.
+        """Learn until the flight is over; yield the status after each step.
 
-        A flight that is not heard of any more may come back, and another one may begin.
+        A flight that has become silent may return, and another flight may begin.
         """
         while True:
             self._look()
@@ -101,13 +101,13 @@ class Ground:
                 self._standing = self._beat()
             if ended := last_note(self._bus, "ended"):
                 self._tell(over=True)
-                time.sleep(FAREWELL)  # the flight waits for that word before it takes its bridge away
+                time.sleep(FAREWELL)  # the flight keeps its bridge until it receives that message
                 yield one_line(f"flight over: {ended.get('reason', '')}")
                 return
             yield self._standing
 
     def _look(self) -> bool:
-        """Take a new mission, if there is one; return whether there is any."""
+        """Accept a new mission, if there is one; return whether there is a mission."""
         message = self._network.latest("mission", self._known)
         try:
             mission = None if message is None else Mission.unpack(message.data)
@@ -135,12 +135,12 @@ class Ground:
         return True
 
     def _begin(self, mission: Mission) -> None:
-        """Learn for a flight that is new."""
+        """Start learning for a new flight."""
         self._end()
         self._bus = SharedMemoryBus.create({**mission.capacities, **{beat_topic(x): 1024 for x in mission.layers}})
-        topics = mission.capacities  # a controller without a fitted half has no topic for it
+        topics = mission.capacities  # a controller without a residual has no topic for it
         out, into = ([topic for topic in carried if topic in topics] for carried in (OUT, INTO))
-        # The network remembers the flight before this one, whose ticks, orders and reference are foreign here.
+        # The network still holds messages of the previous flight; its ticks, orders and reference do not apply here.
         before = {} if self._bridge is None else self._bridge.known
         known = {topic: before.get(topic, 0) for topic in out}
         self._bridge = Bridge(self._network, self._bus, out=out, into=into, known=known)
@@ -150,7 +150,7 @@ class Ground:
             self._begin_with(layer)
 
     def _end(self) -> None:
-        """End the learners of a flight."""
+        """End the learners of the present flight."""
         for process in self.processes.values():
             process.kill()
             process.wait()
@@ -161,7 +161,7 @@ class Ground:
 
     def _begin_with(self, layer: Any) -> None:
         self._start(layer)
-        if self._fleet is None:  # who learns for all of several flights has no heartbeat for each
+        if self._fleet is None:  # a process that learns for several flights has no heartbeat for each of them
             self._pulses.expect(layer, STARTING)
 
     def _start(self, layer: Any) -> None:
@@ -173,7 +173,7 @@ class Ground:
             self._bus.folder, layer, start, m.reference, m.seed, m.base, os.getpid(), m.floor, self._trust
         )
         if (old := self.processes.get(layer)) is not None:
-            old.kill()  # a seat in the process of a fleet outlives that process
+            old.kill()  # a seat in the process of a fleet remains after that process has died
         complaints = self.folder / f"{layer}.log"
         if self._fleet is not None:
             self.processes[layer] = self._fleet.start(layer, plan, complaints)
@@ -181,7 +181,7 @@ class Ground:
             self.processes[layer] = launch(MAINS[layer], plan, complaints)
 
     def _beat(self) -> str:
-        """Tell the flight who is alive, bring back who is not, and return how it stands."""
+        """Report the living learners to the flight, restart dead learners, and return the status."""
         assert self._mission is not None
         failed = ""
         for layer in self._pulses.hanging([each for each in self.processes if self.processes[each].poll() is None]):
@@ -199,7 +199,7 @@ class Ground:
         return failed or self._stands()
 
     def _tell(self, failed: str = "", *, over: bool = False) -> None:
-        """Tell the flight who is alive, and whether it has been heard here that the flight is over."""
+        """Report to the flight which learners are alive, and whether the ground has received the end of the flight."""
         assert self._mission is not None
         alive = {layer: process.poll() is None for layer, process in self.processes.items()}
         note = pack_note("ground", base=self._mission.base, alive=alive, failed=failed, over=over)
@@ -229,23 +229,24 @@ def learn_for(
     told: Callable[[str], None] = lambda text: None,
     trust: tuple[str, ...] = (),
 ) -> str:
-    """Learn for flights elsewhere until all of them are over.
+    """Learn for flights on other machines until all of them are over.
 
-    One flight has processes of its own; several have one process for all, which learns for those that are due at once.
+    One flight has separate processes. Several flights share one process, which learns for all flights that are due at
+    the same time.
 
     Args:
-        addresses: Where the flights are.
-        stop: Ends it early; the flights go on with their last policies.
-        told: Receives how they stand, very often.
-        trust: Python names that a flight may name, as ``mine:task``; they are imported here.
+        addresses: Addresses of the flights.
+        stop: Ends learning early; the flights continue with their last policies.
+        told: Called with the status of the flights, at a high rate.
+        trust: Python names that a flight may use, as ``mine:task``; this machine imports them.
 
     Returns:
-        How they ended.
+        The final status of the flights.
 
     Raises:
-        ConfigError: One of the buses cannot be joined, an address is there twice, there are two rosmasters, or an
-            address is beyond this machine and there is no shared key.
-        Exception: The first of what failed, once the other flights are over.
+        ConfigError: One of the buses cannot be joined, an address occurs twice, there are two rosmasters, or an
+            address is outside this machine and there is no shared key.
+        Exception: The first failure, raised when the other flights are over.
     """
     if twice := [str(each) for i, each in enumerate(addresses) if each in addresses[:i]]:
         raise ConfigError(f"address {twice[0]} is there twice; each vehicle has its own, or a key of its own")
@@ -260,17 +261,17 @@ def learn_for(
             stack.callback(fleet.close)
         grounds = [stack.enter_context(Ground(address, fleet, trust)) for address in addresses]
         stands = dict.fromkeys(grounds, "waiting for a flight")
-        # A thread for each: a network that is slow to one vehicle keeps no other waiting.
+        # One thread for each flight, so that a slow network to one vehicle does not delay the others.
         pool = stack.enter_context(ThreadPoolExecutor(len(grounds)))
         flights = {pool.submit(_serve, ground, stands, stop): ground for ground in grounds}
         try:
             while (now := wait(flights, TOLD_EVERY)).not_done:
-                for flight in now.done:  # the others may fly for long: a failure is told while they do
+                for flight in now.done:  # report a failure immediately: the other flights may last long
                     if (error := flight.exception()) is not None:
                         stands[flights[flight]] = f"failed: {error!r}"
                 told(_summary(stands))
         except BaseException:
-            stop.set()  # the threads end, too
+            stop.set()  # so that the threads end, too
             raise
         for flight in flights:
             flight.result()
@@ -278,7 +279,7 @@ def learn_for(
 
 
 def _serve(ground: Ground, stands: dict[Ground, str], stop: threading.Event) -> None:
-    """Learn for one flight until it is over, and note how it stands."""
+    """Learn for one flight until it is over, and store its status in ``stands``."""
     for words in ground.wait():
         stands[ground] = words
         if stop.wait(SELDOM):
@@ -292,7 +293,7 @@ def _serve(ground: Ground, stands: dict[Ground, str], stop: threading.Event) -> 
 
 
 def _summary(stands: dict[Ground, str]) -> str:
-    """Return how flights stand: one in its own words, several by their addresses."""
+    """Return the status of all flights; several flights are labelled with their addresses."""
     if len(stands) == 1:
         return next(iter(stands.values()))
     return "; ".join(f"{ground.address}: {words}" for ground, words in stands.items())

@@ -1,4 +1,4 @@
-"""The process that identifies the vehicle beside a flight: rows of flight come in, the identified vehicle goes out."""
+"""Process that identifies the vehicle during a flight: it reads flight rows and publishes the identified vehicle."""
 
 import contextlib
 import time
@@ -36,39 +36,39 @@ from .states import state_of
 
 EVERY = 0.1  # [s] between two messages
 CHECK_EVERY = 0.005  # [s]
-ALLOWANCE = 5.0  # [s] that a look at the bus, with all its rows, may take
-AT_ONCE = 5 * PIECE  # rows
-SMALL = 1e-3  # a smaller change of all numbers is not published
+ALLOWANCE = 5.0  # [s], longest time for one read of the bus with all its rows
+AT_ONCE = 5 * PIECE  # rows per step
+SMALL = 1e-3  # an estimate is published only if one of its numbers changes by more than this
 
 
 @dataclass(frozen=True)
 class IdentifierPlan:
-    """Everything that the process is started with."""
+    """Arguments of the process."""
 
     folder: Path
-    """Of the bus."""
+    """Folder of the bus."""
     start: Path
     """File with the preset."""
     base: str
-    """Hash of the controller that flies."""
+    """Hash of the controller of the flight."""
     parent: int
     trust: tuple[str, ...] = ()
-    """Python names that ``start`` may hold."""
+    """Python names that ``start`` may contain."""
 
 
 class IdentifierLoop:
-    """Identification beside one flight. :meth:`step` is the whole of it."""
+    """Identification during one flight. Call :meth:`step` repeatedly."""
 
     def __init__(self, preset: Preset, base: str, bus: Bus) -> None:
-        """Build it.
+        """Initialise the loop.
 
         Args:
-            preset: Of the policy; it has a family of vehicles.
-            base: Hash of the controller that flies.
-            bus: Of the flight.
+            preset: Preset of the policy, with a family of vehicles.
+            base: Hash of the controller of the flight.
+            bus: Bus of the flight.
 
         Raises:
-            ConfigError: The preset is for one vehicle.
+            ConfigError: The preset is for a single vehicle.
         """
         family = make_family(preset)
         if family is None:
@@ -81,10 +81,10 @@ class IdentifierLoop:
         self._published: np.ndarray | None = None
         self._reports: list[tuple[float, str]] = []
         message = bus.latest(f"parameters.{VEHICLE}")
-        self._version = 0 if message is None else message.version  # of an earlier process
+        self._version = 0 if message is None else message.version  # version of an earlier process
 
     def warm_up(self) -> None:
-        """Compile what a flight needs, with rows of a vehicle that hovers; they are forgotten."""
+        """Compile the programs of the flight with rows of a hovering vehicle; the rows are then discarded."""
         row = np.zeros(len(COLUMNS))
         row[MEASURED] = np.concatenate([np.zeros(3), np.eye(3).ravel(), np.zeros(3)])
         row[COMMAND] = np.asarray(Command.hover().vector())
@@ -95,7 +95,7 @@ class IdentifierLoop:
         self._state, self._taken, self._t = None, 0, 0.0
 
     def step(self) -> bool:
-        """Take some of the rows that are new; return whether there were any."""
+        """Process some of the new rows; return whether there were any."""
         self._look()
         if not self._rows:
             return False
@@ -128,7 +128,7 @@ class IdentifierLoop:
             self._state = _estimate(self._estimator, self._state)
 
     def _conclude(self, t: float) -> None:
-        """Publish the estimate if it has changed, and report it when a report is due."""
+        """Publish the estimate if it has changed, and publish the report when it is due."""
         assert self._state is not None
         self._state = _estimate(self._estimator, self._state)
         arrays = wire.names(_vehicle(self._family, self._state))
@@ -159,7 +159,7 @@ def _vehicle(family: PathFamily, s: EstimatorState) -> VehicleEstimate:
 
 
 def identify(plan: IdentifierPlan) -> None:
-    """Identify until the flight is over: the main function of the process."""
+    """Run the main function of the process: identify until the flight is over."""
     enable_compile_cache()
     bus, parent = SharedMemoryBus(plan.folder), Lifeline(plan.parent)
     preset: Any = load_learnt(plan.start, trust=plan.trust)[1]

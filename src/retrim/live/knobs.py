@@ -1,4 +1,4 @@
-"""What a person may do to a simulated vehicle in flight: push it, blow at it, load it, weaken a rotor."""
+"""Disturbances of a simulated vehicle that the user controls in flight: push, wind, load, weak rotor and kick."""
 
 from dataclasses import dataclass
 
@@ -16,30 +16,30 @@ from ..physics.state import Command
 from ..physics.vehicle import payload_inertia
 from ..plants.plant import Measurement, Plant
 
-PUSH, WIND, LOAD, WEAKEST = 4.0, 10.0, 5.0, 0.5  # [m/s^2], [m/s] per axis; [kg]; share of its thrust
-KICK_S = 0.2  # [s], how long a kick acts
-KICK = 15.0  # [m/s^2] per axis, at most
+PUSH, WIND, LOAD, WEAKEST = 4.0, 10.0, 5.0, 0.5  # [m/s^2], [m/s] per axis; [kg]; share of the thrust
+KICK_S = 0.2  # [s], duration of a kick
+KICK = 15.0  # [m/s^2], maximum per axis
 
 
 @dataclass(frozen=True)
 class Knobs:
-    """How the knobs stand. All of it comes on top of the disturbance of the scenario."""
+    """Positions of the knobs. Their effects add to the disturbance of the scenario."""
 
     push: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """External acceleration, world [m/s^2]."""
     wind: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """World [m/s]."""
+    """Wind, world [m/s]."""
     load: float = 0.0
-    """Mass hung under the vehicle [kg]."""
+    """Mass of the payload under the vehicle [kg]."""
     rotor: float = 1.0
-    """Share of its thrust that the front-right rotor keeps."""
+    """Remaining share of the thrust of the front-right rotor."""
     kick: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Acceleration of the last kick, world [m/s^2]."""
     kicks: int = 0
-    """Kicks so far; one more is one more kick."""
+    """Number of kicks so far; an increase triggers a kick."""
 
     def __post_init__(self) -> None:
-        """Raise :class:`MessageError` for a knob that is turned too far, or nowhere."""
+        """Raise :class:`MessageError` for a knob with a value out of range or of the wrong type."""
         read_fields("knobs", vars(self))
         for name, values, bound in (("push", self.push, PUSH), ("wind", self.wind, WIND), ("kick", self.kick, KICK)):
             if not all(abs(v) <= bound for v in values):
@@ -58,7 +58,7 @@ class Knobs:
         """Read knobs.
 
         Raises:
-            MessageError: The bytes are none, or a knob is turned too far.
+            MessageError: The bytes are not knobs, or a knob is out of range.
         """
         fields = unpack_note(data, "knobs")
         try:
@@ -68,7 +68,7 @@ class Knobs:
             raise MessageError(f"knobs: {error} is missing") from error
 
     def effects(self, *, kicking: bool = False) -> ExternalEffects:
-        """Return what acts on the vehicle, with or without the kick."""
+        """Return the effects on the vehicle, with or without the kick."""
         push = np.asarray(self.push) + (np.asarray(self.kick) if kicking else 0.0)
         gain = np.array([self.rotor, 1.0, 1.0, 1.0])
         inertia = payload_inertia(self.load) if self.load > 0 else np.zeros(3)
@@ -76,19 +76,19 @@ class Knobs:
 
 
 class KnobbedPlant:
-    """A plant whose knobs are turned while it flies. What it does not know is refused, and the flight goes on."""
+    """Plant with knobs that change in flight. It rejects unsupported knobs, and the flight continues."""
 
     def __init__(self, plant: Plant, scenario: Scenario, seed: int) -> None:
-        """Build one; a plant of one's own without a method ``disturb`` has no knobs."""
+        """Initialise; a user-defined plant without a method ``disturb`` has no knobs."""
         self.refused = "" if hasattr(plant, "disturb") else "this plant has no knobs"
-        """Why the knobs were not turned last time."""
+        """Reason why the last change of the knobs was rejected; empty if it was accepted."""
         self._plant, self._possible = plant, not self.refused
         self._knobs, self._left = Knobs(), 0
         self._scenario = disturbance(scenario.disturbance, seed)
         self._turn()
 
     def turn(self, knobs: Knobs) -> None:
-        """Turn the knobs; a kick begins if there was one more than before."""
+        """Set the knobs; a kick begins if ``kicks`` has increased."""
         if knobs.kicks > self._knobs.kicks:
             self._left = round(KICK_S / self._plant.dt)
         self._knobs = knobs
@@ -97,7 +97,7 @@ class KnobbedPlant:
         self._turn()
 
     def step(self, u: Command) -> tuple[Measurement, Command]:
-        """Fly for a tick.
+        """Advance the plant by one tick.
 
         Raises:
             PlantError: The plant is lost.

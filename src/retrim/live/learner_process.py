@@ -1,4 +1,4 @@
-"""The process of one layer of learning: windows of flight come in, parameters go out."""
+"""Process of one layer of learning: it reads windows of flight and publishes parameters."""
 
 import contextlib
 import os
@@ -40,35 +40,35 @@ from .published import flown_update, keep, learnt_from, newest_update
 from .states import state_of
 
 CHECK_EVERY = 0.005  # [s]
-LOOKING, COMPUTING = 5.0, 60.0  # [s] that a look at the bus and that an update may take
-VERDICT = 1.0  # [s] that a policy waits to be taken or refused; after it, it counts as lost
+LOOKING, COMPUTING = 5.0, 60.0  # [s], longest time for a read of the bus and for an update
+VERDICT = 1.0  # [s] for control to accept or refuse a policy; after it, the policy counts as lost
 NICE = 10
-REMEMBERED = 8  # policies that were flown
+REMEMBERED = 8  # number of past policies from the flight, kept for a rollback
 
 
 @dataclass(frozen=True)
 class LearnerPlan:
-    """Everything that the process is started with."""
+    """Arguments of the process."""
 
     folder: Path
     layer: Layer
     start: Path
-    """File with what was learnt before the flight, and the preset."""
+    """File with the learned state from before the flight and the preset."""
     reference: str | None
     seed: int
     base: str
-    """Hash of the controller that flies."""
+    """Hash of the controller of the flight."""
     parent: int
     floor: int = 0
-    """Version of the policy up to which updates on the bus are older than ``start``."""
+    """Policy version; updates on the bus up to this version are older than ``start``."""
     trust: tuple[str, ...] = ()
-    """Python names that ``start`` may hold, since the user named them to the process that wrote this plan."""
+    """Python names that ``start`` may contain. The user passed them to the process that wrote this plan."""
     out: Path | None = None
-    """Where what was learnt goes if the supervisor is not there to write it; None for nowhere."""
+    """Folder for the learned state if the supervisor is gone and cannot write it; None to discard the state."""
 
 
 class LearnerLoop:
-    """One layer beside the flight. :meth:`step` is the whole of it; a test gives it a clock."""
+    """Learning loop of one layer during the flight. Call :meth:`step` repeatedly; tests pass their own clock."""
 
     def __init__(
         self,
@@ -77,13 +77,14 @@ class LearnerLoop:
         clock: Callable[[], float] = time.monotonic,
         setup_of: Callable[[Preset, str | None], Setup] = Setup.of,
     ) -> None:
-        """Build it.
+        """Initialise the loop.
 
         Args:
-            plan: What to learn.
-            bus: Of the flight.
-            clock: The time [s].
-            setup_of: Returns the set-up of a preset and a reference; loops of several vehicles may share one.
+            plan: Plan of the learner.
+            bus: Bus of the flight.
+            clock: Function that returns the time [s].
+            setup_of: Function that returns the set-up of a preset and a reference; loops of several vehicles may
+                share a set-up.
         """
         state, preset = load_learnt(plan.start, trust=plan.trust)
         self.plan, self.bus, self.state, self._clock = plan, bus, state, clock
@@ -91,34 +92,34 @@ class LearnerLoop:
         self.every = preset.adapt.fit_every if plan.layer == "residual" else preset.adapt.update_every
         self._buffer = RollingBuffer(preset.adapt.window)
         self.worker = self.new_worker()
-        """It goes on from what is flown."""
+        """Worker, which continues from the parameters in flight."""
         self._last_tick, self._new_ticks, self._began = -1, 0, float("-inf")
         self._known: dict[str, int] = {}
         self._learnt = 0
         self.taken_back = 0
-        """How often control took a policy back."""
+        """Number of times that control rolled back a policy."""
         self._pending: tuple[int, PolicyUpdate, float] | None = None
         self._flown: list[tuple[int, Update]] = []
 
     def new_worker(self) -> ResidualWorker | PolicyWorker:
-        """Return a worker that begins with what was learnt before the flight."""
+        """Return a worker that starts from the learned state before the flight."""
         if self.plan.layer == "residual":
             return ResidualWorker(self.setup.learner, self.state)
         return PolicyWorker(self.setup.learner, self.state, random.key(self.plan.seed))
 
     def warm_up(self) -> None:
-        """Compile what a flight needs; what is learnt from a made-up window is dropped."""
+        """Compile the programs of the flight on a synthetic window and discard the result."""
         self.worker.learn(self.made_up_window())
         self.worker = self.new_worker()
 
     def made_up_window(self) -> Window:
-        """Return a window of the shapes of the flight's, with one tick of hover."""
+        """Return a synthetic window with the shapes of a flight window and one tick of hover."""
         x, buffer = State.at(self.setup.flown.home()), RollingBuffer(self.setup.preset.adapt.window)
         buffer.push(0.0, x, Command.hover(x.p.dtype))
         return buffer.window()
 
     def catch_up(self) -> None:
-        """Go on from what an earlier process of this layer published and control flies."""
+        """Continue from the update in flight if an earlier process of this layer published it."""
         self._take_residual()
         if (
             self.plan.layer == "policy"
@@ -129,7 +130,7 @@ class LearnerLoop:
             self.worker.receive(found[1])
 
     def step(self) -> bool:
-        """Take what is new and learn if it is time; return whether something was learnt."""
+        """Read new messages and learn if an update is due; return whether an update was learned."""
         window = self.due()
         if window is None:
             return False
@@ -137,7 +138,7 @@ class LearnerLoop:
         return True
 
     def due(self) -> Window | None:
-        """Take what is new; return the window to learn from if it is time, else None."""
+        """Read new messages; return the window to learn from if an update is due, else None."""
         self._look()
         self._follow()
         if self.plan.layer == "policy":
@@ -150,19 +151,19 @@ class LearnerLoop:
         return self._buffer.window()
 
     def learnt(self, update: Update) -> None:
-        """Publish what was learnt from the window of :meth:`due`, if it is still wanted."""
+        """Publish an update learned from the window of :meth:`due`, if control still accepts updates."""
         self._learnt += 1
         topic, took = f"learner.{self.plan.layer}", self._clock() - self._began
         excluded = list(update.excluded if isinstance(update, ResidualUpdate) else NOTHING)
         note = pack_note(topic, learnt=self._learnt, took=took, until=update.computed_from, excluded=excluded)
         self.bus.publish(topic, note)
         if self.plan.layer == "policy" and self._judge():
-            return  # the policy that it was trained from was taken back meanwhile
+            return  # meanwhile control has rolled back the policy from which it was trained
         if self._wanted():
             self._publish(update)
 
     def _look(self) -> None:
-        """Add the ticks that are new to the window."""
+        """Add the new ticks to the window."""
         message = self._fresh("flight")
         if message is None:
             return
@@ -177,7 +178,7 @@ class LearnerLoop:
             self._last_tick, self._new_ticks = int(row[0]), self._new_ticks + 1
 
     def _follow(self) -> None:
-        """Learn on the reference that is followed, if another one is followed now."""
+        """Learn on the present reference if the flight has changed to another one."""
         followed = self.setup.followed
         if followed is None or (message := self._fresh(f"parameters.{REFERENCE}")) is None:
             return
@@ -194,7 +195,7 @@ class LearnerLoop:
             return
         topic = f"parameters.{layer}"
         before = self.bus.latest(topic)
-        known = self._status().get("newest", {}).get(layer, 0)  # a bus that is new knows less than who flies
+        known = self._status().get("newest", {}).get(layer, 0)  # a new bus lacks versions that control has received
         version = max(0 if before is None else before.version, known) + 1
         parent = self._flown[-1][0] if self._flown else 0
         whole = self._learnt_by(update)
@@ -214,7 +215,11 @@ class LearnerLoop:
         return LearnerState(self.state.policy, update.state)
 
     def _judge(self) -> bool:
-        """Go on from a policy once it is flown, and from the last that still is; return whether one was taken back."""
+        """Continue from a policy once control has accepted it, and from the last valid one after a rollback.
+
+        Returns:
+            Whether a policy was rolled back.
+        """
         status = self._status()
         given_up, back = status.get("given_up", []), False
         while self._flown and self._flown[-1][0] in given_up:
@@ -232,20 +237,24 @@ class LearnerLoop:
             self.worker.receive(update)
             self._flown, self._pending = [*self._flown[-REMEMBERED:], (version, update)], None
         elif self._clock() - published > VERDICT:
-            self._pending = None  # it was damaged on the way, or nobody takes policies any more
+            self._pending = None  # it was corrupted in transit, or control does not accept policies any more
         return back
 
     def _status(self) -> dict[str, Any]:
         return last_note(self.bus, "status")
 
     def _wanted(self) -> bool:
-        """Nobody takes what is learnt after the policy has flown; what was flown last would be lost."""
+        """Return whether control accepts updates and learning is not paused.
+
+        After the end of policy mode control does not accept updates, and a further update would displace the last one
+        that was in flight.
+        """
         return self._status().get("mode", "policy") == "policy" and not last_note(self.bus, "learning").get(
             "paused", False
         )
 
     def _take_residual(self) -> None:
-        """Take note of the newest fit, if it is new."""
+        """Pass the newest residual fit to the worker, if it is new."""
         found = newest_update(self.bus, self.state, "residual", after=self._known.get("fit", 0))
         if found is not None:
             self._known["fit"] = found[0]
@@ -259,7 +268,7 @@ class LearnerLoop:
         return message.data
 
     def leave(self, folder: Path, patience: float = 3.0) -> None:
-        """Write down what was learnt and flown last, once no policy flies any more, or after a while [s]."""
+        """Write the last learned state of the flight, once no policy is in control, or after ``patience`` [s]."""
         until = self._clock() + patience
         while self._wanted() and self.bus.latest("ended") is None and self._clock() < until:
             time.sleep(CHECK_EVERY)
@@ -275,9 +284,9 @@ def _start(state: LearnerState) -> PolicyUpdate:
 
 
 def learn(plan: LearnerPlan) -> None:
-    """Learn until the flight is over: the main function of the process."""
+    """Run the main function of the process: learn until the flight is over."""
     with contextlib.suppress(OSError, AttributeError):
-        os.nice(NICE)  # a browser or a terminal on the same machine answers before the next update is done
+        os.nice(NICE)  # so that a browser or terminal on the same machine responds before the next update is complete
     enable_compile_cache()
     bus, parent = SharedMemoryBus(plan.folder), Lifeline(plan.parent)
     loop = LearnerLoop(plan, bus)
@@ -294,6 +303,6 @@ def learn(plan: LearnerPlan) -> None:
             heart.touch(COMPUTING)
             loop.learnt(loop.worker.learn(window))
     if plan.layer == "policy" and plan.out is not None:
-        while not parent.gone(LOOKING):  # it writes down what was learnt, and ends this process
+        while not parent.gone(LOOKING):  # the supervisor writes the learned state and ends this process
             pass
         loop.leave(plan.out)

@@ -1,4 +1,4 @@
-"""What learners on another machine have to know."""
+"""Mission: description of a flight for learners on another machine."""
 
 import json
 import re
@@ -21,21 +21,21 @@ LOCAL = re.compile(r"\.(csv|toml)(:|\+|$)", re.IGNORECASE)
 
 @dataclass(frozen=True)
 class Mission:
-    """One flight, as its learners see it."""
+    """Description of one flight for its learners."""
 
     number: int
-    """It rises when the policy's learner shall start again with another start."""
+    """Number of the mission; an increase restarts the policy learner with another start."""
     reference: str | None
     seed: int
     base: str
-    """Hash of the controller that flies."""
+    """Hash of the controller of the flight."""
     layers: tuple[Layer, ...]
     floor: int
-    """Version of the policy up to which updates are older than ``start``."""
+    """Policy version; updates up to this version are older than ``start``."""
     capacities: Mapping[str, int]
     """Longest message of each topic [bytes]."""
     start: bytes
-    """File with what was learnt before the flight, and the preset."""
+    """Content of the file with the learned state from before the flight and the preset."""
 
     @classmethod
     def of(cls, number: int, reference: str | None, seed: int, base: str, layers: tuple[Layer, ...],
@@ -45,13 +45,13 @@ class Mission:
         return cls(number, reference, seed, base, layers, floor, carried, start.read_bytes())
 
     def check(self, trust: Collection[str]) -> None:
-        """Check that what is to be built names no Python code but what the user of this machine named.
+        """Check that the mission uses only Python names that the user of this machine trusts.
 
         Args:
-            trust: Python names, as ``mine:task``.
+            trust: Trusted Python names, as ``mine:task``.
 
         Raises:
-            MessageError: The file holds no learner's state, or a file of this machine is named.
+            MessageError: The file does not hold a learner state, or the mission names a file of this machine.
             ConfigError: The preset cannot be used, or a Python name is not trusted.
         """
         header = describe(self.start, kind="learnt", source="mission")
@@ -72,7 +72,7 @@ class Mission:
         """Read a mission.
 
         Raises:
-            MessageError: The bytes are none.
+            MessageError: The bytes are not a mission.
         """
         header = describe(data, kind="mission", source="mission")
         try:

@@ -1,8 +1,9 @@
-"""Any controller as NumPy source, so that the process that flies needs no JAX.
+"""Conversion of controllers to NumPy source, so that the control process does not need JAX.
 
-A controller is traced once, before take-off. Each operation of the trace becomes one line of NumPy. What no input
-reaches is computed now, what only parameters reach is computed when they change, and the rest each tick. So learned and
-classical controllers, ours and the user's own, fly in real time by the same definition that trains in JAX.
+A controller is traced once, before take-off. Each operation of the trace becomes one line of NumPy. Values that depend
+on constants only are computed during the conversion. Values that depend on parameters but not on inputs are computed
+when the parameters change. All other values are computed each tick. Learned and classical controllers, built-in or
+user-defined, thus fly in real time with the same definition that trains in JAX.
 """
 
 import re
@@ -21,12 +22,12 @@ from .primitives import EXPRESSIONS, no_form
 
 CONSTANT, PARAMETER, INPUT = range(3)
 INLINE = ("jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "remat", "checkpoint")
-LONGEST = 100  # steps of a loop
+LONGEST = 100  # maximum number of steps of a loop
 NUMBER = ".reshape(())"
-"""What makes a number of a block of one element."""
+"""Expression that converts a block of one element to a scalar."""
 BLOCK = re.compile(r"(\w+)\[(\d+:\d+(?:, \d+:\d+)*)\]")
 Ref = tuple[str, int]
-"""Name of a value in the source, and the kind of what it depends on."""
+"""Name of a value in the source, and kind of its dependency: constant, parameter or input."""
 
 
 def numpy_program(function: Callable[..., Any], parameters: Any, inputs: Any) -> ProgramSource:
@@ -34,11 +35,11 @@ def numpy_program(function: Callable[..., Any], parameters: Any, inputs: Any) ->
 
     Args:
         function: ``function(parameters, inputs)`` returns a pytree; it is traced with JAX.
-        parameters: What changes seldom; an example.
-        inputs: What is new at every call; an example.
+        parameters: Example of the parameters, which change rarely.
+        inputs: Example of the inputs, which are new at every call.
 
     Raises:
-        ConfigError: The function has an operation that has no NumPy form here.
+        ConfigError: The function has an operation without a NumPy form in this module.
     """
     closed = jax.make_jaxpr(function)(parameters, inputs)
     writer = _Writer()
@@ -49,14 +50,14 @@ def numpy_program(function: Callable[..., Any], parameters: Any, inputs: Any) ->
 
 
 def plain(value: Any) -> np.ndarray:
-    """Return a leaf as NumPy has it; a random key becomes its two words."""
+    """Return a leaf as a NumPy array; a random key becomes its two words."""
     if isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
         value = random.key_data(value)
     return np.asarray(value)
 
 
 class _Writer:
-    """Collects lines and constants."""
+    """Collects source lines and constants."""
 
     def __init__(self) -> None:
         self.constants: dict[str, Any] = {}
@@ -70,7 +71,7 @@ class _Writer:
         key = f"{array.dtype} {array.shape} {array.tobytes().hex()}"
         if key not in self._known:
             name = f"c{len(self.constants)}"
-            # Scalars of NumPy are several times faster than arrays without axes.
+            # NumPy scalars are several times faster than arrays without axes.
             self.constants[name] = self._scope[name] = array if array.ndim else array[()]
             self._known[key] = (name, CONSTANT)
         return self._known[key]
@@ -104,7 +105,7 @@ class _Writer:
     def _write(self, eqn: Any, operands: list[Ref]) -> list[Ref]:
         text = EXPRESSIONS[eqn.primitive.name](eqn, *(name for name, _ in operands))
         for name, kind in operands:
-            if text == name and not eqn.primitive.multiple_results:  # nothing happens to it
+            if text == name and not eqn.primitive.multiple_results:  # the operation returns its operand unchanged
                 return [(name, kind)]
         if not eqn.primitive.multiple_results:
             return [self._line(text, operands)]
@@ -114,7 +115,7 @@ class _Writer:
         return [self._line(f"{whole[0]}[{i}]", [whole]) for i in range(len(eqn.outvars))]
 
     def _line(self, text: str, operands: Sequence[Ref]) -> Ref:
-        """Return the name of an expression of operands; the same one is written once."""
+        """Return the name of an expression of operands; identical expressions are written once."""
         text, operands = self._number(text, operands)
         kind = max((kind for _, kind in operands), default=CONSTANT)
         if kind == CONSTANT:
@@ -125,7 +126,7 @@ class _Writer:
         return self._known[text]
 
     def _number(self, text: str, operands: Sequence[Ref]) -> tuple[str, Sequence[Ref]]:
-        """Take a number out of an array at once: scalars of NumPy are several times faster than arrays without axes."""
+        """Index an array directly: NumPy scalars are several times faster than arrays without axes."""
         name = operands[0][0] if text.endswith(NUMBER) else ""
         block = BLOCK.fullmatch(self.lines[int(name[1:])][1]) if name.startswith("v") else None
         if block is None:
@@ -134,7 +135,7 @@ class _Writer:
         return f"{array}[{starts}]", [(array, operands[0][1])]
 
     def _unrolled(self, eqn: Any, operands: list[Ref]) -> list[Ref]:
-        """Write the body of a loop of known length once for each of its steps."""
+        """Write the body of a loop of known length once for each step."""
         params = eqn.params
         length, (held, carry, taken) = params["length"], _parts(params, operands)
         if not 0 < length <= LONGEST:
@@ -148,7 +149,7 @@ class _Writer:
         return [*carry, *(self._line(f"np.stack([{', '.join(n for n, _ in c)}])", c) for c in columns)]
 
     def source(self, given: Sequence[Ref], outputs: Sequence[Ref]) -> str:
-        """Return the source of both functions, without lines that nobody needs."""
+        """Return the source of both functions, without unused lines."""
         needed, kept = {name for name, _ in outputs}, []
         for line in reversed(self.lines):
             if line[0] in needed:
@@ -174,7 +175,7 @@ class _Writer:
 
 
 def _parts(params: dict[str, Any], operands: list[Ref]) -> tuple[list[Ref], ...]:
-    """Divide what goes into a loop: what it keeps, what it carries, and what it takes a row of at each step."""
+    """Split the operands of a loop into constants, carried values, and arrays with one row per step."""
     if "ft_in" in params:  # since jax 0.11
         return tuple(list(part) for part in params["ft_in"].update(operands).unpack())
     held, carried = params["num_consts"], params["num_consts"] + params["num_carry"]

@@ -1,4 +1,4 @@
-"""The process of the page: a flight in a browser, with knobs. The flight waits for it at no time."""
+"""Process of the page, which shows a flight with knobs in a browser. It never blocks the flight."""
 
 import contextlib
 import io
@@ -32,7 +32,7 @@ from .scene import Scene
 from .spec import PageSpec
 
 RATE = 20.0  # [Hz]
-TEXT_EVERY = 5  # refreshes
+TEXT_EVERY = 5  # [refreshes]
 FLOWN_BY = {
     "policy": " (the neural policy, with what it has learnt so far)",
     "hold": " (the guard, which holds the vehicle, and lands it then)",
@@ -40,17 +40,17 @@ FLOWN_BY = {
     "blind": " (the guard, without a measurement)",
     "drop": " (the guard, which stopped the motors after two seconds without a measurement)",
 }
-"""What the names of who flies mean."""
-NO_ROTATION = 0.1  # error of R R^T, above which an attitude is not shown
-FAR = 1e6  # [m], further than anything is drawn
+"""Explanations of the names of the modes."""
+NO_ROTATION = 0.1  # largest error of R R^T with which an attitude is shown
+FAR = 1e6  # [m], limit of drawn coordinates
 
 
 @dataclass(frozen=True)
 class PagePlan:
-    """Everything that the process is started with."""
+    """Arguments of the process."""
 
     folder: Path
-    """Of the bus."""
+    """Folder of the bus."""
     page: PageSpec
     parent: int
 
@@ -59,10 +59,10 @@ HOST = re.compile(r"(?:[\w-]{1,63}\.){0,9}[\w-]{1,63}|(?=.*:)[\da-fA-F:.]{2,45}(
 
 
 def free_port(host: str, wanted: int) -> int:
-    """Return a port of ``host`` that nobody listens on: the first of ten from ``wanted`` on.
+    """Return the first free port of ``host`` among the ten ports from ``wanted`` on.
 
     Raises:
-        ConfigError: There is none, or no such address on this machine.
+        ConfigError: All ten ports are in use, or this machine does not have the address.
     """
     if not HOST.fullmatch(host):
         raise ConfigError(f"--page-host {excerpt(host)}: neither an address nor the name of a host")
@@ -77,16 +77,16 @@ def free_port(host: str, wanted: int) -> int:
 
 
 def page_address(host: str, port: int, *, demanded: bool, say: Callable[[str], None]) -> tuple[str, int] | None:
-    """Return where a page can be; None if viser is not installed and nobody demanded a page.
+    """Return host and port for a page; None if viser is not installed and the page was not requested.
 
     Args:
         host: Address to listen on.
         port: First port to try.
-        demanded: A page was asked for, it is not just the default.
-        say: Told what a person should know.
+        demanded: Whether the user requested a page explicitly, as opposed to the default.
+        say: Called with messages for the user.
 
     Raises:
-        ConfigError: There is no such port, or a page was demanded and cannot be had.
+        ConfigError: There is no such port, or a requested page is not possible.
     """
     if not 1 <= port <= 65535:
         raise ConfigError(f"--page-port {port} must be between 1 and 65535")
@@ -105,11 +105,11 @@ def page_address(host: str, port: int, *, demanded: bool, say: Callable[[str], N
 
 
 def show(plan: PagePlan) -> None:
-    """Show the flight until somebody ends the process: its main function."""
+    """Run the main function of the process: show the flight until the process is terminated."""
     import viser
 
     bus, parent, spec = SharedMemoryBus(plan.folder), Lifeline(plan.parent), plan.page
-    # It prints where it is; so do we.
+    # viser prints its address, and so does retrim: discard the output of viser.
     with contextlib.redirect_stdout(io.StringIO()), only_for(spec.token, spec.host):
         server = viser.ViserServer(host=spec.host, port=spec.port, label=f"retrim: {spec.name}", verbose=False)
     page = _Page(spec, bus, server)
@@ -120,21 +120,21 @@ def show(plan: PagePlan) -> None:
         heart.beat()
         try:
             page.refresh(text=refreshed % TEXT_EVERY == 0)
-        except Exception as error:  # the button that lands outlives whatever cannot be shown
+        except Exception as error:  # the landing button must work even if a refresh fails
             page.refuse(f"{type(error).__name__}: {error}")
         refreshed += 1
     server.stop()
 
 
 class _Page:
-    """Reads the bus for scene and panel, and writes what a person does."""
+    """Reads the bus for scene and panel, and publishes the actions of the user."""
 
     def __init__(self, spec: PageSpec, bus: Bus, server: Any) -> None:
         self._bus, self._lock = bus, threading.Lock()
         self._spec = spec
         self._refused = 0
         self._wishes = dict[str, Any]()
-        for name, value in last_note(self._bus, "wish").items():  # of a page before this one
+        for name, value in last_note(self._bus, "wish").items():  # from an earlier page process
             with contextlib.suppress(MessageError):
                 self._wishes |= self._possible({name: value})
         self._scene = Scene(server, spec.path, spec.arm, RATE)
@@ -155,7 +155,7 @@ class _Page:
         self._tick = -1
 
     def refresh(self, *, text: bool) -> None:
-        """Show what is new."""
+        """Update scene and panel from new messages."""
         status, sample = last_note(self._bus, "status"), self._sample()
         if sample is not None and sample.tick != self._tick:
             self._tick = sample.tick
@@ -187,20 +187,20 @@ class _Page:
         return {layer: note for layer, note in found.items() if note}
 
     def _knobs(self) -> Knobs:
-        """How the knobs stand."""
+        """Return the positions of the knobs."""
         message = self._bus.latest("knobs")
         with contextlib.suppress(MessageError):
             return Knobs() if message is None else Knobs.unpack(message.data)
         return Knobs()
 
     def refuse(self, why: str) -> None:
-        """Count what cannot be used, and tell it."""
+        """Count a refused input and publish the count with the reason."""
         self._refused += 1
         with contextlib.suppress(MessageError):
             self._bus.publish(PAGE, pack_note(PAGE, count=self._refused, last=plain(why)))
 
     def _turn(self, turned: Callable[[Knobs], Knobs]) -> Knobs | None:
-        """Turn knobs from how they stand, in many threads; return how they stand if they cannot be turned so."""
+        """Set knobs relative to their present positions, from any thread; return these positions if that fails."""
         with self._lock:
             before = self._knobs()
             try:
@@ -211,7 +211,7 @@ class _Page:
         return None
 
     def _wish(self, **wish: Any) -> dict[str, Any]:
-        """Ask for something; return what is asked for now, in full."""
+        """Publish a request of the user; return all present requests."""
         first = {"method": next(iter(self._spec.methods), "none"), "paused": False}
         with self._lock:
             try:
@@ -222,10 +222,10 @@ class _Page:
             return first | {"reference": next(iter(self._paths), "")} | self._wishes
 
     def _possible(self, wish: dict[str, Any]) -> dict[str, Any]:
-        """Return a wish that can be had.
+        """Return the known fields of a request, checked.
 
         Raises:
-            MessageError: It is of another type, or there is no such choice.
+            MessageError: A field has another type, or there is no such choice.
         """
         found = read_fields("wish", {name: value for name, value in wish.items() if name in FIELDS["wish"]})
         for name, there in (("method", (*self._spec.methods, "none")), ("reference", tuple(self._spec.paths))):
@@ -264,13 +264,13 @@ def _text(
 
 
 def _drawn(vector: Any) -> np.ndarray:
-    """Return a vector that can be drawn, whatever was reported."""
+    """Return a finite vector of limited size for drawing, for any reported values."""
     drawn: np.ndarray = np.clip(np.nan_to_num(np.asarray(vector, dtype=float)), -FAR, FAR)
     return drawn
 
 
 def _escaped(text: str) -> str:
-    """Return a text as Markdown shows it letter by letter, whatever markup it holds."""
+    """Return a text in which Markdown markup is escaped, so that it is shown literally."""
     return "".join(c if c.isalnum() or c in " ,.:;()'+-/%=" else f"&#{ord(c)};" for c in plain(text))
 
 

@@ -1,8 +1,8 @@
-"""Who may reach the page of a flight: whoever has the address that was printed, from that address only.
+"""Access control of the page of a flight: only users with the printed address may open it, and only by that address.
 
-Every website that is open in a browser can send requests to this machine. A request is therefore answered only if its
-path begins with a random token, its ``Host`` is the address that it has reached, and its ``Origin`` is the page itself.
-A name that a stranger points at this machine (DNS rebinding) is another ``Host``.
+Every website that is open in a browser can send requests to this machine. The server therefore answers a request only
+if its path begins with a random token, its ``Host`` is the address that it has reached, and its ``Origin`` is the page
+itself. The name of an attacker that resolves to this machine (DNS rebinding) is a different ``Host``.
 """
 
 import contextlib
@@ -17,15 +17,15 @@ from typing import Any
 from ..errors import PlantError
 
 EVERYWHERE = ("", "0.0.0.0", "::")
-"""Addresses that stand for all of this machine's."""
+"""Addresses that mean all addresses of this machine."""
 SEALED = {
-    "Referrer-Policy": "no-referrer",  # a link to elsewhere would carry the token
+    "Referrer-Policy": "no-referrer",  # otherwise a link to another site would send the token
     "Cache-Control": "no-store",
     "X-Frame-Options": "DENY",
     "Content-Security-Policy": "frame-ancestors 'none'",
     "Cross-Origin-Resource-Policy": "same-origin",
 }
-"""Headers of every answer."""
+"""Headers of every response."""
 
 
 def page_url(host: str, port: int, token: str) -> str:
@@ -36,14 +36,14 @@ def page_url(host: str, port: int, token: str) -> str:
 def refusal(
     path: str, headers: Mapping[str, tuple[str, ...]], *, token: str, host: str, local: tuple[Any, ...]
 ) -> HTTPStatus | None:
-    """Return the status with which a request is refused; None if it may pass.
+    """Return the status of the refusal of a request; None if the request is allowed.
 
     Args:
-        path: Of the request, with its query, as it came.
-        headers: All values of each header that the request has, by name in lower case.
+        path: Path of the request with its query, unmodified.
+        headers: All values of each header of the request, by name in lower case.
         token: First part of every path of the page.
         host: Address that the page listens on.
-        local: Address and port that the request has reached, as of a socket.
+        local: Address and port that the request has reached, in the format of a socket.
     """
     named, origins = headers.get("host", ()), headers.get("origin", ())
     if len(named) != 1 or named[0].lower() not in _authorities(host, local):
@@ -51,7 +51,7 @@ def refusal(
     given = path.partition("?")[0].split("/")[1:2] if path.startswith("/") else []
     if not hmac.compare_digest("".join(given).encode("utf-8", "replace"), token.encode()):
         return HTTPStatus.NOT_FOUND
-    upgrade = bool(headers.get("upgrade", ()))  # browsers say where a WebSocket comes from, always
+    upgrade = bool(headers.get("upgrade", ()))  # browsers always send the origin of a WebSocket
     if (upgrade or origins) and origins != (f"http://{named[0].lower()}",):
         return HTTPStatus.FORBIDDEN
     return None
@@ -59,16 +59,16 @@ def refusal(
 
 @contextlib.contextmanager
 def only_for(token: str, host: str) -> Iterator[None]:
-    """Have every server of websockets that starts in this context answer only requests with the token.
+    """Restrict each server of ``websockets`` that starts in this context to requests with the token.
 
-    viser serves files and WebSockets by one of them, and has no hook for who may reach it.
+    viser serves files and WebSockets with one such server and has no hook for access control.
 
     Args:
         token: First part of every path of the page.
         host: Address that the page listens on.
 
     Raises:
-        PlantError: No server has started by the end, so that nothing is known to be protected.
+        PlantError: No server has started in the context, so that the page may be unprotected.
     """
     import websockets.asyncio.server as servers
 
@@ -104,7 +104,7 @@ def only_for(token: str, host: str) -> Iterator[None]:
 
 
 def _authorities(host: str, local: tuple[Any, ...]) -> set[str]:
-    """Return how a browser may name the address that it has reached, with the port."""
+    """Return the valid ``Host`` values, with port, for an address that a browser has reached."""
     address, port = ip_address(str(local[0]).partition("%")[0]), int(local[1])
     if isinstance(address, IPv6Address) and address.ipv4_mapped is not None:
         address = address.ipv4_mapped
@@ -119,7 +119,7 @@ def _bracketed(host: str) -> str:
 
 
 def _outward() -> str:
-    """Return the address by which other machines reach this one; nothing is sent."""
+    """Return the address by which other machines reach this one, without sending a packet."""
     with contextlib.suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.connect(("192.0.2.1", 9))
         return str(probe.getsockname()[0])

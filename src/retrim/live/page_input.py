@@ -1,17 +1,17 @@
-"""What a browser may change of the page: values of its controls, and nothing else."""
+"""Input filter of the page: a browser may change only the values of its controls."""
 
 from collections.abc import Callable
 from typing import Any
 
 
 def take_values_only(server: Any, refuse: Callable[[str], None]) -> None:
-    """Have a viser server take values of controls only, and tell what else a browser sends.
+    """Restrict a viser server to changes of control values, and report any other input of a browser.
 
-    viser itself lets a browser change every property of a control, as whether it is shown.
+    By default viser lets a browser change every property of a control, for example its visibility.
 
     Args:
         server: The viser server.
-        refuse: Called with what was refused.
+        refuse: Called with a description of the refused input.
     """
     from viser._messages import GuiUpdateMessage
 

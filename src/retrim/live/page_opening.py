@@ -1,4 +1,4 @@
-"""Opens the page of a flight in a browser of this machine."""
+"""Opening of the page of a flight in a browser on this machine."""
 
 import atexit
 import contextlib
@@ -11,15 +11,17 @@ from pathlib import Path
 
 
 def open_page(url: str, folder: Path) -> None:
-    """Open a page by a file that only this user can read: everybody on a machine can read a browser's command line.
+    """Open a page through a file that only this user can read.
+
+    All users of a machine can read the command line of a browser, so the command line must not contain the token.
 
     Args:
-        url: Of the page, with its token.
-        folder: For the file, which goes when this process ends.
+        url: Address of the page, with its token.
+        folder: Folder for the file, which is removed when this process ends.
     """
     if sys.platform != "darwin" and not {"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ):
-        return  # there is no screen
-    with contextlib.suppress(OSError):  # the address was printed, too
+        return  # this machine does not have a screen
+    with contextlib.suppress(OSError):  # on failure the user can still open the printed address
         descriptor, name = tempfile.mkstemp(prefix="page-", suffix=".html", dir=folder.resolve())
         atexit.register(_remove, Path(name))
         with os.fdopen(descriptor, "w") as file:

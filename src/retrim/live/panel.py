@@ -1,4 +1,4 @@
-"""The panel of the page: how the flight stands, and what a person may change of it."""
+"""Panel of the page, with the status of the flight and its controls."""
 
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -14,7 +14,7 @@ WAITING = "Waiting for take-off."
 
 
 class Panel:
-    """Sliders, buttons and a history; what a person does with them is told at once."""
+    """Sliders, buttons and a history plot. It reports each action of the user immediately."""
 
     def __init__(
         self,
@@ -33,17 +33,17 @@ class Panel:
 
         Args:
             server: The viser server.
-            turn: Called with a function from how the knobs stand to how they shall stand; it returns how they stand if
-                they cannot be turned so.
-            wish: Called with ``method`` and ``paused``, with ``reference``, or with ``land``; it returns what is wished
-                now, which is not always what was asked for.
-            knobs: How the knobs stand.
-            wishes: What was wished before.
-            methods: Ways of learning to choose from, the present one first; none if nothing learns.
-            references: What may be followed, the first one at the beginning; none if there is no choice.
-            mass: Of the vehicle [kg].
-            rate: How often the panel is refreshed [Hz].
-            world: What flies where, in Markdown.
+            turn: Called with a function from the present to the new positions of the knobs; it returns the present
+                positions if the new ones are not possible.
+            wish: Called with ``method`` and ``paused``, with ``reference``, or with ``land``; it returns the present
+                requests, which may differ from the arguments.
+            knobs: Positions of the knobs.
+            wishes: Earlier requests.
+            methods: Available learning methods, the present one first; empty if the flight does not learn.
+            references: Available references, the initial one first; empty if there is no choice.
+            mass: Mass of the vehicle [kg].
+            rate: Refresh rate of the panel [Hz].
+            world: Description of plant and disturbance, in Markdown.
         """
         self._tell, self._wish, self._gui, self._pull = turn, wish, server.gui, np.zeros(3)
         self._setting, self._choices = False, dict[str, Any]()
@@ -92,7 +92,7 @@ class Panel:
         self._gui.add_button("Land", color="red").on_click(lambda _: wish(land=True))
 
     def pull(self, a: np.ndarray) -> None:
-        """Take note of what the mouse does: an acceleration, world [m/s^2]."""
+        """Set the acceleration of the pull with the mouse, world [m/s^2]."""
         self._pull = a
         self._turned()
 
@@ -101,17 +101,17 @@ class Panel:
         self._history.append((t, 100.0 * error, policies))
 
     def show(self, text: str) -> None:
-        """Refresh what is shown: the history, and how the flight stands in Markdown."""
+        """Refresh the history plot and the status text, which is in Markdown."""
         self._text.content = text
         if len(self._history) > 1:
             t, error, policies = np.array(self._history).T
             top = max(1.0, 1.1 * error.max())
-            marks = np.where(np.append(False, np.diff(policies) > 0), error, -10.0 * top)  # not there: far below
+            marks = np.where(np.append(False, np.diff(policies) > 0), error, -10.0 * top)  # others: below the axis
             self._plot.scales = _scales((t[0], t[-1]), top)
             self._plot.data = (t, error, marks)
 
     def _choose(self, *names: str) -> None:
-        """Wish for what the controls of some names say, and let them say what is wished."""
+        """Publish the values of some controls as requests, and set the controls to the resulting requests."""
         if self._setting:
             return
         before = {name: self._choices[name].value for name in names}
@@ -119,7 +119,7 @@ class Panel:
         self._set(*((self._choices[name], wished[name]) for name in names))
 
     def _set(self, *values: tuple[Any, Any]) -> None:
-        """Let controls say what stands; nothing is told of that."""
+        """Set values of controls without reporting them as actions of the user."""
         self._setting = True
         try:
             for control, value in values:
@@ -176,7 +176,7 @@ def _history_plot(gui: Any) -> Any:
 
 
 def _scales(span: tuple[float, float], top: float) -> dict[str, Any]:
-    """Ranges of the axes."""
+    """Return the ranges of the axes."""
     from viser import uplot
 
     return {

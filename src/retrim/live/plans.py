@@ -1,4 +1,4 @@
-"""What each process of a live flight is started with."""
+"""Plans of the processes of a live flight."""
 
 import os
 from pathlib import Path
@@ -22,13 +22,13 @@ def plan_of(role: str, spec: LiveSpec, start: Path, floor: int, bus: Path, cores
     """Return the plan of a role.
 
     Args:
-        role: Name.
-        spec: Of the flight.
-        start: File with what learners go on from.
-        floor: Version of the policy up to which updates are older than it.
+        role: Name of the role.
+        spec: Specification of the flight.
+        start: File with the initial state of the learners.
+        floor: Policy version; updates up to this version are older than ``start``.
         bus: Folder of the bus.
-        cores: Those of the processes that must be on time.
-        control: The process that flies, once it runs.
+        cores: CPU cores of the processes with real-time requirements.
+        control: Process identifier of the control process; 0 before it runs.
     """
     s, parent = spec, os.getpid()
     if role == "control":

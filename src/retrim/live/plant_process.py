@@ -1,4 +1,4 @@
-"""The process of a simulated plant: it keeps wall-clock time, as a vehicle does."""
+"""Process of a simulated plant. It runs in wall-clock time, as a vehicle does."""
 
 import contextlib
 import time
@@ -25,21 +25,21 @@ from ..transport.shared_memory import SharedMemoryBus
 from .knobs import KnobbedPlant, Knobs
 from .states import state_of, vector_of
 
-ALONE = 5.0  # [s] without a command, after which a plant without a supervisor ends
+ALONE = 5.0  # [s] without a command until a plant without a supervisor ends
 CRASHED = "crashed"
-"""Why a flight ended that nobody landed."""
+"""Reason for the end of a flight without a landing."""
 
 
 @dataclass(frozen=True)
 class PlantPlan:
-    """Everything that the process is started with."""
+    """Arguments of the process."""
 
     folder: Path
     scenario: Scenario
     vehicle: Any
-    """Vehicle that the policy was trained for: a name or a specification."""
+    """Vehicle of the training: a name or a specification."""
     x0: np.ndarray
-    """Start: p, R by rows, v."""
+    """Initial state: p, R by rows, v."""
     dt: float
     seed: int
     cores: frozenset[int]
@@ -48,15 +48,15 @@ class PlantPlan:
 
 
 def simulate(plan: PlantPlan) -> None:
-    """Fly until the vehicle has landed: the main function of the process."""
-    jax.config.update("jax_cpu_enable_async_dispatch", False)  # a tick is computed here and now, by no pool of threads
+    """Run the main function of the process: simulate until the vehicle has landed."""
+    jax.config.update("jax_cpu_enable_async_dispatch", False)  # compute each tick synchronously, without a thread pool
     enable_compile_cache()
     bus, parent = SharedMemoryBus(plan.folder), Lifeline(plan.parent)
     x0 = state_of(plan.x0, jnp.zeros(0).dtype)
     try:
         with plan.scenario.make(plan.vehicle, dt=plan.dt, seed=plan.seed) as plant:
             knobbed = KnobbedPlant(plant, plan.scenario, plan.seed)
-            for load in (0.0, 0.01):  # every program compiled, and run
+            for load in (0.0, 0.01):  # compile and run every program
                 plant.reset(x0)
                 knobbed.turn(Knobs(load=load))
                 for _ in range(5):
@@ -77,7 +77,7 @@ def simulate(plan: PlantPlan) -> None:
 def _flown(
     plan: PlantPlan, plant: KnobbedPlant, bus: Bus, parent: Lifeline, measurement: Measurement, epoch: float
 ) -> str:
-    """Fly, and return why the flight ended."""
+    """Simulate the flight; return the reason for its end."""
     tick, late, held, unanswered, turned = 0, 0, 0, 0, 0
     u = accepted = as_numpy(Command.hover()).astype(float)
     while True:
@@ -98,7 +98,7 @@ def _flown(
         setpoint = answer(bus, tick, epoch + (tick + SHARE) * plan.dt)
         unanswered = 0 if setpoint is not None else unanswered + 1
         if setpoint is None:
-            held += 1  # a vehicle goes on with the last one, too
+            held += 1  # a vehicle also keeps the last command
             if unanswered * plan.dt > ALONE and parent.gone():
                 return "nobody commands, and the supervisor is gone"
         elif setpoint.landed:
@@ -115,13 +115,13 @@ def _flown(
         behind = time.monotonic() - (epoch + tick * plan.dt)
         if behind > 0:
             late += 1
-            epoch += max(0.0, behind - plan.dt)  # the world waits rather than jump
+            epoch += max(0.0, behind - plan.dt)  # the simulation falls behind rather than skip time
         if tick % 25 == 0:
             bus.publish("world", pack_note("world", late=late, held=held, knobs_refused=plant.refused))
 
 
 def answer(bus: Bus, tick: int, until: float) -> Setpoint | None:
-    """Return the answer to a sample, or the fallback's, if there is one in time."""
+    """Return the setpoint of control or fallback for a sample; None if it does not arrive before ``until`` [s]."""
     while True:
         for topic in ("setpoint", "fallback"):
             message = bus.latest(topic)

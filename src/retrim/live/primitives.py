@@ -1,4 +1,7 @@
-"""NumPy expressions for the operations of a trace, by name: functions of the equation and the names of its operands."""
+"""NumPy expressions for the operations of a trace, by name.
+
+Each expression is a function of the equation and the names of its operands.
+"""
 
 from collections.abc import Callable
 from typing import Any
@@ -14,7 +17,7 @@ Expression = Callable[..., str]
 
 
 def no_form(operation: str) -> ConfigError:
-    """Return the error of a controller with an operation that cannot be written."""
+    """Return the error for an operation without a NumPy form."""
     return ConfigError(f"{operation} in this controller has no NumPy form, so it cannot fly live")
 
 
@@ -44,15 +47,16 @@ def _reduced(ufunc: str) -> Expression:
         axes, dtype = tuple(eqn.params["axes"]), np.dtype(eqn.outvars[0].aval.dtype)
         if ufunc.startswith("logical") and dtype.kind != "b":
             raise no_form("a bitwise reduction")
-        whole = f", dtype={dtype.name!r}" if ufunc in ("add", "multiply") and dtype.kind in "iu" else ""  # it wraps
-        # the ufunc's own method: half of the time of NumPy's function
+        # integers must wrap on overflow
+        whole = f", dtype={dtype.name!r}" if ufunc in ("add", "multiply") and dtype.kind in "iu" else ""
+        # the method of the ufunc takes half the time of the NumPy function
         return f"np.{ufunc}.reduce({x}, {axes[0] if len(axes) == 1 else axes}{whole})"
 
     return expression
 
 
 def _stack(eqn: Any, *xs: str) -> str:
-    if eqn.params["axis"] == 0 and not _is_key(eqn.invars[0]):  # a quarter of the time of np.stack
+    if eqn.params["axis"] == 0 and not _is_key(eqn.invars[0]):  # takes a quarter of the time of np.stack
         return f"np.array(({', '.join(xs)},), {np.dtype(eqn.outvars[0].aval.dtype).name!r})"
     return f"np.stack(({', '.join(xs)},), axis={eqn.params['axis']})"
 
@@ -106,7 +110,7 @@ def _select(eqn: Any, which: str, *cases: str) -> str:
     if len(set(cases)) == 1:
         return cases[0]
     if len(cases) == 2 and eqn.invars[0].aval.dtype == bool:
-        if not eqn.invars[0].aval.ndim:  # a fortieth of the time of np.where
+        if not eqn.invars[0].aval.ndim:  # takes a fortieth of the time of np.where
             return f"({cases[1]} if {which} else {cases[0]})"
         return f"np.where({which}, {cases[1]}, {cases[0]})"
     return f"np.choose({which}, ({', '.join(cases)},))"
@@ -145,7 +149,7 @@ def _gather(eqn: Any, x: str, at: str) -> str:
     axes = (d.offset_dims, d.collapsed_slice_dims, d.start_index_map, eqn.params["slice_sizes"])
     mode = GatherScatterMode.from_any(eqn.params["mode"])
     value, shown = eqn.params["fill_value"], ""
-    if mode == fill and value is not None:  # a float's own text may be "nan", which is no name
+    if mode == fill and value is not None:  # the text of a float may be "nan", which is not a name
         value = np.asarray(value).item()
         shown = f", value=float({str(value)!r})" if isinstance(value, float) else f", value={value}"
     return f"lax.gather({x}, {at}, {', '.join(str(tuple(each)) for each in axes)}, fill={mode == fill}{shown})"

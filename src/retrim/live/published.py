@@ -1,6 +1,7 @@
-"""What learners keep on the bus beside parameters: whole updates, with optimiser states, to go on from.
+"""Full updates, including optimiser states, which learners publish on the bus in addition to parameters.
 
-Two versions of each layer stay: the last one, and the newest one that is flown.
+A restarted learner continues from such an update. The bus keeps two versions of each layer: the last one, and the
+newest one in flight.
 """
 
 import contextlib
@@ -13,18 +14,20 @@ from ..errors import MessageError
 from ..onboard.topics import LAYERS, SLOTS, slot
 from ..transport.bus import Bus, Message
 
-PREFIX = 8  # bytes of the version before an update
+PREFIX = 8  # [bytes], length of the version in front of an update
 
 
 def keep(bus: Bus, layer: str, version: int, update: Update, status: dict[str, Any]) -> None:
-    """Publish an update in place of the one before the last, but never of the one that is flown: nobody may take it.
+    """Publish an update in place of the one before the last, but never in place of the one in flight.
+
+    The update in flight must remain, since control may not accept the new one.
 
     Args:
-        bus: Where it is published.
-        layer: Which one.
-        version: Of the update.
-        update: What to keep.
-        status: Last report of the process that flies.
+        bus: Bus of the flight.
+        layer: Layer of the update.
+        version: Version of the update.
+        update: Update to publish.
+        status: Last status of the control process.
     """
     held = [_version(bus.latest(slot(layer, i))) for i in range(SLOTS)]
     place, flown = version % SLOTS, max(filter(_flies(layer, status), held), default=0)
@@ -39,24 +42,24 @@ def newest_update(bus: Bus, state: LearnerState, layer: str, after: int = 0) -> 
 
 
 def flown_update(bus: Bus, state: LearnerState, layer: str, status: dict[str, Any]) -> tuple[int, Update] | None:
-    """Return the newest update of a layer that is flown, with its version; None if there is none any more.
+    """Return the newest update of a layer in flight, with its version; None if it is not on the bus.
 
     Args:
-        bus: Where updates are published.
-        state: What they should look like.
-        layer: Which one.
-        status: Last report of the process that flies.
+        bus: Bus of the flight.
+        state: State with the expected structure.
+        layer: Layer of the update.
+        status: Last status of the control process.
     """
     return _newest(bus, state, layer, _flies(layer, status))
 
 
 def learnt_from(bus: Bus, state: LearnerState, status: dict[str, Any]) -> LearnerState | None:
-    """Return what was learnt and flown last; None if nothing was.
+    """Return the last learned state that was in flight; None if no update was in flight.
 
     Args:
-        bus: Of the flight.
-        state: What the learners went on from.
-        status: Last report of the process that flies.
+        bus: Bus of the flight.
+        state: Initial state of the learners.
+        status: Last status of the control process.
     """
     fit, policy = (flown_update(bus, state, layer, status) for layer in LAYERS)
     found = state
@@ -68,7 +71,7 @@ def learnt_from(bus: Bus, state: LearnerState, status: dict[str, Any]) -> Learne
 
 
 def _flies(layer: str, status: dict[str, Any]) -> Callable[[int], bool]:
-    """Return what tells whether a version has taken over and was not taken back."""
+    """Return a function that checks whether control has accepted a version and has not rolled it back."""
     newest = status.get("newest", {}).get(layer, 0)
     given_up = status.get("given_up", []) if layer == "policy" else []
     return lambda version: version <= newest and version not in given_up

@@ -1,4 +1,4 @@
-"""Notes between processes that are none: counted, and told now and then instead of each time."""
+"""Invalid notes between processes, which are counted and reported at intervals rather than each time."""
 
 from collections.abc import Iterable
 
@@ -8,28 +8,28 @@ from ..transport.bus import Bus
 
 NOTES = ("airborne", "beat.", "ended", "followed", "ground", "knobs", "learner.", "learning", "order", "ready.",
          "refusals.", "stalls", "status", "wish", "world")  # fmt: skip
-"""Topics of notes, or how their names begin."""
+"""Topics of notes, or prefixes of their names."""
 PAGE, NETWORK = "refusals.page", "refusals.network"
-"""Topics of what the page has refused of a browser, and the bridge of the network."""
+"""Topics of refusals: of browser inputs by the page, and of network messages by the bridge."""
 
 
 class RefusedNotes:
-    """Looks at each new note of a bus once. Who reads a note ignores one that is refused here, too."""
+    """Checks each new note of a bus once. Readers of notes also ignore the notes that are refused here."""
 
     def __init__(self, bus: Bus, topics: Iterable[str]) -> None:
-        """Begin to look.
+        """Initialise for a bus.
 
         Args:
-            bus: Of the flight.
-            topics: Of the bus; those that are no notes are left out.
+            bus: Bus of the flight.
+            topics: Topics of the bus; topics without notes are left out.
         """
         self.count = 0
-        """Notes and inputs that were refused so far."""
+        """Number of refused notes and inputs so far."""
         self._bus, self._known = bus, {topic: 0 for topic in topics if topic.startswith(NOTES)}
         self._refused, self._told_so_far = dict.fromkeys(self._known, 0), dict[str, int]()
 
     def look(self) -> list[str]:
-        """Return what has been refused since the last look, in words; a topic is told 1, 10, 100 times and so on."""
+        """Return lines about new refusals; a topic is reported at its 1st, 10th, 100th refusal and so on."""
         said = []
         for topic, known in self._known.items():
             message = self._bus.latest(topic, known)
@@ -45,11 +45,11 @@ class RefusedNotes:
         return said
 
     def _told(self, topic: str) -> list[str]:
-        """Count what a process has refused by itself."""
+        """Count the refusals that a process has published."""
         note = last_note(self._bus, topic)
         before, now = self._told_so_far.get(topic, 0), note.get("count", 0)
         self._told_so_far[topic] = now
-        more = now - before if now >= before else now  # the process was started again
+        more = now - before if now >= before else now  # the process was restarted
         return self._count(topic, more, note.get("last", "")) if more else []
 
     def _count(self, topic: str, more: int, why: str) -> list[str]:

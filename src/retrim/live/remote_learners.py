@@ -1,4 +1,4 @@
-"""Learners on another machine, as the flight sees them."""
+"""Interface of the flight to learners on another machine."""
 
 import time
 from pathlib import Path
@@ -11,21 +11,21 @@ from .refused_notes import NETWORK
 from .spec import LiveSpec
 from .topics import topics
 
-LOST = 2.0  # [s] without a word
-PARTING = 5.0  # [s] in which they may say that they have heard of the end
+LOST = 2.0  # [s] without a message until learners count as lost
+PARTING = 5.0  # [s], time limit for the learners to confirm the end of the flight
 
 
 class RemoteLearners:
-    """Tells them what to learn for, and knows which of them live."""
+    """Publishes missions for remote learners and monitors which learners are alive."""
 
     def __init__(self, spec: LiveSpec, bus: Bus) -> None:
-        """Build it for a flight and its bus."""
+        """Initialise for a flight and its bus."""
         self._spec, self._bus = spec, bus
         self._missions, self._beat = 0, (0, 0.0)
         self._distrust: float | None = None
 
     def announce(self, start: Path) -> None:
-        """Publish what they have to know; the policy's learner starts again from ``start``."""
+        """Publish a new mission; the policy learner restarts from ``start``."""
         s, self._missions = self._spec, self._missions + 1
         message = self._bus.latest("parameters.policy")
         floor = 0 if message is None else message.version
@@ -33,7 +33,7 @@ class RemoteLearners:
         self._bus.publish("mission", mission.pack())
 
     def alive(self) -> dict[str, bool]:
-        """Return which learners live, by what their machine said last."""
+        """Return for each learner whether it is alive, from the last message of its machine."""
         message, said = self._bus.latest("ground"), None
         if message is not None:
             if message.version != self._beat[0]:
@@ -43,11 +43,11 @@ class RemoteLearners:
         return {layer: fresh and isinstance(said, dict) and bool(said.get(layer)) for layer in self._spec.layers}
 
     def ready(self, layer: str) -> bool:
-        """Return whether a learner is ready for this flight, and not for an earlier one."""
+        """Return whether a learner is ready for this flight, rather than for an earlier one."""
         return last_note(self._bus, f"ready.{layer}", "ready").get("base") == self._spec.controller.base
 
     def failed(self) -> str | None:
-        """Return why learners cannot learn: another key, or the last words of one that died for good; else None."""
+        """Return why learners cannot learn: a wrong key, or the last output of a permanently dead one; else None."""
         fault = last_note(self._bus, NETWORK).get("fault", "")
         self._distrust = (self._distrust or time.monotonic()) if fault else None
         if self._distrust is not None and time.monotonic() > self._distrust + DISTRUST:
@@ -59,12 +59,12 @@ class RemoteLearners:
         return words
 
     def part(self) -> None:
-        """Wait until they have heard of the end, which they wait for, or are gone."""
+        """Wait until the learners confirm the end of the flight, or are gone; they run until they receive the end."""
         base, began = self._spec.controller.base, time.monotonic()
         while (waited := time.monotonic() - began) < PARTING:
             said = last_note(self._bus, "ground")
             if said.get("over") and said.get("base") == base:
                 return
-            if waited > FAREWELL and not any(self.alive().values()):  # what they said last may be on its way
+            if waited > FAREWELL and not any(self.alive().values()):  # their last message may be in transit
                 return
             time.sleep(0.02)

@@ -1,4 +1,4 @@
-"""What a live flight leaves: a log in the form of all others, errors, and the accounts of its deadlines."""
+"""Results of a live flight: a log in the common format, errors, and deadline statistics."""
 
 from collections.abc import Collection, Sequence
 from pathlib import Path
@@ -26,28 +26,28 @@ from .published import learnt_from
 from .session import LiveRequest
 from .status import Status
 
-GAP_S = 0.5  # [s] of a log that may be missing: a machine that stands still sends nothing
+GAP_S = 0.5  # [s], allowed gap in a log, since a stalled machine does not send messages
 
 
 def flight_of(
     request: LiveRequest, events: Sequence[Event], status: Status, learnt: LearnerState | None, path: Path
 ) -> tuple[Flight, np.ndarray]:
-    """Return the flight that a log holds, up to its landing, and the rows of the log.
+    """Return the flight from a log, up to its landing, and the rows of the log.
 
     Args:
-        request: What was flown.
-        events: What happened.
-        status: The last one.
-        learnt: What the learners knew at the end.
-        path: The log.
+        request: Request of the flight.
+        events: Events of the flight.
+        status: Last status.
+        learnt: Learned state at the end.
+        path: Path of the log.
 
     Raises:
-        PlantError: The log holds no flight.
+        PlantError: The log does not contain a flight.
     """
     rows = read_log(path)
     dt = request.setup.preset.dt
     shown = rows[(rows[:, 1] < request.seconds - 0.5 * dt) & measured(rows)]
-    if status.control.get("reason") == "landing":  # as ordered: what follows is not the policy's
+    if status.control.get("reason") == "landing":  # ordered landing: exclude the ticks after the policy
         by_policy = np.flatnonzero(shown[:, -1] == Mode.POLICY)
         shown = shown[: by_policy[-1] + 1] if len(by_policy) else shown[:0]
     if len(shown) < 2:
@@ -69,19 +69,19 @@ def flight_of(
 def results(
     request: LiveRequest, flight: Flight, rows: np.ndarray, status: Status, events: LiveEvents
 ) -> list[dict[str, Any]]:
-    """Return the rows of ``results.json``; nothing of the landing counts.
+    """Return the rows of ``results.json``, which exclude the landing.
 
     Args:
-        request: What was flown.
-        flight: How.
-        rows: All of its log, the landing too.
-        status: The last one.
-        events: What happened.
+        request: Request of the flight.
+        flight: Flight, up to its landing.
+        rows: All rows of the log, including the landing.
+        status: Last status.
+        events: Events of the flight.
     """
     scenario, log = request.scenario, flight.log
     end = float(log.t[-1])
     changes = change_times(scenario.disturbance, request.setup.flown.home(), end)
-    # The state of a crash may be none that is written down.
+    # The log may lack the state of a crash.
     lost = (status.ended or "").startswith((CRASHED, STOPPED)) and status.control.get("reason") != "landing"
     crashed = log.terminated or lost
     back = recoveries(log.t, flight.error, changes, 0.05, terminated=crashed)
@@ -113,7 +113,7 @@ def results(
 
 
 def _stalls(status: Status, dt: float) -> dict[str, Any]:
-    """When the machine stood still, and how many ticks were missed then; None where nobody could tell."""
+    """Return statistics of stalls of the machine and the ticks missed in them, or null values without stall reports."""
     seen = status.stalls
     if not seen:
         return dict.fromkeys(("missed_in_stalls", "stalls", "stall_max_ms"))
@@ -122,16 +122,16 @@ def _stalls(status: Status, dt: float) -> dict[str, Any]:
 
 
 def missing(rows: np.ndarray, status: Status, dt: float) -> list[str]:
-    """Return which part of a flight its log does not hold, in a line; none if it holds all that was flown.
+    """Return one line about the part of a flight that its log lacks; an empty list if the log is complete.
 
     Args:
-        rows: All of the log.
-        status: The last one.
+        rows: All rows of the log.
+        status: Last status.
         dt: Control tick [s].
     """
     ticks = np.concatenate([[-1], rows[:, 0], [max(status.ticks, rows[-1, 0] + 1 if len(rows) else 0)]])
     gaps = np.diff(ticks) - 1
-    missed = max((int(n) for *_, n in status.control.get("gaps", [])), default=0)  # nobody flew those
+    missed = max((int(n) for *_, n in status.control.get("gaps", [])), default=0)  # control missed these ticks
     if gaps.max() <= missed + GAP_S / dt:
         return []
     at = int(np.argmax(gaps))
@@ -141,7 +141,7 @@ def missing(rows: np.ndarray, status: Status, dt: float) -> list[str]:
 
 
 def histograms(rows: np.ndarray) -> dict[str, Any]:
-    """Return how late steps began and how long they took, as histograms [ms]."""
+    """Return histograms of the lateness, duration and idle time of control steps [ms]."""
     flown = rows[accounted(rows)]
     return {"edges_ms": list(EDGES_MS)} | {
         name: summary(flown[:, ACCOUNTS[name]])["histogram"] for name in ("lateness", "step", "idle")
@@ -157,19 +157,19 @@ def _finite(value: Any) -> Any:
 
 
 def learnt_in(bus: Bus, status: Status, start: Path, trust: Collection[str] = ()) -> LearnerState | None:
-    """Return what was learnt and flown last; None if nothing was.
+    """Return the last learned state that was in flight; None if no update was in flight.
 
     Args:
-        bus: Of the flight.
-        status: How it stands.
-        start: File with what the learners went on from.
-        trust: Python names that it may hold.
+        bus: Bus of the flight.
+        status: Present status.
+        start: File with the initial state of the learners.
+        trust: Python names that the file may contain.
     """
     return learnt_from(bus, load_learnt(start, trust=trust)[0], status.control)
 
 
 def complaints(folder: Path) -> list[Path]:
-    """Return the files with what processes wrote to their standard outputs; those that are empty are removed."""
+    """Return the files with the standard output and error of the processes; remove empty files."""
     found = sorted(folder.glob("*.log"))
     for path in found:
         if not path.stat().st_size:

@@ -1,4 +1,4 @@
-"""The vehicle and what acts on it, in three dimensions."""
+"""Three-dimensional scene with the vehicle and the disturbances on it."""
 
 from collections import deque
 from collections.abc import Callable
@@ -7,26 +7,27 @@ from typing import Any
 import numpy as np
 
 RED, BLUE, GREY, GREEN, DARK = (214, 69, 65), (48, 112, 214), (150, 150, 150), (60, 160, 90), (45, 45, 50)
-METRES = 0.25  # of an arrow, for each m/s^2
-ROPE = 5.0  # [1/s^2], acceleration for each metre that the hand is away
+METRES = 0.25  # [m per m/s^2], length of arrows
+ROPE = 5.0  # [1/s^2], acceleration per metre between grip and hand
 TRAIL_S = 6.0  # [s]
 FORWARD = np.array([[1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, 1.0]])
-"""Where rotors are, x forward and y left: front-right, back-left, back-right, front-left."""
+"""Directions of the rotors, x forward and y left: front-right, back-left, back-right, front-left."""
 
 
 class Scene:
-    """Vehicle, trail, reference and arrows; each is sent once and then moved."""
+    """Vehicle, trail, reference and arrows. Each object is sent to the browser once and then moved."""
 
     def __init__(self, server: Any, path: np.ndarray, arm: float, rate: float) -> None:
         """Build the scene.
 
         Args:
             server: The viser server.
-            path: Places that the reference passes, world [m], (n, 3).
-            arm: From the centre of the vehicle to a rotor [m].
-            rate: How often the scene is moved [Hz].
+            path: Positions along the reference, world [m], (n, 3).
+            arm: Distance from the centre of the vehicle to a rotor [m].
+            rate: Update rate of the scene [Hz].
         """
-        server.scene.configure_default_lights(cast_shadow=False)  # a sixth of the time to the page, drawn by software
+        # Without shadows the page appears in a sixth of the time in software rendering.
+        server.scene.configure_default_lights(cast_shadow=False)
         self._scene, self._trail = server.scene, deque[np.ndarray](maxlen=round(TRAIL_S * rate))
         middle, size = path.mean(0), float(np.ptp(path, axis=0).max())
         server.initial_camera.position = tuple(middle + (1.3 + size) * np.array([-0.8, -0.7, 0.35]))
@@ -54,12 +55,12 @@ class Scene:
         }
 
     def on_pull(self, pull: Callable[[np.ndarray], None]) -> None:
-        """Call ``pull`` with an acceleration, world [m/s^2], as somebody pulls the vehicle; zero at the end."""
+        """Call ``pull`` with an acceleration, world [m/s^2], while the user pulls the vehicle; zero at the end."""
 
-        async def dragged(event: Any) -> None:  # the server calls only coroutines in order
+        async def dragged(event: Any) -> None:  # the server preserves the order of calls for coroutines only
             grip, hand = (np.asarray(place, dtype=float) for place in (event.start_position, event.end_position))
             over = event.phase == "end" or grip.shape != (3,) or hand.shape != (3,)
-            if over or not np.isfinite([grip, hand]).all():  # whatever a browser sends, a pull ends
+            if over or not np.isfinite([grip, hand]).all():  # a pull must end for any message of a browser
                 self._rope.visible = False
                 pull(np.zeros(3))
                 return
@@ -69,7 +70,7 @@ class Scene:
         self._grip.on_drag("left")(dragged)
 
     def follow(self, path: np.ndarray) -> None:
-        """Show the reference that is followed: the places that it passes, world [m], (n, 3)."""
+        """Show the present reference: positions along it, world [m], (n, 3)."""
         pairs = np.stack([path[:-1], path[1:]], axis=1)
         self._scene.add_line_segments("/reference", pairs, GREY, thickness=0.006)
 
@@ -81,19 +82,19 @@ class Scene:
         Args:
             p: Position, world [m].
             R: Attitude, body to world.
-            target: Where the vehicle should be, world [m].
-            disturbance: Acceleration that the simple model misses, world [m/s^2].
-            estimate: What the residual model says of it, world [m/s^2].
+            target: Target position, world [m].
+            disturbance: Acceleration that the simple model does not describe, world [m/s^2].
+            estimate: Estimate of this acceleration by the residual model, world [m/s^2].
         """
         self._vehicle.position, self._vehicle.wxyz = tuple(p), quaternion(R)
-        self._shadow.position = (p[0], p[1], 0.0)  # straight below, so that its height is seen
+        self._shadow.position = (p[0], p[1], 0.0)  # vertically below the vehicle, to make its height visible
         self._target.position = tuple(target)
         self._trail.append(p)
         if len(self._trail) > 1:
             points = np.stack(self._trail)
             self._line.points = np.stack([points[:-1], points[1:]], axis=1)
         for (name, arrow), a in zip(self._arrows.items(), (disturbance, estimate), strict=True):
-            above = 0.04 if name == "estimate" else 0.0  # beside each other where they agree
+            above = 0.04 if name == "estimate" else 0.0  # an offset, so that equal arrows do not overlap
             start = p + np.array([0.0, 0.0, above])
             arrow.visible = bool(np.linalg.norm(a) > 0.05)
             arrow.points = np.stack([start, start + METRES * a])[None]
@@ -101,7 +102,7 @@ class Scene:
 
 def quaternion(R: np.ndarray) -> tuple[float, float, float, float]:
     """Return an attitude as a unit quaternion, real part first."""
-    from scipy.spatial.transform import Rotation  # here: it takes as long to import as all of retrim
+    from scipy.spatial.transform import Rotation  # local import: it takes as long as the import of retrim
 
     x, y, z, w = Rotation.from_matrix(R).as_quat()
     return float(w), float(x), float(y), float(z)

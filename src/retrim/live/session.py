@@ -1,4 +1,4 @@
-"""From a policy and a scenario to a live flight."""
+"""Specification of a live flight from a policy and a scenario."""
 
 import secrets
 from collections.abc import Callable
@@ -38,22 +38,22 @@ from .states import vector_of
 
 LAYERS: tuple[Layer, ...] = ("residual", "policy")
 LEARNING = ("full", "lora")
-PATH_S = 20.0  # [s] of the reference that the page draws
-STEP = 0.05  # [s] between two places of it
-BELOW_GROUND = 0.3  # [m], by which a fence lies below z = 0: starts may lie there, and a transient dips
-LONGEST = 3600.0  # [s]
+PATH_S = 20.0  # [s], duration of the reference path on the page
+STEP = 0.05  # [s] between two positions on the path
+BELOW_GROUND = 0.3  # [m], depth of a fence below z = 0, since starts may be there and transients go lower
+LONGEST = 3600.0  # [s], maximum length of a flight
 
 
 def check_limits(fence: float, seconds: float | None, policy_age: float | None) -> None:
-    """Check the numbers of a live flight, before anything is trained.
+    """Check the limits of a live flight, before training begins.
 
     Args:
-        fence: How far from the reference the vehicle may be [m].
-        seconds: Length; None for until it is stopped.
-        policy_age: How old the flight may be that the policy was learnt from [s]; None for any age.
+        fence: Maximum distance of the vehicle from the reference [m].
+        seconds: Length of the flight [s]; None for a flight until the user stops it.
+        policy_age: Maximum age of the flight data from which the policy was learned [s]; None for any age.
 
     Raises:
-        ConfigError: One of them cannot be.
+        ConfigError: One of the limits is out of range.
     """
     if policy_age is not None and not policy_age > 0.0:
         raise ConfigError(f"--policy-age {policy_age:g} s must be positive")
@@ -65,54 +65,54 @@ def check_limits(fence: float, seconds: float | None, policy_age: float | None) 
 
 @dataclass(frozen=True)
 class LiveRequest:
-    """What is asked of a live flight."""
+    """Request for a live flight."""
 
     setup: Setup
-    """Preset of the policy, on the reference that is flown."""
+    """Set-up of the policy's preset with the reference of the flight."""
     policy: Policy
     scenario: Scenario
     method: str
-    """``full`` and ``lora`` learn; any method whose pilot is a controller flies."""
+    """Method of the flight: ``full`` and ``lora`` learn; any method whose pilot is a controller can fly."""
     seconds: float
-    """Length of the flight, of which the fence must hold the whole reference [s]."""
+    """Length of the flight [s]; the fence must enclose the reference over this time."""
     seed: int
     fence: float
-    """How far from the reference the vehicle may be along any axis [m]."""
+    """Maximum distance of the vehicle from the reference along each axis [m]."""
     folder: Path
     state: LearnerState | None = None
-    """What an earlier flight learnt, to go on from."""
+    """Learned state of an earlier flight, from which learning continues."""
     page: tuple[str, int] | None = None
-    """Address and port of the page; None for no page."""
+    """Address and port of the page, if the flight has one."""
     learners: Address | None = None
-    """Where learners on another machine are reached; None: they run here."""
+    """Address of learners on another machine, if they are not on this machine."""
     policy_age: float = float("inf")
-    """How old the flight may be that the policy was learnt from [s]."""
+    """Maximum age of the flight data from which the policy was learned [s]."""
     record: Path | None = None
-    """File of a recording for other viewers."""
+    """Path of a recording for other viewers."""
     until_stopped: bool = False
-    """Whether an interruption is how the flight is meant to end."""
+    """Whether an interruption is the intended end of the flight."""
 
     @property
     def followed(self) -> str:
-        """Name of the reference that is followed at the beginning; empty if there is none."""
+        """Name of the initial reference; empty if there is no reference."""
         track = self.setup.preset.track
         return self.scenario.reference or ("" if track is None else track.reference)
 
     @property
     def flight(self) -> FlightSpec:
-        """The flight as results name it."""
+        """Specification of the flight for the results."""
         return FlightSpec(self.scenario, self.method, 0, self.seed)
 
 
 def live_spec(request: LiveRequest) -> LiveSpec:
-    """Return everything that the processes of a flight are started with; nothing is started.
+    """Return the specification of all processes of a flight, without starting them.
 
     Raises:
-        ConfigError: The method cannot be flown live, or the reference is not finite.
+        ConfigError: The method cannot be used in a live flight, or the reference is not finite.
     """
     setup, preset = request.setup, request.setup.preset
     window = max(preset.adapt.window, round(3.0 / preset.dt))
-    vehicle = request.scenario.entry.is_vehicle  # which starts at rest where its reference does
+    vehicle = request.scenario.entry.is_vehicle  # a vehicle starts at rest at the start of its reference
     if request.learners is not None:
         _check_remote(request)
     fault = measurement_fault(request.scenario.fault)
@@ -137,7 +137,7 @@ def live_spec(request: LiveRequest) -> LiveSpec:
             raise ConfigError(f"method {request.method!r} is no controller, so it cannot fly live; full and lora learn")
         controller = plain_source(setup, pilot.controller)
         save_learnt(start, learner_state(request, request.policy, "full"), preset)
-    # Parameters and learners of another flight are foreign, even if the same controller flies.
+    # Makes the hash unique: parameters and learners of another flight must not match, even for the same controller.
     controller = replace(controller, base=f"{controller.base}-{secrets.token_hex(4)}")
     return LiveSpec(
         controller=controller,
@@ -165,16 +165,16 @@ def live_spec(request: LiveRequest) -> LiveSpec:
 
 
 def learners_at(text: str | None, say: Callable[[str], None], key: Path | None = None) -> Address | None:
-    """Return where learners on another machine are reached; None if they are on this one.
+    """Return the address of learners on another machine; None if they are on this machine.
 
     Args:
-        text: As ``zenoh:192.168.1.5:7447``; None for this machine.
-        say: Told what a person should know.
-        key: File with the key that those who learn have, too; None: that of ``RETRIM_KEY``, if there is one.
+        text: Address, as ``zenoh:192.168.1.5:7447``; None for this machine.
+        say: Called with messages for the user.
+        key: File with the key that the learners share; None for the key of ``RETRIM_KEY``, if there is one.
 
     Raises:
-        ConfigError: It is no address, what it takes is not installed, or there is no key although it is beyond this
-            machine, or one although it is needed for nothing.
+        ConfigError: The text is not an address, a required package is not installed, there is no key for an address
+            outside this machine, or there is a key that is not needed.
     """
     shared = read_key(key)
     if text is None:
@@ -192,7 +192,7 @@ def learners_at(text: str | None, say: Callable[[str], None], key: Path | None =
 
 
 def _check_remote(request: LiveRequest) -> None:
-    """Raise :class:`ConfigError` if learners on another machine cannot learn for a flight."""
+    """Raise :class:`ConfigError` if learners on another machine cannot learn for this flight."""
     if request.method not in LEARNING:
         raise ConfigError(f"--learners: {request.method!r} does not learn; full and lora do")
     preset = request.setup.preset
@@ -204,13 +204,13 @@ def _check_remote(request: LiveRequest) -> None:
 
 
 def learner_state(request: LiveRequest, policy: Policy, method: str, residual: Any = None) -> LearnerState:
-    """Return what learners start from.
+    """Return the initial state of the learners.
 
     Args:
-        request: Of the flight.
-        policy: What flies.
+        request: Request of the flight.
+        policy: Policy in flight.
         method: ``full`` or ``lora``.
-        residual: What has been fitted; None for nothing.
+        residual: State of the fitted residual, if there is one.
     """
     key = request.flight.key()
     chosen = request.setup.low_rank(policy, key) if method == "lora" else policy
@@ -234,11 +234,11 @@ def _page(request: LiveRequest) -> PageSpec:
 
 
 def _limits(request: LiveRequest) -> Limits:
-    """What the vehicle takes, and a box around everything that the reference passes."""
+    """Return the command limits of the vehicle and a box around all positions of the reference."""
     setup, fence = request.setup, request.fence
     vehicle = request.scenario.make_vehicle(setup.preset.vehicle)
     places = _places(request, request.seconds)
-    if not (finite := np.isfinite(places).all(1)).all():  # no place would be outside
+    if not (finite := np.isfinite(places).all(1)).all():  # otherwise every position would count as inside
         at = STEP * int(np.argmin(finite))
         raise ConfigError(f"task {setup.preset.task!r}: its reference is not finite at {at:g} s; no fence can hold it")
     low, high = places.min(0) - fence, places.max(0) + fence
@@ -248,7 +248,7 @@ def _limits(request: LiveRequest) -> Limits:
 
 
 def _places(request: LiveRequest, seconds: float) -> np.ndarray:
-    """Places that the reference passes, world [m]."""
+    """Return positions along the reference, world [m], (n, 3)."""
     setup = request.setup
     times = jnp.arange(0.0, max(seconds, setup.preset.dt), STEP)
     return np.asarray(jax.jit(jax.vmap(setup.flown.target))(times), dtype=float)

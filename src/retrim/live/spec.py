@@ -1,4 +1,4 @@
-"""A live flight, before it has processes."""
+"""Specification of a live flight."""
 
 import secrets
 from collections.abc import Mapping
@@ -27,47 +27,47 @@ MAINS = {
 }
 """Main function of each process, by role."""
 VEHICLE = "retrim.live.vehicle_process:fly"
-"""Main function of the plant's process where the plant is a vehicle."""
+"""Main function of the plant process if the plant is a vehicle."""
 
 
 @dataclass(frozen=True)
 class PageSpec:
-    """The page of a flight."""
+    """Specification of the page of a flight."""
 
     host: str
     port: int
     name: str
-    """Of what flies."""
+    """Name of the preset."""
     path: np.ndarray
-    """Places that the reference passes, world [m], (n, 3)."""
+    """Positions along the reference, world [m], (n, 3)."""
     methods: tuple[str, ...]
-    """Ways of learning to choose from, the present one first; none if nothing learns."""
+    """Available learning methods, the present one first; empty if the flight does not learn."""
     arm: float
-    """From the centre of the vehicle to a rotor [m]."""
+    """Distance from the centre of the vehicle to a rotor [m]."""
     mass: float
-    """Of the vehicle [kg]."""
+    """Mass of the vehicle [kg]."""
     paths: Mapping[str, np.ndarray] = field(default_factory=dict)
-    """References to choose from by name, the present one first, and places that each passes, world [m], (n, 3); none
-    if nothing is to be chosen."""
+    """Available references by name, the present one first, with positions along each, world [m], (n, 3); empty if there
+    is no choice."""
     world: str = ""
-    """What flies where, in words."""
+    """Description of plant and disturbance."""
     token: str = field(default_factory=lambda: secrets.token_urlsafe(24), repr=False)
-    """First part of every path of the page, which only its printed address has."""
+    """First part of every path of the page, a secret that only the printed address contains."""
 
 
 @dataclass(frozen=True)
 class LiveSpec:
-    """Everything that the processes of one flight are started with."""
+    """Specification of all processes of one flight."""
 
     controller: ControllerSource
     layers: tuple[Layer, ...]
-    """Layers of learning: ``residual``, ``policy``, or none."""
+    """Layers of learning: ``residual`` and ``policy``; empty if the flight does not learn."""
     start: Path
-    """File with what was learnt before the flight."""
+    """File with the learned state from before the flight."""
     reference: str | None
     scenario: Scenario
     vehicle: Any
-    """Vehicle of training, by name or specification."""
+    """Vehicle of the training: a name or a specification."""
     x0: np.ndarray
     home: np.ndarray
     limits: Limits
@@ -75,16 +75,16 @@ class LiveSpec:
     delay_ticks: int
     window: int
     seconds: float
-    """After which the vehicle lands [s]."""
+    """Time after which the vehicle lands [s]."""
     seed: int
     folder: Path
-    """Where the log goes, and what the processes write to their standard outputs."""
+    """Folder for the log and for the standard output and error of the processes."""
     spare: tuple[Path, ...] = ()
-    """Where files go that cannot be written there."""
+    """Folders for files that cannot be written to ``folder``."""
     page: PageSpec | None = None
     learners: Address | None = None
-    """Where learners on another machine are reached; None: they are processes of this one."""
+    """Address of learners on another machine; None for learners on this machine."""
     trust: tuple[str, ...] = ()
-    """Python names that ``start`` may hold: the user named them to this process."""
+    """Python names that ``start`` may contain. The user passed them to this process."""
     mains: Mapping[str, str] = field(default_factory=lambda: MAINS)
-    """What runs as each process; another link to a vehicle is another main function of the plant."""
+    """Main function of each process, by role. A link to a vehicle uses a different main function for the plant."""

@@ -1,4 +1,4 @@
-"""States between processes: p, R by rows and v as one vector of NumPy."""
+"""States between processes: p, R by rows and v as one NumPy vector."""
 
 from typing import Any
 
@@ -9,11 +9,11 @@ from ..physics.state import State
 
 
 def vector_of(x: State) -> np.ndarray:
-    """Return a state as a vector; no program of JAX is needed for it."""
+    """Return a state as a vector, without a JAX program."""
     return np.concatenate([np.asarray(leaf, dtype=float).ravel() for leaf in (x.p, x.R, x.v)])
 
 
 def state_of(x: np.ndarray, dtype: Any) -> State:
-    """Return the state of a vector."""
+    """Return the state from a vector."""
     p, R, v = (jnp.asarray(part, dtype) for part in (x[:3], x[3:12].reshape(3, 3), x[12:]))
     return State(p, R, v)

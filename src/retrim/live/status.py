@@ -1,4 +1,4 @@
-"""How a live flight stands."""
+"""Status of a live flight."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -6,7 +6,7 @@ from typing import Any
 
 @dataclass
 class Status:
-    """A flight as the supervisor sees it."""
+    """Status of a flight, as the supervisor reports it."""
 
     t: float
     """Time since take-off [s]."""
@@ -15,28 +15,28 @@ class Status:
     alive: dict[str, bool]
     restarts: dict[str, int]
     ended: str | None
-    """Why the flight is over; None while it is not."""
+    """Reason for the end of the flight; None before the end."""
     rejections: list[str]
-    """What learners said since the last look of results that must not be used."""
+    """Reasons of learners for rejecting their own results since the last status."""
     watchdog_flies: bool
-    """The newest command is the watchdog's."""
+    """Whether the newest command comes from the watchdog."""
     watchdog_ticks: int
-    """How often the watchdog has commanded."""
+    """Number of commands of the watchdog."""
     log_failed: str | None
-    """Why the flight is no longer written down; None while it is."""
+    """Reason why the flight is no longer logged; None while it is logged."""
     stalls: dict[str, Any] = field(default_factory=dict)
-    """How often the machine stood still, and for how long."""
+    """Number and duration of stalls of the machine."""
     refusals: list[str] = field(default_factory=list)
-    """What was refused of notes between processes since the last look."""
+    """Refusals of notes between processes since the last status."""
     refused_notes: int = 0
-    """How many notes and inputs of a browser were refused so far."""
+    """Number of refused notes and browser inputs so far."""
     excluded: list[int] = field(default_factory=list)
-    """Numbers of measurements that the last fit excluded, by reason."""
+    """Number of measurements that the last fit excluded, for each reason."""
     hangs: dict[str, int] = field(default_factory=dict)
-    """How often each process was ended because it was silent."""
+    """Number of times that each process was ended because it was silent."""
     log_moved: str = ""
-    """Why the log is another file than it was, and which; empty while it is not."""
+    """Message with the reason for a change of the log file and its new path; empty without a change."""
     ticks: int = 0
-    """Ticks that the plant has sent so far."""
+    """Number of ticks that the plant has sent so far."""
     vehicles: list[tuple[float, str]] = field(default_factory=list)
-    """Times of the flight [s], and the vehicle as it was identified then."""
+    """Times of the flight [s] and descriptions of the vehicle identified at these times."""

@@ -1,4 +1,4 @@
-"""Starts the processes of a live flight, arms it when all are ready, brings back those that die, and ends it."""
+"""Supervisor of a live flight, which starts all processes, arms the flight, restarts dead processes and ends it."""
 
 import contextlib
 import json
@@ -28,26 +28,26 @@ from .spec import LiveSpec
 from .status import Status
 from .topics import topics
 
-LANDING = 60.0  # [s], after which processes are ended wherever the vehicle is
-LAST = 5  # ticks in which what control said last is written down, once it has nothing left to fly
-ATTEMPTS = 5  # to bring a process back
+LANDING = 60.0  # [s] for a landing; afterwards the processes are ended wherever the vehicle is
+LAST = 5  # [ticks] for the log to receive the last reports of control after the plant has ended
+ATTEMPTS = 5  # restarts per process
 LEARN = ("residual", "policy", "identifier", "recorder", "page", "bridge")
-"""Roles that stay off the core of those that must be on time."""
-READY_S = 300.0  # [s], compiling included
+"""Roles that do not run on the core of the processes with real-time requirements."""
+READY_S = 300.0  # [s], including compilation
 RESTARTED = ("residual", "policy", "identifier", "watchdog", "recorder", "page", "bridge")
 
 
 @dataclass
 class Supervisor:
-    """The processes of one flight. Leaving it as a context ends them all."""
+    """Processes of one flight. Exit from the context ends all of them."""
 
     spec: LiveSpec
     processes: dict[str, "Popen[bytes]"] = field(default_factory=dict)
     restarts: dict[str, int] = field(default_factory=dict)
     hangs: dict[str, int] = field(default_factory=dict)
-    """How often each process was ended because it was silent."""
+    """Number of times that each process was ended because it was silent."""
     refused: dict[str, list[str]] = field(default_factory=dict)
-    """What the operating system refused to which process."""
+    """Requests that the operating system refused, by process."""
     epoch: float | None = None
     _landing: bool = False
     _moved: str = ""
@@ -56,9 +56,9 @@ class Supervisor:
     _remote: RemoteLearners | None = None
 
     def __enter__(self) -> "Supervisor":
-        """Make the bus."""
+        """Create the bus."""
         self.bus, self.floor = SharedMemoryBus.create(topics(self.spec)), 0
-        self.start = self.bus.take_in(self.spec.start)  # the folder of the results may go away
+        self.start = self.bus.take_in(self.spec.start)  # the folder of the results may disappear
         self.spec = replace(self.spec, start=self.start)
         self._notes, self._pulses = RefusedNotes(self.bus, topics(self.spec)), Pulses(self.bus)
         self._heart = Heart(self.bus, "supervisor")
@@ -69,7 +69,7 @@ class Supervisor:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Land what still flies, end what still runs, and take the bus away."""
+        """Land a vehicle that still flies, end the running processes, and remove the bus."""
         aloft = self.epoch is not None or self._airborne_ordered
         if aloft and self._alive("plant") and not last_note(self.bus, "ended"):
             self.land()
@@ -94,10 +94,10 @@ class Supervisor:
         self.bus.remove()
 
     def warm_up(self) -> Iterator[tuple[str, float]]:
-        """Start the processes; yield what is waited for and since when [s], until all are ready.
+        """Start the processes; yield the names of the processes that are not ready and the waiting time [s].
 
         Raises:
-            PlantError: A process ended, or was not ready in time; the message has the last line of what it said.
+            PlantError: A process ended, or was not ready in time; the message has the last line of its output.
         """
         began = time.monotonic()
         if self._remote is not None:
@@ -124,10 +124,10 @@ class Supervisor:
             yield from self._lift_off()
 
     def take_off(self) -> None:
-        """Give the order; the first tick is half a second away, the same for all.
+        """Publish the order to start; the first tick is 0.5 s later for all processes.
 
         Raises:
-            PlantError: A process has ended since it was ready.
+            PlantError: A process has ended after it was ready.
         """
         self._check_alive()
         self.epoch = time.monotonic() + 0.5
@@ -136,7 +136,7 @@ class Supervisor:
             self._pulses.expect(role)
 
     def _lift_off(self) -> Iterator[tuple[str, float]]:
-        """Let a vehicle take off by its autopilot, now that all are ready to fly it."""
+        """Make a vehicle take off under control of its autopilot when all processes are ready."""
         began, self._airborne_ordered = time.monotonic(), True
         self.bus.publish("order", pack_note("order", order="take off"))
         while self.bus.latest("airborne") is None:
@@ -145,17 +145,17 @@ class Supervisor:
             time.sleep(0.1)
 
     def land(self) -> None:
-        """Give the order to land, once."""
+        """Publish the order to land, once."""
         if not self._landing:
             self._landing = True
             self.bus.publish("order", pack_note("order", epoch=self.epoch, order="land"))
 
     def learn(self, *, paused: bool, flown: bool) -> None:
-        """Let the learners work or wait, and fly what they learnt or what took off."""
+        """Run or pause the learners, and fly the learned parameters or the initial ones."""
         self.bus.publish("learning", pack_note("learning", paused=paused, flown=flown))
 
     def learn_from(self, start: Path) -> None:
-        """Start the policy's learner again with what a file holds."""
+        """Restart the policy learner from a file."""
         self.start, newest = start, self.bus.latest("parameters.policy")
         self.floor = 0 if newest is None else newest.version
         if self._remote is not None:
@@ -168,23 +168,23 @@ class Supervisor:
 
     @property
     def landing(self) -> bool:
-        """Whether the order to land was given."""
+        """Whether the order to land was published."""
         return self._landing
 
     @property
     def page_port(self) -> int | None:
-        """Where the page is; None if there is none."""
+        """Port of the page, if there is one."""
         return last_note(self.bus, "ready.page", "ready").get("port")
 
     def watch(self) -> Status:
-        """Bring back processes that have died or hang, and may; return how the flight stands."""
+        """Restart processes that died or hang, if their role permits it; return the status of the flight."""
         assert self.epoch is not None
         self._heart.beat()
         ended = last_note(self.bus, "ended").get("reason")
         if ended is None:
             self._end_hanging()
             for role, process in self.processes.items():
-                died = process.poll() not in (None, 0)  # who ends by itself says that the flight is over
+                died = process.poll() not in (None, 0)  # a regular exit means that the flight is over
                 if role in RESTARTED and died and self.restarts.get(role, 0) < ATTEMPTS:
                     self._restart(role)
             if self.processes["plant"].poll() is not None:
@@ -210,44 +210,44 @@ class Supervisor:
         )  # fmt: skip
 
     def finish(self, patience: float = 3.0) -> None:
-        """Wait until the log is written, and write what is missing of it if its process does not."""
+        """Wait until the log is complete, and write the missing part if the recorder does not."""
         until, flew, recorder = time.monotonic() + patience, time.monotonic(), self.processes["recorder"]
         while recorder.poll() is None and time.monotonic() < until:
             if self._alive("plant"):
                 flew = time.monotonic()
             elif self._alive("control") and time.monotonic() > flew + LAST * self.spec.dt:
-                self.processes["control"].terminate()  # there is nothing left to fly
+                self.processes["control"].terminate()  # the plant has ended
             time.sleep(0.02)
         if recorder.poll() != 0:
             self._end("recorder")
             self._record()
 
     def _end_hanging(self) -> None:
-        """End processes that are alive and silent."""
+        """End processes that are alive but silent."""
         for role in self._pulses.hanging([role for role in self.processes if self._alive(role)]):
             self.hangs[role] = self.hangs.get(role, 0) + 1
             self._end(role)
 
     def _end(self, role: str) -> None:
-        """End a process at once, also one that is suspended."""
+        """End a process immediately, even if it is suspended."""
         self.processes[role].kill()
-        with contextlib.suppress(TimeoutExpired):  # a disk or a device may keep it for a while
+        with contextlib.suppress(TimeoutExpired):  # a disk or a device may delay the end
             self.processes[role].wait(1.0)
 
     def _restart(self, role: str) -> None:
         self.restarts[role] = self.restarts.get(role, 0) + 1
         if role == "recorder":
-            self._record()  # until the new one is there, ticks may leave the reports
-        with contextlib.suppress(OSError):  # the flight goes on without it
+            self._record()  # before the new recorder runs, ticks may drop out of the reports
+        with contextlib.suppress(OSError):  # the flight continues without the process
             self._start(role)
             self._pulses.expect(role, READY_S)
 
     def _record(self) -> None:
-        """Write down what is reported and not written yet; nobody else must be writing."""
+        """Write the reported ticks that the log lacks; no other process may write at the same time."""
         Recorder(self.spec.folder / "flight.csv", self.bus, self.spec.spare).step()
 
     def _lost_plant(self) -> str:
-        """Why a flight is over whose plant has ended."""
+        """Return the reason for the end of a flight whose plant process has ended."""
         if said := last_note(self.bus, "ended").get("reason"):
             return str(said)
         if "plant" in self.hangs:

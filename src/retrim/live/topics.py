@@ -1,4 +1,4 @@
-"""The topics of a live flight, and the longest message of each."""
+"""Topics of a live flight, with the maximum message length of each."""
 
 from ..onboard.messages import COLUMNS
 from ..onboard.topics import LAYERS, REFERENCE, SLOTS, slot
@@ -10,10 +10,10 @@ ROLES = ("control", "plant", "watchdog", "recorder", "page", "bridge", "identifi
 
 
 def topics(spec: LiveSpec) -> dict[str, int]:
-    """Return the longest message of each topic [bytes]."""
+    """Return the maximum message length of each topic [bytes]."""
     half = {name: sum(a.nbytes for a in arrays.values()) for name, arrays in spec.controller.parameters.items()}
     rows = 8 * len(COLUMNS) * spec.window + 10_000
-    # A policy with the moments of its optimiser, also where what is learnt now is a low-rank part of it.
+    # Room for a policy with the moments of its optimiser, even if the present method learns a low-rank part of it.
     learnt = spec.start.stat().st_size + 3 * half.get("policy", 0) + 200_000
     return (
         dict.fromkeys(SMALL, 4096)

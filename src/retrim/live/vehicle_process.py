@@ -1,4 +1,4 @@
-"""The process of a link to a vehicle: it carries samples and commands, and time does not wait for it."""
+"""Process of a link to a vehicle: it transfers samples and commands in real time."""
 
 import math
 import signal
@@ -20,12 +20,12 @@ from ..transport.bus import Bus
 from ..transport.shared_memory import SharedMemoryBus
 from .plant_process import ALONE, PlantPlan, answer
 
-HOLD_S = 0.05  # [s] for which the autopilot holds before the order to begin is looked for again
+HOLD_S = 0.05  # [s] between two reads of the orders while the autopilot holds
 
 
 def fly(plan: PlantPlan) -> None:
-    """Take off, carry until the vehicle has landed, and leave it to its autopilot: the main function of the process."""
-    signal.signal(signal.SIGTERM, _ended)  # the vehicle is left to its autopilot all the same
+    """Run the main function of the process: take off, transfer until landing, and return control to the autopilot."""
+    signal.signal(signal.SIGTERM, _ended)  # so that control returns to the autopilot in this case, too
     bus, parent = SharedMemoryBus(plan.folder), Lifeline(plan.parent)
 
     def wanted() -> bool:
@@ -43,7 +43,7 @@ def fly(plan: PlantPlan) -> None:
                     return
                 plant.wait(time.monotonic() + HOLD_S)
             plant.take_off(plan.x0[:3], heading_of(plan.x0[3:12].reshape(3, 3)), wanted)
-            plant.now()  # what it imports when it is first asked is there before time counts
+            plant.now()  # performs the imports of the first call before timing matters
             bus.publish("airborne", pack_note("airborne"))
             while (epoch := last_note(bus, "order").get("epoch")) is None:
                 if not wanted():
@@ -53,12 +53,12 @@ def fly(plan: PlantPlan) -> None:
             reason = _carried(plan, plant, bus, parent, float(epoch))
     except PlantError as error:
         reason = f"plant lost: {error}"
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # nothing is left to be ended
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # the link is already closed
     bus.publish("ended", pack_note("ended", reason=reason))
 
 
 def _carried(plan: PlantPlan, plant: VehiclePlant, bus: Bus, parent: Lifeline, epoch: float) -> str:
-    """Carry samples and commands, and return why that ended."""
+    """Transfer samples and commands; return the reason for the end."""
     tick, late, held, unanswered = 0, 0, 0, 0
     accepted = HOVER
     while True:
@@ -68,7 +68,7 @@ def _carried(plan: PlantPlan, plant: VehiclePlant, bus: Bus, parent: Lifeline, e
         setpoint = answer(bus, tick, epoch + (tick + SHARE) * plan.dt)
         unanswered = 0 if setpoint is not None else unanswered + 1
         if setpoint is None:
-            held += 1  # nothing is sent: the autopilot goes on with the last command for as long as it likes
+            held += 1  # without a new command the autopilot keeps the last one for as long as it permits
             if unanswered * plan.dt > ALONE and parent.gone():
                 return "nobody commands, and the supervisor is gone"
         elif setpoint.landed:
@@ -87,7 +87,8 @@ def _carried(plan: PlantPlan, plant: VehiclePlant, bus: Bus, parent: Lifeline, e
 
 def _sample(tick: int, dt: float, now: VehicleState, accepted: np.ndarray) -> Sample:
     state, truth = (np.concatenate([x.p, x.R.ravel(), x.v]) for x in (now, now.truth or now))
-    # Of news that the guard refuses the age is told, so that it does; until then what a controller has to make up for.
+    # Normally the age after extrapolation, for which the controller compensates. If the measurement is too old for the
+    # guard, its full age, so that the guard refuses it.
     age = now.age if now.news <= Limits.state_age else now.news
     return Sample(tick, tick * dt, time.monotonic(), age, state, truth, accepted)
 

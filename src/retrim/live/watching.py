@@ -1,4 +1,4 @@
-"""A live flight from take-off to landing."""
+"""Monitoring of a live flight from take-off to landing."""
 
 import contextlib
 import threading
@@ -12,8 +12,8 @@ from .status import Status
 from .supervisor import LANDING, Supervisor
 from .wishes import Wishes
 
-EVERY = 0.05  # [s]
-LAST = 1.0  # [s] for a terminal to take the end of a flight
+EVERY = 0.05  # [s] between two reads of the status
+LAST = 1.0  # [s] for a terminal to display the end of a flight
 
 
 def watched(
@@ -27,15 +27,15 @@ def watched(
     """Take off, watch until the flight is over, and wait until its log is written.
 
     Args:
-        supervisor: Its processes are ready.
-        seconds: After which the vehicle lands [s].
-        events: They are collected here.
-        show: Called many times a second with how the flight stands and what is new.
-        stop: Lands the vehicle, too.
-        wishes: What a person asks for in flight.
+        supervisor: Supervisor whose processes are ready.
+        seconds: Time after which the vehicle lands [s].
+        events: Events of the flight; this function adds to them.
+        show: Called many times per second with the status and the new events.
+        stop: Lands the vehicle early.
+        wishes: Requests of the user in flight.
 
     Returns:
-        The last status.
+        Last status.
     """
     supervisor.take_off()
     landed_by = float("inf")
@@ -43,7 +43,7 @@ def watched(
         while True:
             status = supervisor.watch()
             new = events.take(status, wishes.obey(status) if wishes is not None else ())
-            if not screen.show(status, new):  # nobody reads any more: whoever is in the air lands
+            if not screen.show(status, new):  # the display has closed: land the vehicle
                 stop.set()
             if status.ended is not None or time.monotonic() > landed_by:
                 supervisor.finish()
@@ -55,7 +55,7 @@ def watched(
 
 
 class _Screen:
-    """Shows in a thread of its own: a terminal that stands still stops nobody else."""
+    """Shows the status in a separate thread, so that a blocked terminal does not block the flight."""
 
     def __init__(self, show: Callable[[Status, list[Event]], None]) -> None:
         self._show, self._waiting = show, list[Event]()
@@ -68,7 +68,7 @@ class _Screen:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Show the end, if there is somebody to show it to within a second."""
+        """Show the end of the flight if the display responds within one second."""
         with contextlib.suppress(TimeoutError, OSError, SystemExit):
             if self._work is not None:
                 self._work.result(LAST)
@@ -77,7 +77,7 @@ class _Screen:
         self._thread.shutdown(wait=False, cancel_futures=True)
 
     def show(self, status: Status, new: list[Event]) -> bool:
-        """Show how the flight stands if the last look is done; return whether there is still somebody to show it to."""
+        """Show the status if the previous call has finished; return whether the display still works."""
         self._waiting += new
         self._last = status
         if self._lost or (self._work is not None and not self._work.done()):

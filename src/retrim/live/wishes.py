@@ -1,4 +1,4 @@
-"""What a person asks for in flight: land, pause, learn in another way, fly what took off, follow something else."""
+"""Requests of the user in flight: land, pause, change method, fly the initial parameters, change reference."""
 
 import contextlib
 import time
@@ -18,14 +18,14 @@ from .session import LEARNING, LiveRequest, learner_state
 from .status import Status
 from .supervisor import Supervisor
 
-SETTLED_S = 0.5  # [s] without a further turn, after which knobs that were turned are an event
+SETTLED_S = 0.5  # [s] without a further change until a change of the knobs becomes an event
 
 
 class Wishes:
-    """Reads what was asked, and does it; one for each flight. What it takes long to do is done beside the flight."""
+    """Reads and executes the requests of the user in one flight. Long operations run in a separate thread."""
 
     def __init__(self, request: LiveRequest, supervisor: Supervisor) -> None:
-        """Build one for the flight of a supervisor."""
+        """Initialise for the flight of a supervisor."""
         self._request, self._supervisor = request, supervisor
         self._wish: dict[str, Any] = {"method": request.method, "paused": False}
         self._method, self._starts = request.method, 0
@@ -36,10 +36,10 @@ class Wishes:
         self._coming: tuple[str, Future[Path]] | None = None
 
     def obey(self, status: Status) -> list[Event]:
-        """Do what has been asked for since the last call; return it as events."""
+        """Execute the requests since the last call; return them as events."""
         new = self._knobs(status.t)
         if (wish := self._new("wish")) is not None:
-            with contextlib.suppress(MessageError):  # the supervisor counts and tells it
+            with contextlib.suppress(MessageError):  # the supervisor counts and reports invalid notes
                 asked = unpack_note(wish, "wish")
                 if "reference" in asked:
                     new += self.following.ask(asked["reference"], status.t)
@@ -47,7 +47,7 @@ class Wishes:
         return new + self._arrived(status.t) + self.following.obey(status)
 
     def close(self) -> None:
-        """Drop what is still being worked on."""
+        """Cancel pending operations."""
         self._work.shutdown(wait=False, cancel_futures=True)
 
     def _ask(self, asked: dict[str, Any], status: Status) -> list[Event]:
@@ -68,7 +68,7 @@ class Wishes:
         return [Event(status.t, "asked", f"method {method}" + (", paused" if paused else ""))]
 
     def _start_of(self, method: str, status: Status) -> Path:
-        """Write down what flies, in the form in which ``method`` learns."""
+        """Write the policy and residual in flight in the form in which ``method`` learns; return the path."""
         start, trust = self._supervisor.start, self._supervisor.spec.trust
         state = learnt_in(self._supervisor.bus, status, start, trust) or load_learnt(start, trust=trust)[0]
         self._starts += 1
