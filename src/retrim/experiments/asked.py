@@ -60,7 +60,7 @@ class Where:
     crazyflie:udp:HOST:PORT or ros:HOST:PORT for a vehicle; or module:name."""
     reference: str | None = None
     """Reference of a tracking policy: circle, figure8, star, module:name or a CSV file of t, x, y, z[, yaw]; by default
-    the reference of its training. A closed file repeats as laps, and an open one is flown once; my.csv:laps and
+    the reference of its training. A closed file repeats as laps, any other is flown once; my.csv:laps and
     my.csv:once override this. Only a policy that observes its reference can follow another one than in training."""
     vehicle: str | None = None
     """Vehicle that the plant simulates: small, large, kingfisher, a vehicle file or module:name; by default the vehicle

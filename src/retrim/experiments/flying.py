@@ -28,7 +28,7 @@ FLOOR = -0.5  # [m]: a vehicle below this is terminated; starts may lie at z = 0
 
 
 def plant_of(setup: Setup, spec: FlightSpec) -> Plant:
-    """Return the plant of a flight, with the on-board controller of its method.
+    """Return the plant of a flight, with the on-board controller of its method, if any.
 
     Raises:
         ConfigError: The method cannot fly the plant.
