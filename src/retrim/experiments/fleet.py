@@ -56,7 +56,7 @@ class Fleet:
             state: Learner state of an earlier flight; adapting flights resume from it.
 
         Raises:
-            ConfigError: Something does not exist, or does not fit together.
+            ConfigError: A name does not exist, or two settings are incompatible.
         """
         if not scenarios or not methods:
             raise ConfigError(f"{len(scenarios)} scenarios by {len(methods)} methods: there is nothing to fly")
@@ -67,7 +67,7 @@ class Fleet:
         self.policies: dict[int, Any] = dict(policies) if isinstance(policies, Mapping) else {0: policies}
         check_seeds(tuple(self.policies))
         self.setups = {name: Setup.of(preset, name) for name in {s.reference for s in scenarios}}
-        for method in methods:  # some do not fit every task, network or plant
+        for method in methods:  # some methods do not support every task, network or plant
             for setup in self.setups.values():
                 setup.pilot(next(iter(self.policies.values())), method, random.key(0))
             if find_method(method).on_board is not None:
@@ -90,7 +90,7 @@ class Fleet:
         ]
 
     def lots(self, specs: Sequence[FlightSpec]) -> list[Lot]:
-        """Return specifications in batches; flights that cannot share a program are flown individually."""
+        """Return specifications in batches; flights that cannot share a program run individually."""
         groups: dict[Hashable, list[FlightSpec]] = {}
         for spec in specs:
             groups.setdefault(spec.group, []).append(spec)
@@ -102,7 +102,7 @@ class Fleet:
         return in_lots(groups.values(), program)
 
     def warm_up(self, specs: Sequence[FlightSpec] | None = None) -> None:
-        """Compile the programs of flights that are flown one by one before their take-off, in this process.
+        """Compile the programs of single flights before their take-off, in this process.
 
         Args:
             specs: Flights; all of the fleet by default.
@@ -130,12 +130,12 @@ class Fleet:
         by_lot: bool = False,
         forget: bool = False,
     ) -> Flights:
-        """Fly.
+        """Fly all or some of the flights.
 
         Args:
             executor: Any executor, which then flies one flight at a time; one with other processes builds its own
-                programs. By default flights of a simulated plant are flown in batches, each as one program, and the
-                others one by one, on one thread per core.
+                programs. By default flights of a simulated plant run in batches, each as one program, and the others
+                one by one, on one thread per core.
             progress: Called in this thread when flights are completed, and periodically before.
             landed: Receives completed flights, in this thread.
             stop: Aborts the running flights. Ctrl-C does the same, and sets it.

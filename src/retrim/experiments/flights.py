@@ -92,14 +92,15 @@ class Flight:
     def behind(self) -> tuple[float, float] | None:
         """Lag of the flight behind its reference [s], and its mean error without this lag [m].
 
-        The lag is the constant shift in time, of at most 3 s, with the smallest mean error over the last seconds. Of
-        equally good shifts, as on a lap, it is the smallest. None for a terminated flight or a task without reference.
+        The lag is the constant shift in time, of at most 3 s, with the smallest mean error over the last seconds. If
+        several shifts are equally good, as on a lap, it is the smallest. Both are absent (None) for a terminated flight
+        or a task without reference.
         """
         if self.cross is None or self.target is None or self.log.terminated:
             return None
         rows = np.flatnonzero(self._late_rows())
         most = min(round(LONGEST_SHIFT / self.log.dt), int(rows[0]), len(rows) // 2)
-        rows = rows[rows + most < len(self.target)]  # the same rows for every shift, so that their errors are comparable
+        rows = rows[rows + most < len(self.target)]  # the same rows for every shift, to make errors comparable
         shifts, errors = sorted(range(-most, most + 1), key=abs), list[float]()
         for k in shifts:
             errors.append(float(np.linalg.norm(self.log.p[rows] - self.target[rows - k], axis=1).mean()))
@@ -125,7 +126,7 @@ class Flight:
 
     @property
     def swaps(self) -> tuple[float, ...]:
-        """Times at which a new policy took over [s], without those after the log, as in the landing of a live flight."""
+        """Times at which a new policy took over [s], except during the landing of a live flight, after the log."""
         return tuple(e.t for e in self.log.events if e.kind == "policy" and e.t <= self.log.t[-1])
 
     @property

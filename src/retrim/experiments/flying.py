@@ -85,7 +85,7 @@ def program_of(setup: Setup, policy: Any, specs: Sequence[FlightSpec]) -> Hashab
     Only the first two flights are checked.
 
     Returns:
-        The key; None if the flights cannot be flown as one program.
+        The key; None if the flights cannot run as one program.
 
     Raises:
         PlantError: The package of the plant is not installed.

@@ -1,4 +1,4 @@
-"""Networks and training states in the folder of a run, so that an interrupted training resumes."""
+"""Networks and training states in the folder of a run: a training runs only once, and resumes after an interruption."""
 
 from collections.abc import Mapping
 from pathlib import Path

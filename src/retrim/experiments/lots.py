@@ -25,13 +25,13 @@ class Lot(NamedTuple):
 
 
 def in_lots(groups: Iterable[list[FlightSpec]], program: Callable[[list[FlightSpec]], Hashable | None]) -> list[Lot]:
-    """Divide flights into batches; flights that cannot share a program are flown individually.
+    """Divide flights into batches; flights that cannot share a program run individually.
 
     The first batch of each program comes first, so that different programs compile at the same time.
 
     Args:
         groups: Flights that differ in numbers of the vehicle, start and seed only.
-        program: Returns a key that identifies the program of a group; None if its flights are flown one by one.
+        program: Returns a key that identifies the program of a group; None if its flights run one by one.
     """
     first, others = dict[Hashable, Lot](), list[Lot]()
     for group in groups:
@@ -47,7 +47,7 @@ def in_lots(groups: Iterable[list[FlightSpec]], program: Callable[[list[FlightSp
 
 
 def _parts(group: list[FlightSpec], size: int) -> list[list[FlightSpec]]:
-    """Divide a group so that no batch has a single flight."""
+    """Divide a group into parts of ``size`` flights; a single remaining flight joins the part before it."""
     bounds = [*range(0, len(group), size), len(group)]
     if size > 1 and len(bounds) > 2 and bounds[-1] - bounds[-2] == 1:
         del bounds[-2]

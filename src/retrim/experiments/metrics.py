@@ -95,10 +95,10 @@ def rows(flights: Sequence[Flight], *, by_seed: bool = False) -> Rows:
 
 
 def summary(records: Sequence[Mapping[str, Any]], keys: Sequence[str] = CONDITIONS) -> dict[str, Any]:
-    """Return one row for flights of the same conditions.
+    """Return one row for flights under the same conditions.
 
     The mean is over the flights that were not terminated; the median and the maximum count a terminated flight as
-    infinite (written as None), so that they do not hide a crash. A flight whose job failed has no information about
+    infinite (written as None), so that they do not hide a crash. A flight whose job failed gives no information about
     the method: it counts in ``n`` and is listed in ``failures``.
 
     Args:
@@ -141,8 +141,8 @@ def summary(records: Sequence[Mapping[str, Any]], keys: Sequence[str] = CONDITIO
 def interval(records: Sequence[Mapping[str, Any]], draws: int = 2000) -> list[float] | None:
     """Return the 95 % bootstrap interval of the mean error [m]; None if every flight was terminated.
 
-    Training seeds are drawn first, with replacement, and then the flights of each. Flights of one seed are correlated,
-    and must not make the interval narrower.
+    Training seeds are drawn first, with replacement, and then the flights of each. Flights of one seed are correlated;
+    this order keeps their correlation from making the interval narrower.
 
     Args:
         records: Results of :func:`record`.

@@ -21,7 +21,7 @@ from .provenance import section_key
 from .reporter import Reporter
 from .run import Run
 
-DATT_STEPS = 20_000_000  # the paper's
+DATT_STEPS = 20_000_000  # as in the paper
 DATT_PPO: dict[str, Any] = {"envs": 64, "steps": 256, "minibatches": 8, "epochs": 6, "learning_rate": 2e-3}
 DATT_TAG = 2**30 + 5  # folded into a seed: DATT shares no key with the policies
 PARTLY = ".partly"

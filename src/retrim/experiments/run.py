@@ -62,7 +62,7 @@ class Run:
         check_writable(self.folder)
 
     def of_earlier(self) -> str:
-        """Return a line on the fate of earlier results in the folder; empty if it has no results."""
+        """Return a line that reports if the run resumes or replaces earlier results; empty if the folder has none."""
         if any((self.folder / PARTS).glob("*")):
             return f"results in {self.folder}: what the same code made there of the same things stays, the rest goes"
         return f"results in {self.folder} are replaced" if any(self.folder.glob("*.json")) else ""

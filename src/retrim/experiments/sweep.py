@@ -50,7 +50,7 @@ class Sweep:
     disturbances: tuple[str, ...] = Field(default=("none",), min_length=1)
     plants: tuple[str, ...] = Field(default=("bem",), min_length=1)
     vehicles: tuple[str | VehicleSpec, ...] = ()
-    """Vehicles of the flights; by default that of training. Files are read from the sweep file's folder, and stored."""
+    """Vehicles of the flights; by default that of training. Paths are relative to the sweep file; contents are kept."""
     sensors: tuple[str, ...] = Field(default=("ideal",), min_length=1)
     references: tuple[str, ...] = ()
     """References of tracking policies."""
@@ -58,7 +58,7 @@ class Sweep:
     seconds: float | None = Field(default=None, ge=1.0, le=36_000.0, strict=True)
     """Length of a flight; the task's own by default."""
     overlay: dict[str, Any] = Field(default_factory=dict)
-    """Values on top of every preset, as in its TOML file; a vehicle file is read from the sweep file's folder."""
+    """Values on top of every preset, as in its TOML file; a vehicle file is relative to the sweep file."""
 
     def scenarios(self) -> list[Scenario]:
         """Return every combination of disturbance, plant, vehicle, sensors and reference."""

@@ -43,7 +43,7 @@ PLAN: tuple[tuple[Callable[..., None], str, Options], ...] = (
 """Table, its place in the paper, and its options. Timed tables come first, when the machine is least busy."""
 QUICK_LEAVES_OUT = (phase, plants)
 AT_LEAST = "at least "
-"""Mark of a time that lacks the time of a killed run, which was not recorded; that of an interrupted one is counted."""
+"""Prefix of a time that lacks the time of a killed run; the time of an interrupted run is recorded and counted."""
 
 
 def everything(run: Run, reporter: Reporter, *, quick: bool = False) -> None:

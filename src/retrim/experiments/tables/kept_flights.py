@@ -36,7 +36,7 @@ class KeptFlights:
         """Read the flights of the same fleet that an earlier run has written to the folder with the same code."""
         self._run, self._over = run, dict[FlightSpec, Flight]()
         self._groups = dict[Group, list[FlightSpec]]()
-        for spec in dict.fromkeys(fleet.specs):  # a method that is named twice is flown once
+        for spec in dict.fromkeys(fleet.specs):  # a method that is named twice flies once
             self._groups.setdefault(spec.group, []).append(spec)
         policies = {str(seed): _digest_of(policy) for seed, policy in fleet.policies.items()}
         about = {"preset": dump(fleet.preset), "policies": policies, "seconds": fleet.seconds}
@@ -49,7 +49,7 @@ class KeptFlights:
             self._keys[group] = section_key(**about, **what)
         found = [self._read(group) for group in self._groups]
         self.earlier = {flight.spec: flight for flights in found for flight in flights}
-        """Flights of an earlier run, which are not flown again."""
+        """Flights of an earlier run, which this run does not repeat."""
         run.taken_over += sum(map(bool, found))
 
     def landed(self, flights: Sequence[Flight]) -> None:
@@ -65,7 +65,7 @@ class KeptFlights:
         try:
             return unpacked(self._path(group).read_bytes(), self._groups[group])
         except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
-            return []  # they are flown again
+            return []  # the group flies again
 
     def _path(self, group: Group) -> Path:
         return self._run.folder / FLIGHTS / f"{self._keys[group]}.npz"

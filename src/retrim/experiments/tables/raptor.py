@@ -43,8 +43,8 @@ def raptor(
         run: Folder of raptor.md, raptor.json and the pictures.
         reporter: Receives progress and the sections.
         presets: One for hover and one for tracking.
-        vehicles: Vehicles of the flights; policies are trained for each. small and large have more thrust than RAPTOR
-            was made for.
+        vehicles: Vehicles of the flights; policies are trained for each. small and large lift more than RAPTOR was
+            made for.
         methods: Methods of the flights.
         seeds: Training seeds.
         seconds: Length of a flight [s].

@@ -93,7 +93,7 @@ def fly_all(
     Args:
         study: Policies to fly.
         scenarios: Scenarios of the flights.
-        run: Its folder stores the flights; those that an earlier run has stored there are not flown again.
+        run: Its folder stores the flights; flights that an earlier run has stored there are not repeated.
         reporter: Receives progress.
         methods: Methods of the flights.
         starts: Flights per scenario, method and seed.
