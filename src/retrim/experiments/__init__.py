@@ -1,4 +1,4 @@
-"""Experiments as a library: training, fleets of flights, sweeps, tables, pictures. Nothing here prints."""
+"""Experiments as a library: training, fleets of flights, sweeps, tables, pictures. This package never prints."""
 
 from .cluster import Cluster as Cluster
 from .compile_cache import enable_compile_cache as enable_compile_cache

@@ -1,4 +1,4 @@
-"""What a command is asked for: weights, preset and reference, from files and names, checked against each other."""
+"""Options of a command: weights, preset and reference, from files and names, checked against each other."""
 
 import dataclasses
 from collections.abc import Collection
@@ -21,16 +21,16 @@ from ..io.trained import load_learnt, load_policy
 def loaded(
     policy: Path | None, resume: Path | None, delta: Path | None = None, *, trust: Collection[str] = ()
 ) -> tuple[Policy, Preset, LearnerState | None]:
-    """Return weights, preset, and what an earlier flight learnt.
+    """Return weights, preset, and the learner state of an earlier flight.
 
     Args:
         policy: A policy, or the folder that holds one.
-        resume: Instead of a policy: what an earlier flight learnt.
+        resume: Instead of a policy: the learner state of an earlier flight.
         delta: A low-rank delta to put on the policy.
         trust: Python names that a file may hold, as ``mine:task``.
 
     Raises:
-        ConfigError: There are both or neither, or a delta beside what was learnt.
+        ConfigError: Both or neither of ``policy`` and ``resume`` are given, or ``delta`` together with ``resume``.
         CheckpointError: A file cannot be used.
     """
     if (policy is None) == (resume is None):
@@ -47,48 +47,48 @@ def loaded(
 
 @dataclasses.dataclass(frozen=True)
 class Where:
-    """Where a flight takes place, as a command is asked for it."""
+    """Conditions of a flight, as the options of a command."""
 
     disturbance: str | None = None
-    """What disturbs the flight: none, small, large (the default, but on a vehicle), push, step, kick, reversing, walk,
-    wind, gusts, fan, payload, pickup, battery, weak-rotor, with a size, as wind=6 [m/s] or payload=0.2 [kg], several at
-    once, as wind+payload=0.1, or module:name."""
+    """Disturbance of the flight: none (the default on a vehicle), small, large (the default elsewhere), push, step,
+    kick, reversing, walk, wind, gusts, fan, payload, pickup, battery or weak-rotor. A size may follow, as in wind=6
+    [m/s] or payload=0.2 [kg]. A sum combines several, as in wind+payload=0.1. Or module:name."""
     plant: str = "bem"
-    """bem: blade-element rotors; simple: rotors with linear drag; second-order: a rate loop of second order without
-    rotors; rotorpy, mujoco, crazyflow: independent simulators, each an extra to install; betaflight: its firmware as
-    the rate controller, in real time; mavlink:udp:HOST:PORT, mavlink:serial:DEVICE:BAUD, crazyflie:udp:HOST:PORT,
-    ros:HOST:PORT: a vehicle; or module:name."""
+    """Plant: bem (blade-element rotors), simple (rotors with linear drag), second-order (a rate loop of second order
+    without rotors); rotorpy, mujoco or crazyflow, which are independent simulators, each an extra to install;
+    betaflight (its firmware as the rate controller, in real time); mavlink:udp:HOST:PORT, mavlink:serial:DEVICE:BAUD,
+    crazyflie:udp:HOST:PORT or ros:HOST:PORT for a vehicle; or module:name."""
     reference: str | None = None
-    """What a tracking policy follows: circle, figure8, star, module:name or a CSV file of t, x, y, z[, yaw]; what it
-    was trained on by default. A closed file repeats as laps, another is flown once; my.csv:laps and my.csv:once insist.
-    Another reference than that of training needs a policy that sees it."""
+    """Reference of a tracking policy: circle, figure8, star, module:name or a CSV file of t, x, y, z[, yaw]; by default
+    the reference of its training. A closed file repeats as laps, any other is flown once; my.csv:laps and
+    my.csv:once override this. Only a policy that observes its reference can follow another one than in training."""
     vehicle: str | None = None
-    """Vehicle that the plant simulates: small, large, kingfisher, a vehicle file or module:name; that which the policy
-    was trained for by default. rotorpy and crazyflow fly their own."""
+    """Vehicle that the plant simulates: small, large, kingfisher, a vehicle file or module:name; by default the vehicle
+    of training. rotorpy and crazyflow fly their own."""
     sensors: str = "ideal"
-    """What the policy is shown of the state: ideal, mocap (0.3 mm, 3 mm/s, 1 mrad), onboard (0.6 mm, 6 mm/s, 2 mrad,
-    10 ms late, 1 % of the samples lost), rough (1 mm, 10 mm/s, 3 mrad, 10 ms late, 5 % of the samples lost), or
-    module:name."""
+    """Sensors that measure the state for the policy: ideal, mocap (0.3 mm, 3 mm/s, 1 mrad), onboard (0.6 mm, 6 mm/s,
+    2 mrad, 10 ms late, 1 % of the samples lost), rough (1 mm, 10 mm/s, 3 mrad, 10 ms late, 5 % of the samples lost),
+    or module:name."""
     thrust_error: float = THRUST_ERROR
-    """By how much more than commanded the rotors give, as a share (bem, simple, second-order)."""
+    """Relative thrust error; 0.1 means 10 % more thrust than commanded (bem, simple, second-order)."""
     delay: float = DELAY
-    """Command delay of the plant [s] (bem, simple, second-order); the policy does not know of it."""
+    """Command delay of the plant [s], unknown to the policy (bem, simple, second-order)."""
     fault: str = NO_FAULT
-    """Fault of the measurements, which the policy does not know of (bem, simple, second-order): velocity-spikes,
-    rare-spikes, swapped-markers, late, frozen, repeated, scaled-velocity, velocity-bias, attitude-bias, drift, gaps,
-    clock-jumps, with a size if wanted, as late=3, or module:name."""
+    """Fault of the measurements, unknown to the policy (bem, simple, second-order): velocity-spikes, rare-spikes,
+    swapped-markers, late, frozen, repeated, scaled-velocity, velocity-bias, attitude-bias, drift, gaps, clock-jumps.
+    A size may follow, as in late=3. Or module:name."""
 
     @property
     def is_vehicle(self) -> bool:
-        """Whether a vehicle flies, whose time does not wait."""
+        """Whether the plant is a vehicle, which runs in real time."""
         return is_vehicle(self.plant)
 
     def scenario(self, preset: Preset) -> Scenario:
         """Return the scenario for a policy.
 
         Raises:
-            ConfigError: Something does not exist, or does not fit together.
-            PlantError: What the plant needs is not installed.
+            ConfigError: A name does not exist, or two options are incompatible.
+            PlantError: A requirement of the plant is not installed.
         """
         usual = "none" if self.is_vehicle else "large"
         follows = flown_reference(preset, self.reference)
@@ -100,10 +100,10 @@ class Where:
 
 
 def with_residual(preset: Preset, residual: str | None, state: LearnerState | None) -> Preset:
-    """Return a preset with the residual model that was asked for, if one was.
+    """Return a preset with the given residual model, or unchanged without one.
 
     Raises:
-        ConfigError: There is none of that name, or what an earlier flight learnt has its own.
+        ConfigError: No residual model has this name, or the flight resumes a learner state, which has its own.
     """
     if residual is None:
         return preset
@@ -116,8 +116,8 @@ def flown_reference(preset: Preset, name: str | None) -> str | None:
     """Return the reference of a tracking flight; None for another task.
 
     Args:
-        preset: Of the policy.
-        name: What was asked for; None for what training follows.
+        preset: Preset of the policy.
+        name: Name of the reference; None for the reference of training.
 
     Raises:
         ConfigError: The policy cannot follow it.
@@ -137,10 +137,10 @@ def flown_reference(preset: Preset, name: str | None) -> str | None:
 
 
 def same_policy(trained: Preset, changed_one: Preset, config: Path) -> Preset:
-    """Return ``changed_one``, unless it changes what the weights were trained for.
+    """Return ``changed_one``, unless it changes a value that the weights depend on.
 
     Raises:
-        ConfigError: It does.
+        ConfigError: It changes such a value.
     """
     for name in ("task", "vehicle", "dt", "command_history", "pretrain"):
         before, after = getattr(trained, name), getattr(changed_one, name)
@@ -174,13 +174,13 @@ def asked_preset(
         preset: Name of a preset; by default the task's own.
         config: TOML file on top of it.
         vehicle: Vehicle to train for, on top of both.
-        reference: What to track, on top of both.
+        reference: Reference to track, on top of both.
         residual: Residual model of later adaptation, on top of both.
         trust: Python names that the file may hold, as ``mine:task``.
-        **pretrain: Values of the table ``pretrain``, on top of both; None for those that stay.
+        **pretrain: Values of the table ``pretrain``, on top of both; None leaves a value unchanged.
 
     Raises:
-        ConfigError: A name, key or value does not fit.
+        ConfigError: A name, key or value is invalid.
     """
     entry = find_task(task)
     chosen = load_for(task, preset or entry.default_preset)
@@ -199,5 +199,5 @@ def asked_preset(
 
 
 def _table(value: Any) -> dict[str, Any]:
-    """A dataclass as a plain dictionary; None as an empty one."""
+    """Return a dataclass as a plain dictionary; None as an empty one."""
     return {} if value is None else dataclasses.asdict(value)

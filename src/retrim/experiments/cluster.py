@@ -1,4 +1,4 @@
-"""Jobs for other machines: an executor over Dask's scheduler, which hands them to its workers."""
+"""Jobs on other machines: an executor that submits them to a Dask scheduler, which distributes them to its workers."""
 
 import re
 import socket
@@ -12,21 +12,21 @@ from ..plants.extras import import_extra
 from .provenance import EXTRAS, code, versions
 from .reporter import Reporter
 
-ANSWERS_S = 10.0  # for somebody to be there
-BACK_S = 60.0  # for the scheduler to answer, also after its connection was cut
-WORKERS_S = 30.0  # for the first worker to be there
-ATTEMPTS = 5  # to have a job done that the scheduler forgot, or whose result was lost on the way
+ANSWERS_S = 10.0  # limit for the first connection to the scheduler
+BACK_S = 60.0  # limit for an answer of the scheduler, also after a lost connection
+WORKERS_S = 30.0  # limit for the first worker to connect
+ATTEMPTS = 5  # for a job that the scheduler lost, or whose result did not arrive
 ADDRESS = re.compile(r"(tcp|tls)://\[?(?P<host>[^\]]+)\]?:(?P<port>\d{1,5})")
 ALIKE = ("retrim", "jax", "jaxlib", "equinox", "optax", "numpy", "python")
-"""What must be the same everywhere, so that a flight is the same wherever it is flown."""
+"""Packages whose versions must be equal on all machines, so that a flight does not depend on its machine."""
 
 
 class Cluster(Executor):
-    """An executor whose jobs are done by the workers of a Dask scheduler.
+    """An executor whose jobs run on the workers of a Dask scheduler.
 
-    A job whose worker dies is done again elsewhere, until Dask takes the job for the cause (its ``allowed-failures``,
-    three by default). So is one that the scheduler forgot while the connection to it was cut. Each job's result comes
-    once. Nothing here listens: the scheduler is called.
+    If a worker dies, its job runs again on another one, until Dask considers the job itself the cause (its
+    ``allowed-failures``, three by default). A job that the scheduler lost while the connection was down runs again,
+    too. Each result is delivered once. This process opens no listening port; it connects to the scheduler.
     """
 
     def __init__(self, address: str) -> None:
@@ -36,7 +36,7 @@ class Cluster(Executor):
             address: ``tcp://HOST:PORT``, or ``tls://HOST:PORT`` with the certificates of Dask's own configuration.
 
         Raises:
-            ConfigError: It is no address, nobody answers there, no worker is there, or one has other versions.
+            ConfigError: The address is invalid, no scheduler answers, it has no worker, or a worker has other versions.
             PlantError: Dask is not installed.
         """
         place = ADDRESS.fullmatch(address)
@@ -62,21 +62,21 @@ class Cluster(Executor):
 
     @property
     def workers(self) -> int:
-        """How many workers there are now."""
+        """Current number of workers."""
         return len(self._client.nthreads())
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> "Future[Any]":
-        """Have a function called by a worker; see ``concurrent.futures.Executor``."""
+        """Submit a function call to a worker; see ``concurrent.futures.Executor``."""
         outer: Future[Any] = Future()
         self._start(outer, lambda: self._client.submit(call, ours(), fn, args, kwargs, pure=False), ATTEMPTS)
         return outer
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Leave the scheduler, which drops what was not waited for."""
+        """Disconnect from the scheduler, which then drops unfinished jobs."""
         self._client.close()
 
     def _start(self, outer: "Future[Any]", submit: Callable[[], Any], attempts: int) -> None:
-        """Start a job, and again where it was lost, until its result is there."""
+        """Start a job, and restart it if it is lost, up to the number of attempts."""
         try:
             inner = submit()
         except Exception as error:
@@ -95,10 +95,10 @@ class Cluster(Executor):
                         return
                     except InvalidStateError:
                         raise
-                    except Exception as error:  # on the way from the worker, or it cannot be read here
+                    except Exception as error:  # lost on the way from the worker, or unreadable here
                         lost = _line(error)
                     finally:
-                        done.release()  # or the worker would keep the result as well
+                        done.release()  # otherwise the worker would keep the result as well
                 if attempts > 1 and not outer.done():
                     self._start(outer, submit, attempts - 1)
                 else:
@@ -121,7 +121,7 @@ class Cluster(Executor):
 
 @contextmanager
 def joined(address: str | None, reporter: Reporter) -> Iterator[Cluster | None]:
-    """Yield the cluster at an address, and say how many work there and where its page is; None without an address."""
+    """Yield the cluster at an address, and report its workers and dashboard; yield None without an address."""
     if address is None:
         yield None
         return
@@ -131,7 +131,7 @@ def joined(address: str | None, reporter: Reporter) -> Iterator[Cluster | None]:
 
 
 def ours() -> dict[str, str]:
-    """Return what must be the same everywhere: versions, and the code of retrim."""
+    """Return the values that must be equal on all machines: versions, and the digest of retrim's code."""
     found = versions()
     return {name: found.get(name, "missing") for name in (*ALIKE, *EXTRAS)} | {"code": code()}
 
@@ -140,8 +140,8 @@ def check_alike(theirs: dict[str, str], who: str) -> None:
     """Compare versions with those of this process.
 
     Args:
-        theirs: Of :func:`ours`, in another process.
-        who: That process, for the message.
+        theirs: Result of :func:`ours` in another process.
+        who: Name of that process, for the message.
 
     Raises:
         ConfigError: They differ, with each difference.
@@ -152,7 +152,7 @@ def check_alike(theirs: dict[str, str], who: str) -> None:
 
 
 def call(theirs: dict[str, str], fn: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-    """Call a function on a worker, which may have come late and have other versions than who asks."""
+    """Call a function on a worker; check versions again, since the worker may have joined after the first check."""
     from .compile_cache import enable_compile_cache
 
     check_alike(theirs, "who sent this job to a worker")

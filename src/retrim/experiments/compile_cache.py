@@ -8,20 +8,20 @@ from pathlib import Path
 import jax
 
 MAPS = Path("/proc/self/maps")
-ENOUGH = 30_000  # of the 65,530 memory maps that Linux lets a process have; at the limit it dies of a fault
+ENOUGH = 30_000  # Linux allows a process 65,530 memory maps; at the limit the process crashes
 
 
 def release_programs(above: int = ENOUGH) -> bool:
-    """Give compiled programs back if they hold more than so many memory maps; they are loaded again when needed.
+    """Release compiled programs if the process has more than ``above`` memory maps; they are reloaded when needed.
 
-    Each program holds some. A long table compiles thousands, one set for each of its conditions.
+    Each program holds several maps. A long table compiles thousands of programs, a set for each of its conditions.
 
     Returns:
-        Whether they were given back.
+        Whether the programs were released.
     """
     try:
         many = MAPS.read_bytes().count(b"\n") > above
-    except OSError:  # a system that has no such file
+    except OSError:  # the system has no such file
         return False
     if many:
         jax.clear_caches()
@@ -30,10 +30,10 @@ def release_programs(above: int = ENOUGH) -> bool:
 
 
 def enable_compile_cache() -> Path | None:
-    """Keep compiled programs in the user's cache folder, unless JAX was told otherwise.
+    """Keep compiled programs in the user's cache folder, unless JAX already has a cache folder.
 
-    One folder per version of jax. ``RETRIM_COMPILE_CACHE=0`` switches it off. A fault of the cache never stops a
-    program: it is compiled again.
+    Each version of jax has its own folder. ``RETRIM_COMPILE_CACHE=0`` switches the cache off. An error of the cache
+    does not stop a program; it is compiled again.
 
     Returns:
         The folder; None if there is no cache.

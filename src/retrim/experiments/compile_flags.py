@@ -1,4 +1,4 @@
-"""How JAX's compiler works for a command: flags that must be set before JAX begins."""
+"""Flags of JAX's compiler for a command; they must be set before JAX starts."""
 
 import os
 from importlib.metadata import entry_points, version
@@ -6,20 +6,20 @@ from importlib.metadata import entry_points, version
 from .compile_cache import enable_compile_cache
 
 LONG = ("reproduce", "sweep", "gauntlet", "bench")
-"""Commands that compute for minutes or hours. Workers of a cluster, which no command starts, compile as they do."""
+"""Commands that compute for minutes or hours. Workers of a cluster, which no command starts, compile like these."""
 QUICK = ("--xla_cpu_use_fusion_emitters=false", "--xla_backend_optimization_level=1")
 KNOWN = ("0.8.", "0.9.", "0.10.")
-"""Releases of jaxlib that were tried: later ones end a process for the first of these flags."""
+"""Tested releases of jaxlib; later ones abort the process because of the first of these flags."""
 
 
 def compile_for(command: str) -> None:
-    """Keep compiled programs in the user's cache, and have those of a short command compiled quickly.
+    """Enable the compile cache, and set flags for quick compilation of short commands.
 
-    Compiling takes half the time then, and what is compiled runs up to a sixth slower; most commands are over in
-    seconds. What ``XLA_FLAGS`` says already stands. Nothing changes where JAX has an accelerator's plugin.
+    Compilation then takes half the time, and the programs run up to a sixth slower; most commands finish in seconds.
+    Existing ``XLA_FLAGS`` have precedence. The flags are not set if JAX has an accelerator's plugin.
 
     Args:
-        command: Its name.
+        command: Name of the command.
     """
     if command not in LONG and version("jaxlib").startswith(KNOWN) and not entry_points(group="jax_plugins"):
         given = os.environ.get("XLA_FLAGS", "")

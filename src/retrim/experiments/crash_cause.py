@@ -1,4 +1,4 @@
-"""The likely cause of a crash, with numbers, from what the plant measured and what it was commanded."""
+"""Likely cause of a crash, with numbers, from the measurements and commands in its log."""
 
 from collections.abc import Iterator
 
@@ -8,12 +8,12 @@ from ..physics.state import STANDARD_GRAVITY
 from ..runtime.flight import Log
 
 DELAYS, LAGS = range(11), (0.0, 0.02, 0.04, 0.07, 0.1, 0.15, 0.2, 0.3, 0.5)  # [ticks], [s]
-TICKS = 12  # a flight of fewer says nothing of thrust and rates
-LATER = 0.06  # [s] that rates may be later than in training; the fit of a fast loop is as uncertain
+TICKS = 12  # shorter flights have too little data on thrust and rates
+LATER = 0.06  # [s], tolerated lateness of rates beyond training; the fit of a fast loop has about this uncertainty
 
 
 def likely_cause(log: Log, lateness: float) -> str | None:
-    """Return the first cause that a log shows, or None.
+    """Return the first cause that a log shows; None if it shows no known one.
 
     Args:
         log: A flight that was terminated.
@@ -105,7 +105,7 @@ def _limit(log: Log, lateness: float) -> Iterator[str]:
 
 
 def body_rates(R: np.ndarray, dt: float) -> np.ndarray:
-    """Return mean body rates over each tick [rad/s], of attitudes with a leading time axis."""
+    """Return the mean body rates over each tick [rad/s] from attitudes with a leading time axis."""
     turn = np.swapaxes(R[:-1], 1, 2) @ R[1:]
     skew = 0.5 * (turn - np.swapaxes(turn, 1, 2))
     axis = np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], axis=1)
@@ -115,7 +115,7 @@ def body_rates(R: np.ndarray, dt: float) -> np.ndarray:
 
 
 def _fit(measured: np.ndarray, commanded: np.ndarray, delay: int, lag: float, dt: float) -> tuple[float, float]:
-    """Gain and correlation of rates with commands that are late."""
+    """Return gain and correlation between measured rates and delayed, lagged commands."""
     late = np.concatenate([np.zeros((delay, 2)), commanded[: len(commanded) - delay]])
     share, acting, found = np.exp(-dt / lag) if lag else 0.0, np.zeros(2), np.empty_like(late)
     for k, each in enumerate(late):

@@ -1,4 +1,4 @@
-"""The whole loop in a minute: pretrain, push, adapt; a table and pictures."""
+"""Demonstration of the whole loop in a minute: pretrain, push, adapt; a table and pictures."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -30,7 +30,7 @@ WHY = {
 
 
 class Shown(NamedTuple):
-    """What a demonstration leaves to be looked at."""
+    """Results of a demonstration."""
 
     table: TableSection
     pictures: list[Path]
@@ -41,22 +41,22 @@ class Shown(NamedTuple):
 def demonstrate(
     name: str, plant: str, run: Run, reporter: Reporter, *, seconds: float, starts: int, seed: int
 ) -> Shown | None:
-    """Pretrain a hover policy, push it with disturbances that it never saw, and re-train it while it flies.
+    """Pretrain a hover policy, fly it under unknown disturbances, and re-train it in flight.
 
     Args:
         name: Preset of a hover policy.
-        plant: What flies.
-        run: Where to.
+        plant: Plant of the flights.
+        run: Run whose folder receives the results.
         reporter: Receives lines and progress.
         seconds: Length of a flight.
         starts: Flights per disturbance and method.
-        seed: Seed of everything.
+        seed: Seed of training, starts and flights.
 
     Returns:
-        What is to be looked at; None if pretraining was interrupted.
+        Table and pictures; None if pretraining was interrupted.
 
     Raises:
-        ConfigError: A name does not exist, or the sizes cannot be flown.
+        ConfigError: A name does not exist, or a size is out of range.
     """
     check_seeds([seed])
     check_flights(starts, seconds)

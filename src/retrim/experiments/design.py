@@ -1,4 +1,4 @@
-"""The paper's design study (Sec. IV-C): which model is simulated, and through what the gradient flows."""
+"""The paper's design study (Sec. IV-C): which model is simulated, and which model the gradient flows through."""
 
 import functools
 import math
@@ -42,11 +42,11 @@ class Choice(NamedTuple):
     """A way to simulate and to differentiate."""
 
     rotors: bool
-    """The model has rotors, thrust map, drag and the rate controller, at 1 kHz; otherwise it is a point mass."""
+    """Whether the model has rotors, thrust map, drag and rate controller, at 1 kHz; otherwise it is a point mass."""
     own_gradient: bool
-    """The gradient is that of the model itself; otherwise the point mass's."""
+    """Whether the gradient is that of the simulated model; otherwise it is the point mass's."""
     backprop: bool
-    """Gradients flow through the residual, too."""
+    """Whether gradients flow through the residual, too."""
 
 
 CHOICES = {
@@ -60,18 +60,18 @@ CHOICES = {
 
 
 class Trained(NamedTuple):
-    """What one choice came to."""
+    """Result of one choice."""
 
     policy: Policy
     compile_s: float
     epoch_s: list[float]
-    """Time of an epoch, of each program that was run [s]."""
+    """Mean time of an epoch in each program that was run [s]."""
     residual_rms: float
-    """What the fit left [m/s^2]."""
+    """Root mean square error of the residual fit [m/s^2]."""
 
 
 def flown(setup: Setup, policy: Policy, n: int, seconds: float, seed: int) -> list[Log]:
-    """Fly a policy as it is from random starts, on the study's plant, as one batch."""
+    """Fly a policy without learning from random starts, on the study's plant, as one batch."""
     plants = [Scenario(PUSH, PLANT).make(setup.preset.vehicle, dt=setup.preset.dt) for _ in range(n)]
     controller = PolicyController(setup.flown.observation_in_flight, policy)
     return fly_together(
@@ -83,12 +83,12 @@ def flown(setup: Setup, policy: Policy, n: int, seconds: float, seed: int) -> li
 
 
 def design_dynamics(setup: Setup, residual: Any, choice: Choice) -> AbstractDynamics[Any]:
-    """Return the model of a choice: what is simulated, and what the gradient flows through.
+    """Return the model of a choice, for simulation and for the gradient.
 
     Args:
         setup: Vehicle and control period.
-        residual: What was learnt for the simulated model.
-        choice: How to simulate and to differentiate.
+        residual: Residual that was fitted to the simulated model.
+        choice: Way to simulate and to differentiate.
     """
     simple = PointMass(setup.preset.dt)
     forward = Hybrid(_nominal(setup, choice), residual, backprop=choice.backprop)
@@ -103,13 +103,13 @@ def retrained(setup: Setup, policy: Policy, logs: Sequence[Log], key: Key[Array,
 
     Args:
         setup: Preset of the policy.
-        policy: Where training begins.
-        logs: The flights.
-        key: Consumed.
-        choice: How to simulate and to differentiate.
-        fit_epochs: Of the residual network.
-        epochs: Of the policy; a multiple of ten.
-        envs: Roll-outs of an epoch.
+        policy: Policy that training starts from.
+        logs: Logs of the flights.
+        key: Random key; consumed.
+        choice: Way to simulate and to differentiate.
+        fit_epochs: Epochs of the residual network.
+        epochs: Epochs of the policy; a multiple of ten.
+        envs: Roll-outs per epoch.
     """
     k_fit, k_train = random.split(key)
     nominal = _nominal(setup, choice)
@@ -140,20 +140,23 @@ def _nominal(setup: Setup, choice: Choice) -> AbstractDynamics[Any]:
 
 @functools.cache
 def _adam(learning_rate: float) -> optax.GradientTransformation:
-    """The same object for the same rate, so that what it takes part in is compiled once."""
+    """Return Adam, the same object for the same rate, so that programs with it are compiled once."""
     return optax.adam(learning_rate)
 
 
 @functools.cache
 def _of_policy(learning_rate: float, max_grad_norm: float, epochs: int) -> optax.GradientTransformation:
-    """Adam whose rate falls to zero, as in updates in flight, behind the preset's clip; made once for the numbers."""
+    """Return the optimiser of the policy, cached so that its programs are compiled once.
+
+    The preset's gradient clipping, then Adam with a rate that falls to zero, as in updates in flight.
+    """
     rate = optax.cosine_decay_schedule(learning_rate, epochs)
     return optax.chain(optax.clip_by_global_norm(max_grad_norm), optax.adam(rate))
 
 
 @eqx.filter_jit
 def _rows(windows: Window, nominal: AbstractDynamics[Any], delay_ticks: int) -> Targets:
-    """Targets of many windows (leading axis), one after another."""
+    """Return the targets of many windows (leading axis), concatenated."""
     many = jax.vmap(lambda window: residual_targets(window, nominal, delay_ticks=delay_ticks))(windows)
     return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), many)  # type: ignore[no-any-return]
 

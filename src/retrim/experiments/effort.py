@@ -1,4 +1,4 @@
-"""What each method costs: steps and time of training, of an update in flight, and of one decision."""
+"""Cost of each method: steps and time of training, of an update in flight, and of one decision."""
 
 import time
 from collections.abc import Callable
@@ -19,12 +19,12 @@ from ..learn.window import Window
 from ..physics.state import Command
 from .stopwatch import Stopwatch
 
-RUNS = 9  # of a program that is timed
+RUNS = 9  # runs of each timed program
 DECISIONS = 200
 
 
 def timed(work: Callable[[], Any], runs: int) -> tuple[float, float]:
-    """Return the time that compiling took, and the median of a run [s]."""
+    """Return the compile time, and the median time of a run [s]."""
     watch = Stopwatch()
     jax.block_until_ready(work())
     times, compiled = list[float](), watch.compile_s
@@ -36,11 +36,11 @@ def timed(work: Callable[[], Any], runs: int) -> tuple[float, float]:
 
 
 def updates(setup: Setup, *, lora: bool = False) -> dict[str, Any]:
-    """Time a fit of the residual and an update of the policy, as they are in flight.
+    """Measure the time of a fit of the residual and of an update of the policy, both as in flight.
 
     Args:
-        setup: Its preset says how to learn.
-        lora: Update a low-rank delta.
+        setup: Setup with the preset of adaptation.
+        lora: Whether to update a low-rank delta.
     """
     policy: Any = setup.new_policy(random.key(0))
     if lora:
@@ -62,7 +62,7 @@ def updates(setup: Setup, *, lora: bool = False) -> dict[str, Any]:
 
 
 def decision_s(setup: Setup, controller: AbstractController[Any]) -> float:
-    """Return the time of one decision, the median of many [s]."""
+    """Return the median time of one decision [s]."""
     x = setup.flight_starts(1)[0]
     decide = eqx.filter_jit(lambda controller, memory, t, x: controller(memory, t, x))
     memory, t = controller.init(x), jnp.zeros_like(x.p[0])

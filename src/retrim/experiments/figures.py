@@ -1,4 +1,4 @@
-"""From flights to pictures."""
+"""Pictures of flights."""
 
 import itertools
 from collections.abc import Sequence
@@ -29,17 +29,17 @@ BY_HAND = ("asked", "knobs", "reference")
 def picture(
     flights: Sequence[Flight], setup: Setup, scenario: Scenario, folder: Path, *, stem: str | None = None
 ) -> list[Path]:
-    """Draw the flights of one scenario, method beside method.
+    """Draw the flights of one scenario, with all methods in one picture.
 
     Args:
-        flights: What was flown; flights of other scenarios are left out.
+        flights: Flights; those of other scenarios are left out.
         setup: Preset of the policy, on the scenario's reference.
-        scenario: Which flights to draw.
-        folder: Where to write.
+        scenario: Scenario whose flights are drawn.
+        folder: Output folder.
         stem: Name of the files; by default task and disturbance.
 
     Returns:
-        Paths of the PNG and the SVG; none if there is nothing to draw.
+        Paths of the PNG and the SVG; an empty list if no flight has this scenario.
     """
     shown = [f for f in flights if f.spec.scenario == scenario]
     if not shown:
@@ -77,7 +77,7 @@ def picture(
 
 
 def spans(name: str, home: Array, seconds: float) -> list[plots.Span]:
-    """Return when something disturbs the flight, and what; one span for all that changes all the time."""
+    """Return times and labels of the disturbance in a flight; a disturbance that always changes has one span."""
     times, found, changes = timeline(name, home, seconds)
     if len(changes) > FEW:
         return [plots.Span(0.0, seconds, name, strong=False)]
@@ -91,7 +91,7 @@ def spans(name: str, home: Array, seconds: float) -> list[plots.Span]:
 
 
 def _label(here: ExternalEffects) -> str:
-    """Effects in words; empty if there are none."""
+    """Return the effects in words; an empty text without effects."""
     words = list[str]()
     if np.any(here.push):
         same = len(set(here.push.tolist())) == 1
@@ -107,7 +107,11 @@ def _label(here: ExternalEffects) -> str:
 
 
 def _colours(methods: Sequence[str]) -> dict[str, int]:
-    """The base policy and full adaptation keep theirs; others take what is left, adaptation's first."""
+    """Return a colour per method.
+
+    The base policy and full adaptation have fixed colours. Other methods get the remaining ones in order; the colour
+    of full adaptation is also free if that method is absent.
+    """
     own = {"base": 0, "full": 1}
     left = itertools.count(2 if "full" in methods else 1)
     return {method: own[method] if method in own else next(left) for method in methods}

@@ -24,7 +24,7 @@ from .jobs import Job, fly_job
 from .limits import check_flights, check_seeds
 from .lots import Lot, in_lots, lanes
 
-COMPILED_AFTER = 1.0  # [s] of flight: all programs of a lot have run by then
+COMPILED_AFTER = 1.0  # [s] of flight: all programs of a batch have run by then
 
 
 class Fleet:
@@ -46,17 +46,17 @@ class Fleet:
 
         Args:
             preset: Preset of the policies.
-            policies: By seed; a single one has the seed 0. Policies, or what a method flies in their place.
-            scenarios: Where they fly.
-            methods: How they fly.
+            policies: Policies by seed; a single one has the seed 0. A baseline may have its own network instead.
+            scenarios: Scenarios of the flights.
+            methods: Methods of the flights.
             starts: Flights per scenario, method and seed, each from another start.
             seconds: Length of a flight; the task's own by default.
-            latency: What learning costs in flight time. ``measured`` flies one flight at a time, so that none is
-                charged for another's work.
-            state: What an earlier flight learnt; adapting flights go on from it.
+            latency: How learning is charged to flight time. ``measured`` flies one flight at a time, so that a flight
+                is not charged for the work of another.
+            state: Learner state of an earlier flight; adapting flights resume from it.
 
         Raises:
-            ConfigError: Something does not exist, or does not fit together.
+            ConfigError: A name does not exist, or two settings are incompatible.
         """
         if not scenarios or not methods:
             raise ConfigError(f"{len(scenarios)} scenarios by {len(methods)} methods: there is nothing to fly")
@@ -67,7 +67,7 @@ class Fleet:
         self.policies: dict[int, Any] = dict(policies) if isinstance(policies, Mapping) else {0: policies}
         check_seeds(tuple(self.policies))
         self.setups = {name: Setup.of(preset, name) for name in {s.reference for s in scenarios}}
-        for method in methods:  # some do not fit every task, network or plant
+        for method in methods:  # some methods do not support every task, network or plant
             for setup in self.setups.values():
                 setup.pilot(next(iter(self.policies.values())), method, random.key(0))
             if find_method(method).on_board is not None:
@@ -90,7 +90,7 @@ class Fleet:
         ]
 
     def lots(self, specs: Sequence[FlightSpec]) -> list[Lot]:
-        """Return specifications in lots: those that are flown together as one program, each other one by itself."""
+        """Return specifications in batches; flights that cannot share a program run individually."""
         groups: dict[Hashable, list[FlightSpec]] = {}
         for spec in specs:
             groups.setdefault(spec.group, []).append(spec)
@@ -102,7 +102,7 @@ class Fleet:
         return in_lots(groups.values(), program)
 
     def warm_up(self, specs: Sequence[FlightSpec] | None = None) -> None:
-        """Compile the programs of flights that are flown one by one before their take-off, in this process.
+        """Compile the programs of single flights before their take-off, in this process.
 
         Args:
             specs: Flights; all of the fleet by default.
@@ -130,23 +130,23 @@ class Fleet:
         by_lot: bool = False,
         forget: bool = False,
     ) -> Flights:
-        """Fly.
+        """Fly all or some of the flights.
 
         Args:
             executor: Any executor, which then flies one flight at a time; one with other processes builds its own
-                programs. By default flights of a simulated plant are flown in lots, each as one program, and the others
+                programs. By default flights of a simulated plant run in batches, each as one program, and the others
                 one by one, on one thread per core.
-            progress: Called in this thread when flights are over, and now and then before.
-            landed: Receives flights that were flown to their end, in this thread.
-            stop: Gives up what is flying. Ctrl-C does the same, and sets it.
+            progress: Called in this thread when flights are completed, and periodically before.
+            landed: Receives completed flights, in this thread.
+            stop: Aborts the running flights. Ctrl-C does the same, and sets it.
             only: Fly these specifications, a part of ``specs``.
-            by_lot: Hand an executor of other processes the lots of the default, whose flights then are the same bit for
-                bit, instead of one flight at a time.
-            forget: Return no flights: thousands of logs fill a memory, and ``landed`` has seen them.
+            by_lot: Submit the batches of the default to an executor with other processes, instead of single flights.
+                The flights are then the same bit for bit.
+            forget: Do not return flights: thousands of logs would fill the memory, and ``landed`` has received them.
 
         Returns:
-            The flights that were flown to their end, in the order of the specifications. A job that failed in another
-            process is told beside them.
+            The completed flights, in the order of the specifications, and the flights whose job failed in another
+            process.
 
         Raises:
             PlantError: A plant refused, or its package is not installed.
@@ -172,15 +172,15 @@ class Fleet:
             )
 
     def _here(self, pool: Executor, stop: threading.Event) -> Submit:
-        """Lots are flown in this process."""
+        """Return a function that flies batches in this process."""
         return lambda lot, aloft: pool.submit(self._fly, lot, aloft, stop)
 
     def _away(self, executor: Executor, *, learnt: bool) -> Submit:
-        """Lots are flown by whoever gets the job."""
+        """Return a function that submits batches to an executor with other processes."""
         return lambda lot, aloft: executor.submit(fly_job, self._job(lot.specs, learnt))
 
     def _fly(self, lot: Lot, aloft: Callable[[float], None], stop: threading.Event) -> list[Flight]:
-        """Fly a lot in this process; ``aloft`` is told the share that was flown."""
+        """Fly a batch in this process; ``aloft`` receives the completed share."""
         first = lot.specs[0]
         setup = self.setups[first.scenario.reference]
         policies = [self.policies[spec.seed] for spec in lot.specs]

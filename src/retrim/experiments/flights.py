@@ -1,4 +1,4 @@
-"""One flight of a fleet: its specification, and what it leaves."""
+"""One flight of a fleet: its specification and its results."""
 
 from collections.abc import Hashable
 from dataclasses import dataclass
@@ -14,8 +14,8 @@ from ..runtime.flight import Log
 
 SETTLED = 0.05  # [m]
 LONGEST_SHIFT = 3.0  # [s], half of the longest lap of the paper
-AS_GOOD, AS_GOOD_M = 0.02, 1e-3  # as a share, and [m]: shifts whose errors differ by less are as good as each other
-LEARNER_TAG = 2**30 + 2  # folded into a seed: learners share no key with training, starts and disturbances
+AS_GOOD, AS_GOOD_M = 0.02, 1e-3  # as a share, and [m]: shifts whose errors differ by less count as equally good
+LEARNER_TAG = 2**30 + 2  # folded into a seed, so that learners share no key with training, starts or disturbances
 
 
 @dataclass(frozen=True)
@@ -27,11 +27,11 @@ class FlightSpec:
     start: int
     """Number of the start; it also seeds the learners, the gusts and the noise of the flight."""
     seed: int = 0
-    """Seed of the policy; it also seeds all that ``start`` does."""
+    """Seed of the policy; together with ``start`` it also seeds the learners, the gusts and the noise."""
 
     @property
     def group(self) -> tuple[Hashable, str]:
-        """Key of the flights that one program can fly: they differ in numbers, start and seed only."""
+        """Key of the flights that can share a program: they differ in numbers, start and seed only."""
         return self.scenario.without_numbers(), self.method
 
     def key(self) -> Key[Array, ""]:
@@ -40,30 +40,30 @@ class FlightSpec:
 
     @property
     def plant_seed(self) -> int:
-        """Seed of the plant: the same gusts and noise for every method that flies from a start."""
+        """Seed of the plant, which gives every method the same gusts and noise at the same start."""
         return 1000 * self.seed + self.start
 
 
 @dataclass(frozen=True)
 class Flight:
-    """One flight flown."""
+    """A completed flight."""
 
     spec: FlightSpec
     vehicle: str
-    """Name of the vehicle that flew."""
+    """Name of the vehicle."""
     log: Log
     error: np.ndarray
-    """The task's error in each row of the log [m]."""
+    """Error of the task in each row of the log [m]."""
     metric: str
     """Name of the error."""
     steady_seconds: float
-    """The flight is scored over this long at its end [s]."""
+    """Length of the scored interval at the end of the flight [s]."""
     cross: np.ndarray | None = None
     """Distance from the nearest point of the reference in each row [m], if the task has one."""
     learnt: LearnerState | None = None
-    """What a flight that adapted has learnt."""
+    """Learner state at the end of an adapting flight."""
     target: np.ndarray | None = None
-    """Where the vehicle should have been in each row, world [m]."""
+    """Target position of the vehicle in each row, world [m]."""
 
     @property
     def steady(self) -> float:
@@ -90,16 +90,17 @@ class Flight:
 
     @property
     def behind(self) -> tuple[float, float] | None:
-        """Return by how much the flight is behind its reference [s], and the mean error but for that [m].
+        """Lag of the flight behind its reference [s], and its mean error without this lag [m].
 
-        It is the constant shift in time, of 3 s at most, with the smallest mean error over the last seconds; of shifts
-        that are as good, as those of a lap are, the smallest. None for a flight that was terminated or follows nothing.
+        The lag is the constant shift in time, of at most 3 s, with the smallest mean error over the last seconds. If
+        several shifts are equally good, as on a lap, it is the smallest. Both are absent (None) for a terminated flight
+        or a task without reference.
         """
         if self.cross is None or self.target is None or self.log.terminated:
             return None
         rows = np.flatnonzero(self._late_rows())
         most = min(round(LONGEST_SHIFT / self.log.dt), int(rows[0]), len(rows) // 2)
-        rows = rows[rows + most < len(self.target)]  # the same for every shift, or they could not be compared
+        rows = rows[rows + most < len(self.target)]  # the same rows for every shift, to make errors comparable
         shifts, errors = sorted(range(-most, most + 1), key=abs), list[float]()
         for k in shifts:
             errors.append(float(np.linalg.norm(self.log.p[rows] - self.target[rows - k], axis=1).mean()))
@@ -108,9 +109,9 @@ class Flight:
 
     @property
     def effort(self) -> tuple[float, float]:
-        """Return the commanded body rates, and by how much they change in a tick, both root mean square [rad/s].
+        """Root mean squares of the commanded body rates and of their change per tick [rad/s].
 
-        After the first 5 s; NaN for a flight that was terminated.
+        They are taken after the first 5 s; NaN for a flight that was terminated.
         """
         if self.log.terminated:
             return float("nan"), float("nan")
@@ -125,21 +126,21 @@ class Flight:
 
     @property
     def swaps(self) -> tuple[float, ...]:
-        """Times at which a new policy took over [s]; a live one may do so while landing, which is no part of this."""
+        """Times at which a new policy took over [s], except during the landing of a live flight, after the log."""
         return tuple(e.t for e in self.log.events if e.kind == "policy" and e.t <= self.log.t[-1])
 
     @property
     def events(self) -> tuple[Event, ...]:
-        """What adaptation did."""
+        """Events of the flight, such as those of adaptation."""
         return self.log.events
 
     def _after_start(self) -> np.ndarray:
-        """Rows after the flight to the goal; a short flight is halved."""
+        """Return the rows after the flight to the goal: after 5 s, or after half of a shorter flight."""
         rows: np.ndarray = self.log.t >= min(5.0, self.log.t[-1] / 2)
         return rows
 
     def _late_rows(self) -> np.ndarray:
-        """Rows of the last seconds, by time: a tick may be missed."""
+        """Return the rows of the last seconds, selected by time, since a tick may be missed."""
         rows: np.ndarray = self.log.t > self.log.t[-1] - self.steady_seconds + 0.5 * self.log.dt
         return rows
 

@@ -1,4 +1,4 @@
-"""How the flights of a fleet are flown: one by one, or in lots, each as one program."""
+"""Flies the flights of a fleet, one by one or in batches, each of which is one program."""
 
 from collections.abc import Callable, Hashable, Sequence
 from typing import Any
@@ -28,10 +28,10 @@ FLOOR = -0.5  # [m]: a vehicle below this is terminated; starts may lie at z = 0
 
 
 def plant_of(setup: Setup, spec: FlightSpec) -> Plant:
-    """Return the plant of a flight, with what its method has on board.
+    """Return the plant of a flight, with the on-board controller of its method, if any.
 
     Raises:
-        ConfigError: The method cannot fly it.
+        ConfigError: The method cannot fly the plant.
         PlantError: A package is not installed.
     """
     preset = setup.preset
@@ -55,14 +55,14 @@ def fly_one(
 
     Args:
         setup: Preset of the policy, on the scenario's reference.
-        policy: What flies: a policy, or the network of a method that has its own.
+        policy: A policy, or the network of a method that has its own.
         spec: Scenario, method and seeds.
         x0: State at the start.
         seconds: Length of the flight.
-        latency: What learning costs in flight time.
-        state: What an earlier flight learnt, to go on from.
-        observers: They follow the flight.
-        stop: A ``threading.Event`` that gives the flight up.
+        latency: How learning is charged to flight time.
+        state: Learner state of an earlier flight, to resume from.
+        observers: Observers of the flight.
+        stop: A ``threading.Event`` that aborts the flight.
 
     Raises:
         PlantError: The plant refused.
@@ -80,12 +80,12 @@ def fly_one(
 
 
 def program_of(setup: Setup, policy: Any, specs: Sequence[FlightSpec]) -> Hashable:
-    """Return what tells the program of a batch apart, for flights that differ in start and seed only.
+    """Return a key that identifies the program of a batch of flights that differ in start and seed only.
 
-    It is judged by the first two of them.
+    Only the first two flights are checked.
 
     Returns:
-        None if they cannot be flown as one program.
+        The key; None if the flights cannot run as one program.
 
     Raises:
         PlantError: The package of the plant is not installed.
@@ -114,14 +114,14 @@ def fly_lot(
 
     Args:
         setup: Preset of the policies, on the scenario's reference.
-        policies: What flies, one for each flight.
-        specs: One scenario and method; starts and seeds.
+        policies: Policies or baseline networks, one for each flight.
+        specs: Specifications with the same scenario and method, and different starts and seeds.
         starts: States at the start, one for each flight.
         seconds: Length of the flights.
-        state: What an earlier flight learnt, to go on from.
-        progress: Called now and then with the share that was flown.
-        stop: A ``threading.Event`` that gives the flights up.
-        cold: No such batch was flown yet.
+        state: Learner state of an earlier flight, to resume from.
+        progress: Called periodically with the completed share.
+        stop: A ``threading.Event`` that aborts the flights.
+        cold: Whether this is the first such batch, so that its programs are not compiled yet.
 
     Raises:
         FlightStopped: ``stop`` was set.
@@ -129,7 +129,7 @@ def fly_lot(
     preset = setup.preset
     pilots = [setup.pilot(p, s.method, s.key(), state=state) for p, s in zip(policies, specs, strict=True)]
     plants = [plant_of(setup, spec) for spec in specs]
-    if not can_fly_together(plants, pilots):  # the first two were alike, another one is not
+    if not can_fly_together(plants, pilots):  # the first two are alike, but another one differs
         each = zip(policies, specs, starts, strict=True)
         return [fly_one(setup, policy, spec, x0, seconds, state=state, stop=stop) for policy, spec, x0 in each]
     simulated = [plant for plant in plants if isinstance(plant, SimPlant)]
@@ -142,7 +142,7 @@ def fly_lot(
 
 
 def until_terminated(task: AbstractTask, log: Log) -> Log:
-    """Cut a log where the vehicle left the task's bounds; a batch flies on."""
+    """Cut a log where the vehicle left the task's bounds; a batch does not stop there."""
     left = np.flatnonzero(np.asarray(_all_terminated(task, log.t, log.true.as_state()))[1:])
     if not len(left):
         return log
@@ -155,12 +155,12 @@ def until_terminated(task: AbstractTask, log: Log) -> Log:
 
 
 def learnt_by(pilot: Pilot) -> LearnerState | None:
-    """Return what a pilot has learnt; None if it does not learn."""
+    """Return the learner state of a pilot; None if it does not learn."""
     return pilot.state if isinstance(pilot, AdaptivePilot) else None
 
 
 def scored(setup: Setup, spec: FlightSpec, log: Log, learnt: LearnerState | None = None) -> Flight:
-    """Return a flight with its errors, and why it was terminated if it was."""
+    """Return a flight with its errors, and the reason if it was terminated."""
     task = setup.flown
     error, cross, target = _errors(task, log.t, log.true.as_state())
     if log.terminated:
@@ -180,7 +180,7 @@ def scored(setup: Setup, spec: FlightSpec, log: Log, learnt: LearnerState | None
 
 
 def _why(log: Log, error: float) -> str:
-    """Why a flight was terminated, in words."""
+    """Return the reason of a termination in words."""
     x, y, z = log.p[-1]
     if not all(np.isfinite(part[-1]).all() for part in log.true):
         return "the state is not finite"

@@ -1,4 +1,4 @@
-"""What becomes of flights that are in the air: they land, are told of, or are given up, and none is lost."""
+"""Collects the flights of a fleet: waits for them, reports progress, and keeps all completed ones after a stop."""
 
 import threading
 from collections.abc import Callable, Sequence
@@ -14,23 +14,23 @@ from .lots import Lot
 from .metrics import Rows, rows
 
 GONE: "Future[list[Flight]]" = Future()
-"""In the place of a future whose flights are forgotten; nobody waits for it."""
+"""Placeholder for a future whose flights are forgotten; it is cancelled and never waited for."""
 GONE.cancel()
-OFTEN = 1.0  # [s]: progress is told so often while flights are in the air
+OFTEN = 1.0  # [s]: interval of progress reports while flights are running
 Progress = Callable[[float, int], None]
-"""Called with the number of flights that are over, one in the air by the share that was flown, and of all flights."""
+"""Receives the number of completed flights and of all flights; a running flight counts by its completed share."""
 Submit = Callable[[Lot, Callable[[float], None]], "Future[list[Flight]]"]
-"""Starts a lot; the function that it gets is told the share that was flown."""
+"""Starts a batch; its second argument is a callback that receives the completed share."""
 
 
 def told_by(advance: Callable[[float, str], None]) -> Progress:
-    """Return the progress of a fleet for a bar: ``advance`` takes a share and a text."""
+    """Return a progress callback for a progress bar; ``advance`` receives a share and a text."""
     return lambda done, n: advance(done / n, f"{done:.0f} of {n} flights")
 
 
 @dataclass(frozen=True)
 class Flights:
-    """The flights of a fleet that were flown to their end."""
+    """The completed flights of a fleet."""
 
     flown: list[Flight]
     interrupted: bool
@@ -54,21 +54,21 @@ def gathered(
     outlive: bool = False,
     forget: bool = False,
 ) -> Flights:
-    """Start every lot, and wait until all flights are over or given up.
+    """Start every batch, and wait until all flights are completed or aborted.
 
     Args:
         specs: Flights, in the order in which they are returned.
-        lots: The same, in lots.
-        submit: Starts one.
-        progress: Called in this thread when flights are over, and now and then before.
-        landed: Receives flights that were flown to their end, in this thread.
-        stop: Gives up what is flying. Ctrl-C does the same, and sets it.
-        forget: Keep no flight once ``landed`` has seen it: thousands of logs fill a memory.
-        outlive: Go on where a lot failed, and tell in the end; what does not fit together still ends everything.
+        lots: The same flights, in batches.
+        submit: Starts one batch.
+        progress: Called in this thread when flights are completed, and periodically before.
+        landed: Receives completed flights, in this thread.
+        stop: Aborts the running flights. Ctrl-C does the same, and sets it.
+        forget: Discard each flight after ``landed`` has received it; thousands of logs would fill the memory.
+        outlive: Continue if a batch fails, and return the failures; a configuration error still ends everything.
 
     Raises:
         PlantError: A plant refused.
-        JobError: Nobody can be reached any more who would fly.
+        JobError: The executor cannot be reached any more.
     """
     futures: list[Future[list[Flight]]] = []
     aloft, flown = dict[int, float](), dict[FlightSpec, Flight | None]()
@@ -109,7 +109,7 @@ def gathered(
         stop.set()
         raise
     finally:
-        with interrupts_only_set(stop):  # a further Ctrl-C must not lose what is done
+        with interrupts_only_set(stop):  # a further Ctrl-C must not lose completed flights
             for future in futures:
                 future.cancel()
             late = [future for future in futures if stop.is_set() and not future.cancelled()]

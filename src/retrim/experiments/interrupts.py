@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM and a closed terminal at moments when they must not raise."""
+"""Handling of Ctrl-C, SIGTERM and a closed terminal while they must not raise."""
 
 import contextlib
 import threading
@@ -9,9 +9,9 @@ from ..signals import handled_by
 
 @contextlib.contextmanager
 def interrupts_only_set(stop: threading.Event) -> Iterator[None]:
-    """Let the signals that end a command set ``stop`` and nothing else, so that what is done is written whole.
+    """Let the signals that end a command only set ``stop``, so that output is written completely.
 
-    Only the main thread receives signals; in any other this does nothing.
+    Only the main thread receives signals; in other threads this has no effect.
     """
     with handled_by(lambda *_: stop.set()):
         yield

@@ -1,4 +1,4 @@
-"""A lot of flights as a job for another process: all it needs as a value, and the set-up, built once per process."""
+"""A batch of flights as a job for another process. The job is a plain value; each process builds the set-up once."""
 
 import functools
 from dataclasses import dataclass, replace
@@ -15,24 +15,24 @@ from .flying import fly_lot, fly_one
 
 @dataclass(frozen=True)
 class Job:
-    """Everything that a lot of flights needs, in a form that can be sent to another process."""
+    """Everything that a batch of flights needs, in a form that can be sent to another process."""
 
     fleet: str
-    """Which fleet it belongs to."""
+    """Identifier of its fleet."""
     preset: str
     policies: tuple[Any, ...]
-    """What flies, one for each flight."""
+    """Policies or baseline networks, one for each flight."""
     specs: tuple[FlightSpec, ...]
     starts: tuple[State, ...]
     seconds: float
     latency: Latency
     state: LearnerState | None
     learnt: bool = True
-    """Send back what each flight has learnt, too, which is as large as its log."""
+    """Whether to return the learner state of each flight, too, which is as large as its log."""
 
 
 def fly_job(job: Job) -> list[Flight]:
-    """Fly a job, in another process: several flights as one program, one by itself."""
+    """Fly a job in another process: several flights as one program, or a single flight."""
     setup: Setup = setup_for(job.preset, job.specs[0].scenario.reference, job.fleet)
     if len(job.specs) > 1:
         release_programs()
@@ -49,8 +49,8 @@ def setup_for(preset: str, reference: str | None = None, fleet: str = "") -> Set
 
     Args:
         preset: As JSON.
-        reference: What is flown, by name.
-        fleet: Tells fleets apart: between two of them a file of a reference may have changed.
+        reference: Name of the reference.
+        fleet: Identifier of the fleet; the file of a reference may have changed since another fleet.
     """
     del fleet
     return Setup.of(parse(preset, source="preset"), reference)

@@ -1,4 +1,4 @@
-"""Networks, and states of learning, in the folder of a run: what takes long to train is trained once, and goes on."""
+"""Networks and training states in the folder of a run: a training runs only once, and resumes after an interruption."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -24,21 +24,21 @@ def keep_tree(path: Path, tree: Any, *, kind: str, about: Mapping[str, str] = NO
 
     Args:
         path: The file.
-        tree: Its random keys are written as the numbers that they are made of.
-        kind: What it is.
-        about: What else is told of it, for who opens the file.
+        tree: The tree; random keys are written as their key data.
+        kind: Kind of the content.
+        about: Further metadata for readers of the file.
     """
     write_whole(path, wire.pack(_numbers(tree), kind=kind, about=about))
 
 
 def kept_tree(path: Path, like: T, *, kind: str, reporter: Reporter) -> T | None:
-    """Return what was written, the same to the bit; None if there is nothing, or nothing whole, which is said.
+    """Return the tree that was written, bit for bit; None if there is no file or it is damaged.
 
     Args:
         path: The file.
-        like: A tree of the same structure, with what is no array.
-        kind: What it should be.
-        reporter: Hears of a file that is damaged.
+        like: A tree of the same structure; it supplies the leaves that are not arrays.
+        kind: Expected kind of the content.
+        reporter: Receives a line if the file is damaged.
     """
     if not path.is_file():
         return None
@@ -54,7 +54,7 @@ def kept_tree(path: Path, like: T, *, kind: str, reporter: Reporter) -> T | None
 
 
 def _numbers(tree: Any) -> Any:
-    """The arrays of a tree."""
+    """Return the arrays of a tree, with random keys as key data."""
     arrays = eqx.filter(tree, eqx.is_array)
     return jax.tree.map(lambda leaf: random.key_data(leaf) if _is_key(leaf) else leaf, arrays)
 

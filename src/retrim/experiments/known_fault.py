@@ -1,4 +1,4 @@
-"""A fault of one version of JAX, and how to find it."""
+"""A fault of one version of JAX, and a test for it."""
 
 import jax
 import jax.numpy as jnp
@@ -6,14 +6,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 EXCLUDED = "0.10.2"
-"""The version that computes wrong results on the CPU."""
+"""Version of JAX that computes wrong results on the CPU."""
 
 
 def wrong_rows(n: int, dtype: jnp.dtype) -> int:
-    """Rows that ``jit`` gets wrong of: rotate n vectors (0 ... n-1, 0, 0) by the identity, square, sum.
+    """Return the number of rows that ``jit`` computes wrongly: rotate n vectors by the identity, square, sum.
 
-    jax 0.10.2 returns another row's result once the batch is large enough (jax-ml/jax#39103). Row i must be i^2,
-    exactly in float64 and to rounding in float32.
+    The vectors are (0 ... n-1, 0, 0). jax 0.10.2 returns another row's result once the batch is large enough
+    (jax-ml/jax#39103). Row i must be i^2, exactly in float64 and to rounding in float32.
     """
     rows = np.zeros((n, 3))
     rows[:, 0] = np.arange(n)
@@ -22,7 +22,7 @@ def wrong_rows(n: int, dtype: jnp.dtype) -> int:
     def one(y: Float[Array, "3"]) -> Float[Array, ""]:
         return jnp.sum((identity @ y) ** 2)
 
-    with jax.default_matmul_precision("float32"):  # what is rounded on purpose is no fault
+    with jax.default_matmul_precision("float32"):  # intended rounding is not a fault
         found = np.asarray(jax.jit(jax.vmap(one))(jnp.asarray(rows, dtype=dtype)), dtype=np.float64)
     expected = np.arange(n, dtype=np.float64) ** 2
     tolerance = 0.0 if dtype == jnp.float64 else 1e-6

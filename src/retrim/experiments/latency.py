@@ -1,4 +1,4 @@
-"""How long a message takes between two processes. ``python -m retrim.experiments.latency`` is the other one."""
+"""Latency of messages between two processes. ``python -m retrim.experiments.latency`` is the sending process."""
 
 import os
 import shutil
@@ -17,22 +17,22 @@ from ..transport.remote import Address
 from ..transport.shared_memory import SharedMemoryBus
 
 SIZES = {"a measurement": 500, "the policy of hover/retrim": 74_000, "the policy of hover/paper": 1_100_000}
-"""Bytes of a message, by what it is."""
-COUNT = 200  # messages of a size
+"""Size of each kind of message [bytes]."""
+COUNT = 200  # messages of each size
 EVERY = 0.02  # [s] between two messages
 TOPICS = {"message": 2_000_000}
-FIRST = 10  # messages that are not counted: connections are made
-JOINED = 0.5  # [s], in which both ends find each other
-LONGEST, ANSWERS = 60.0, 20.0  # [s]: for all messages of a size to come, for a rosmaster to be there
+FIRST = 10  # first messages, which do not count: connections are being made
+JOINED = 0.5  # [s], time for both ends to find each other
+LONGEST, ANSWERS = 60.0, 20.0  # [s], time limits: all messages of a size arrive, a rosmaster answers
 
 
 def measured(bus: Bus, words: Sequence[str], size: int) -> list[float]:
-    """Return how long messages took [s], by the monotonic clock that both processes share.
+    """Return the latencies of messages [s], by the monotonic clock that both processes share.
 
     Args:
-        bus: The end that receives.
-        words: Command that starts the other process, before its own arguments.
-        size: Bytes of a message.
+        bus: Receiving end of the bus.
+        words: Command that starts the other process, without the size.
+        size: Size of a message [bytes].
     """
     known = getattr(bus.latest("message"), "version", 0)
     writer = subprocess.Popen([*words, str(size)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -53,7 +53,7 @@ def measured(bus: Bus, words: Sequence[str], size: int) -> list[float]:
 
 
 def write(bus: Bus, size: int) -> None:
-    """Send messages that carry the time at which they were sent."""
+    """Send messages that contain their time of sending."""
     time.sleep(JOINED)
     rest = bytes(size - 16)
     for number in range(FIRST + COUNT):
@@ -64,14 +64,14 @@ def write(bus: Bus, size: int) -> None:
 
 
 def free_port() -> int:
-    """Return a port of the loopback address that nobody uses."""
+    """Return an unused port of the loopback address."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         return int(server.getsockname()[1])
 
 
 @contextmanager
 def rosmaster() -> Iterator[Address | None]:
-    """Run a rosmaster; None where there is none on this machine."""
+    """Run a rosmaster; yield its address, or None if it is not installed."""
     if shutil.which("rosmaster") is None:
         yield None
         return
@@ -95,8 +95,9 @@ def rosmaster() -> Iterator[Address | None]:
 
 @contextmanager
 def two_machines() -> Iterator[tuple[str, Sequence[str]] | None]:
-    """Make two network namespaces with a cable between them; yield the address of this one, and the words that run a
-    command in the other. None where this is not allowed.
+    """Create a second network namespace, with a virtual cable to this one.
+
+    Yield the address of this namespace, and the words that run a command in the other; None without permission.
     """
     name, inside = f"retrim{os.getpid()}", ("ip", "netns", "exec", f"retrim{os.getpid()}")
     here, there = f"rt{os.getpid() % 10**6}a", f"rt{os.getpid() % 10**6}b"
@@ -120,12 +121,12 @@ def two_machines() -> Iterator[tuple[str, Sequence[str]] | None]:
 
 
 def other_process(where: str) -> list[str]:
-    """Return the command of the other process, but for the size; ``where`` is a folder or an address."""
+    """Return the command of the other process, without the size; ``where`` is a folder or an address."""
     return [*PYTHON, "retrim.experiments.latency", where]
 
 
 def main() -> None:
-    """Be the other process."""
+    """Run the sending process."""
     where, size = sys.argv[1], int(sys.argv[2])
     bus = SharedMemoryBus(Path(where)) if "/" in where else Address.of(where).join(TOPICS, listen=False)
     try:

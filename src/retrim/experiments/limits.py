@@ -1,4 +1,4 @@
-"""What can be flown at all: seeds, numbers of starts, lengths of flights. Checked before anything is trained."""
+"""Limits of seeds, numbers of starts and lengths of flights, checked before any training."""
 
 from collections.abc import Sequence
 
@@ -11,7 +11,7 @@ def check_seeds(seeds: Sequence[int]) -> None:
     """Check the seeds of a run.
 
     Raises:
-        ConfigError: There is none, one is there twice, or one is negative or does not fit 32 bits.
+        ConfigError: The list is empty or has duplicates, or a seed is negative or does not fit 32 bits.
     """
     for seed in seeds:
         if not 0 <= seed <= MAX_SEED:
@@ -28,7 +28,7 @@ def check_flights(starts: int, seconds: float | None) -> None:
         seconds: Length of a flight; None for the task's own.
 
     Raises:
-        ConfigError: They cannot be flown.
+        ConfigError: One of them is out of range.
     """
     if not 1 <= starts <= MAX_STARTS:
         raise ConfigError(f"{starts} starts: must be 1 to {MAX_STARTS}")

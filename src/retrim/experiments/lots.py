@@ -1,4 +1,4 @@
-"""Flights that are flown at once, as one program."""
+"""Batches of flights, each of which runs as one program."""
 
 import threading
 from collections.abc import Callable, Hashable, Iterable
@@ -10,28 +10,28 @@ import jax
 from .flights import FlightSpec
 from .provenance import cores
 
-LOT, LARGE = 64, 2048  # flights of one program: on one CPU, on one accelerator
-SMALL = 2  # a flight by itself is stepped by Python, which uses one core however many there are
+LOT, LARGE = 64, 2048  # largest number of flights of one program: on a CPU, on an accelerator
+SMALL = 2  # Python steps a single flight, and uses only one core for it
 
 
 class Lot(NamedTuple):
-    """Flights that are flown at once."""
+    """A batch of flights."""
 
     specs: list[FlightSpec]
     compiled: threading.Event | None
-    """Set when the first lot of its program has compiled it; None for a flight by itself."""
+    """Set when the first batch of the same program has compiled it; None for a single flight."""
     compiles: bool = False
-    """It is the first lot of its program."""
+    """Whether it is the first batch of its program."""
 
 
 def in_lots(groups: Iterable[list[FlightSpec]], program: Callable[[list[FlightSpec]], Hashable | None]) -> list[Lot]:
-    """Divide flights into lots: those that are flown together, each other one by itself.
+    """Divide flights into batches; flights that cannot share a program run individually.
 
-    The first lot of each program comes first: while it compiles, another program's does.
+    The first batch of each program comes first, so that different programs compile at the same time.
 
     Args:
         groups: Flights that differ in numbers of the vehicle, start and seed only.
-        program: It tells the program of a group apart; None if its flights are flown one by one.
+        program: Returns a key that identifies the program of a group; None if its flights run one by one.
     """
     first, others = dict[Hashable, Lot](), list[Lot]()
     for group in groups:
@@ -47,7 +47,7 @@ def in_lots(groups: Iterable[list[FlightSpec]], program: Callable[[list[FlightSp
 
 
 def _parts(group: list[FlightSpec], size: int) -> list[list[FlightSpec]]:
-    """Divide a group; no flight is left over by itself."""
+    """Divide a group into parts of ``size`` flights; a single remaining flight joins the part before it."""
     bounds = [*range(0, len(group), size), len(group)]
     if size > 1 and len(bounds) > 2 and bounds[-1] - bounds[-2] == 1:
         del bounds[-2]
@@ -55,10 +55,10 @@ def _parts(group: list[FlightSpec], size: int) -> list[list[FlightSpec]]:
 
 
 def largest() -> int:
-    """Return how many flights one program has at most, on all devices together."""
+    """Return the largest number of flights of one program, on all devices together."""
     return (LOT if jax.default_backend() == "cpu" else LARGE) * jax.device_count()
 
 
 def lanes() -> int:
-    """Return how many lots fly at once: one for each core, and one where several devices or an accelerator share it."""
+    """Return the number of batches that run at once: one per core, or one for several devices or an accelerator."""
     return cores() if jax.default_backend() == "cpu" and jax.device_count() == 1 else 1

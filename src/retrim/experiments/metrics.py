@@ -1,4 +1,4 @@
-"""From flights to rows of results."""
+"""Rows of results from flights."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -24,11 +24,11 @@ class Rows(list[dict[str, Any]]):
 
 
 CONDITIONS = ("disturbance", "method", "plant", "vehicle", "sensors", "thrust_error", "delay", "fault", "reference")
-"""What the flights of one row have in common."""
+"""Conditions that the flights of one row share."""
 FIGURES = (
     "error", "peak_after_5s", "settle_s", "cross_track_m", "behind_s", "unshifted_m", "rates_rms", "rates_change_rms",
 )  # fmt: skip
-"""What a flight is told by, but whether it crashed."""
+"""Figures of a flight, in addition to whether it crashed."""
 EFFORT = ("rates_rms", "rates_change_rms")
 """Commanded body rates, and their change in a tick [rad/s]."""
 
@@ -66,10 +66,10 @@ def record(flight: Flight) -> dict[str, Any]:
 
 
 def failed_record(spec: FlightSpec, vehicle: str, metric: str, why: str) -> dict[str, Any]:
-    """Return the figures of a flight whose job failed: none but its conditions, and why.
+    """Return the record of a flight whose job failed: its conditions and the reason; all figures are None.
 
     Args:
-        spec: What was to be flown.
+        spec: Specification of the flight.
         vehicle: Name of the vehicle.
         metric: Name of the task's error.
         why: The error, in one line.
@@ -83,8 +83,8 @@ def rows(flights: Sequence[Flight], *, by_seed: bool = False) -> Rows:
     """Return one row per scenario and method: :func:`summary` of each.
 
     Args:
-        flights: What was flown.
-        by_seed: One row for each seed, too.
+        flights: The flights.
+        by_seed: Separate rows for each seed.
     """
     groups: dict[Any, list[Flight]] = {}
     for flight in flights:
@@ -95,15 +95,15 @@ def rows(flights: Sequence[Flight], *, by_seed: bool = False) -> Rows:
 
 
 def summary(records: Sequence[Mapping[str, Any]], keys: Sequence[str] = CONDITIONS) -> dict[str, Any]:
-    """Return one row for flights of the same conditions.
+    """Return one row for flights under the same conditions.
 
     The mean is over the flights that were not terminated; the median and the maximum count a terminated flight as
-    infinite, which is None, so that it cannot hide one. A flight whose job failed says nothing of the method: it counts
-    in ``n`` and is told in ``failures``.
+    infinite (written as None), so that they do not hide a crash. A flight whose job failed gives no information about
+    the method: it counts in ``n`` and is listed in ``failures``.
 
     Args:
-        records: Of :func:`record`.
-        keys: Conditions that the row repeats.
+        records: Results of :func:`record`.
+        keys: Conditions to copy into the row.
     """
     why = [each["failed"] for each in records if each.get("failed")]
     first, records = records[0], [each for each in records if not each.get("failed")]
@@ -141,12 +141,12 @@ def summary(records: Sequence[Mapping[str, Any]], keys: Sequence[str] = CONDITIO
 def interval(records: Sequence[Mapping[str, Any]], draws: int = 2000) -> list[float] | None:
     """Return the 95 % bootstrap interval of the mean error [m]; None if every flight was terminated.
 
-    Training seeds are drawn first, with replacement, and then the flights of each: what seeds have in common is no
-    reason for a narrower interval.
+    Training seeds are drawn first, with replacement, and then the flights of each. Flights of one seed are correlated;
+    this order keeps their correlation from making the interval narrower.
 
     Args:
-        records: Of :func:`record`.
-        draws: Resampled means.
+        records: Results of :func:`record`.
+        draws: Number of resampled means.
     """
     by_seed: dict[Any, list[float]] = {}
     for each in records:
@@ -174,11 +174,11 @@ def _column(records: Sequence[Mapping[str, Any]], name: str) -> np.ndarray:
 
 
 def metres(value: float, digits: int | None = None) -> str:
-    """Return an error [m] as text, and never as zero.
+    """Return an error [m] as text; a value that rounds to zero is written as an upper bound.
 
     Args:
         value: The error.
-        digits: Behind the point; three by default, four below a millimetre.
+        digits: Decimal places; three by default, four below a millimetre.
     """
     return _shown(value, digits or _digits(value))
 
@@ -204,11 +204,11 @@ def _shown(value: float, digits: int) -> str:
 
 
 def cell(row: dict[str, Any], digits: int | None = None) -> str:
-    """Return mean +- standard deviation [m], with the flights that were terminated, or whose job failed.
+    """Return mean ± standard deviation [m], with the numbers of terminated flights and of failed jobs.
 
     Args:
-        row: As :func:`summary` makes it.
-        digits: Behind the point; as in :func:`metres` by default.
+        row: Result of :func:`summary`.
+        digits: Decimal places; as in :func:`metres` by default.
     """
     failed = f", {len(row['failures'])} of {row['n']} failed" if row.get("failures") else ""
     if row["mean"] is None:
@@ -218,12 +218,12 @@ def cell(row: dict[str, Any], digits: int | None = None) -> str:
 
 
 def _finite(value: float) -> float | None:
-    """JSON has no infinity: None."""
+    """Return a finite value unchanged, and otherwise None, since JSON has no infinity."""
     return value if np.isfinite(value) else None
 
 
 def notes(flights: Sequence[Flight], preset: Preset) -> list[str]:
-    """Return which flights crashed and why, a line for each method, and whether no update took effect."""
+    """Return a line with the crashes of each method and their cause, and a line if no update took effect."""
     lines = []
     for method in dict.fromkeys(flight.spec.method for flight in flights):
         same = [flight for flight in flights if flight.spec.method == method]
@@ -237,7 +237,7 @@ def notes(flights: Sequence[Flight], preset: Preset) -> list[str]:
 
 
 def _crashes(method: str, crashed: Sequence[Flight], n: int, preset: Preset) -> str:
-    """Tell the first crash of a method, with its likely cause."""
+    """Return a line on the first crash of a method, with its likely cause."""
     first = min(crashed, key=lambda flight: float(flight.log.t[-1]))
     path = declared_path(preset, make_vehicle(preset.vehicle))
     lateness = float(path.delay + path.response.rate_lag[0])

@@ -36,7 +36,7 @@ class Outlet:
         """Create the outlet of the folder of a run."""
         self.folder, self.spare = folder, spare_folders(folder)
         self.faults: list[str] = []
-        """One line for each file that is in another folder, or nowhere."""
+        """One line for each file that is in another folder, or could not be written."""
 
     def write(self, name: str, put: Callable[[Path], T]) -> T | None:
         """Write one output.
@@ -76,7 +76,7 @@ class Outlet:
         return self.write("results.json", put)
 
     def write_flights(self, flights: Sequence[Flight], preset: Preset) -> None:
-        """Write what flights learnt, their events and their logs, in the place of those of earlier ones."""
+        """Write the learned parameters, events and logs of flights, and remove those of earlier flights."""
         with contextlib.suppress(OSError):
             clear_outputs(self.folder)
         self.write("what was learnt", partial(write_learnt, flights, preset))

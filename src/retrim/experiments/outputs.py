@@ -1,4 +1,4 @@
-"""Files that a run leaves: a trained policy; events and logs of flights, and what they learnt."""
+"""Output files of a run: a trained policy, and the events, logs and learned parameters of flights."""
 
 import json
 from collections.abc import Sequence
@@ -25,12 +25,12 @@ from .run import Run
 def write_trained(
     run: Run, setup: Setup, policy: Policy, losses: Sequence[float], *, seed: int, error_m: float | None = None
 ) -> Path:
-    """Write ``policy.safetensors`` with its ``results.json``; a Ctrl-C comes after both.
+    """Write ``policy.safetensors`` with its ``results.json``; a Ctrl-C takes effect after both.
 
     Args:
-        run: Where to.
+        run: Run whose folder receives the files.
         setup: Preset of the policy.
-        policy: What was trained.
+        policy: Trained policy.
         losses: Loss of each optimiser step.
         seed: Seed of the training.
         error_m: Error in the policy's own model [m], once it is known.
@@ -39,7 +39,7 @@ def write_trained(
         Path of the policy.
 
     Raises:
-        OSError: The folder cannot be written any more.
+        OSError: The folder is no longer writable.
     """
     preset, path = setup.preset, run.folder / "policy.safetensors"
     row: dict[str, Any] = {"task": preset.task, "preset": preset.name, "updates": len(losses)}
@@ -52,7 +52,7 @@ def write_trained(
 
 
 def write_flights(flights: Sequence[Flight], preset: Preset, folder: Path) -> None:
-    """Write events and logs of flights, and what they learnt, in the place of those of earlier ones."""
+    """Write events, logs and learned parameters of flights, and remove those of earlier flights."""
     clear_outputs(folder)
     write_events(flights, folder)
     write_logs(flights, folder)
@@ -60,7 +60,7 @@ def write_flights(flights: Sequence[Flight], preset: Preset, folder: Path) -> No
 
 
 def clear_outputs(folder: Path) -> None:
-    """Remove what an earlier command left of flights in a folder that is used again, before new files are written."""
+    """Remove the flight files of an earlier command from a folder, before new ones are written."""
     for name in ("learnt.safetensors", "adapted.safetensors", "delta.safetensors", "events.jsonl"):
         (folder / name).unlink(missing_ok=True)
     for log in (folder / "logs").glob("*"):
@@ -69,7 +69,7 @@ def clear_outputs(folder: Path) -> None:
 
 
 def write_events(flights: Sequence[Flight], folder: Path) -> None:
-    """Write ``events.jsonl``: what adaptation did, and why a flight was terminated, flight by flight."""
+    """Write ``events.jsonl``: the adaptation events and the reason of a termination, flight by flight."""
     lines = [
         json.dumps(
             {
@@ -89,7 +89,7 @@ def write_events(flights: Sequence[Flight], folder: Path) -> None:
 
 
 def write_logs(flights: Sequence[Flight], folder: Path) -> None:
-    """Write each flight under ``logs/``: as NPZ, and as MCAP where what writes it is installed."""
+    """Write each flight under ``logs/``, as NPZ, and as MCAP if the MCAP writer is installed."""
     (folder / "logs").mkdir(parents=True, exist_ok=True)
     for flight in flights:
         spec, recording = flight.spec, recording_of(flight)
@@ -100,7 +100,7 @@ def write_logs(flights: Sequence[Flight], folder: Path) -> None:
 
 
 def recording_of(flight: Flight) -> Recording:
-    """Return what is recorded of a flight."""
+    """Return the recording of a flight."""
     log = flight.log
     measured, true = (np.concatenate([x.p, x.R.reshape(-1, 9), x.v], axis=1) for x in (log.measured, log.true))
     follows = np.concatenate([log.u[1:], log.u[-1:]])  # a log's row has the command of the tick that it ended
@@ -119,10 +119,10 @@ def recording_of(flight: Flight) -> Recording:
 
 
 def write_learnt(flights: Sequence[Flight], preset: Preset, folder: Path) -> None:
-    """Write what the first whole adapting flight learnt.
+    """Write the learner state of the first adapting flight that was not terminated.
 
-    ``learnt.safetensors`` (to go on from), and ``adapted.safetensors`` (a policy) or ``delta.safetensors`` (of a
-    low-rank one).
+    ``learnt.safetensors`` (to resume from), and ``adapted.safetensors`` (a policy) or ``delta.safetensors`` (for a
+    low-rank policy).
     """
     learnt = next((f.learnt for f in flights if f.learnt is not None and not f.log.terminated), None)
     if learnt is not None:
@@ -130,7 +130,7 @@ def write_learnt(flights: Sequence[Flight], preset: Preset, folder: Path) -> Non
 
 
 def write_state(learnt: LearnerState, preset: Preset, folder: Path) -> None:
-    """Write what was learnt, to go on from, and the policy or the low-rank delta that came of it."""
+    """Write a learner state, to resume from, and its policy or low-rank delta."""
     save_learnt(folder / "learnt.safetensors", learnt, preset)
     policy = learnt.policy.policy
     if isinstance(policy, LoraPolicy):

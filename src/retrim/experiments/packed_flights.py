@@ -1,4 +1,4 @@
-"""Flights as one NPZ file, to the last bit; what each has learnt is not in it."""
+"""Flights as one NPZ file, exact to the last bit, without their learner states."""
 
 import io
 import json
@@ -18,7 +18,7 @@ def packed(flights: Sequence[Flight]) -> bytes:
     """Return flights as an NPZ file.
 
     Args:
-        flights: Their specifications are not in it.
+        flights: Flights; the file does not contain their specifications.
     """
     arrays, about = dict[str, Any](), list[dict[str, Any]]()
     for i, flight in enumerate(flights):
@@ -39,11 +39,11 @@ def unpacked(data: bytes, specs: Sequence[FlightSpec]) -> list[Flight]:
     """Return the flights of :func:`packed`.
 
     Args:
-        data: The file.
-        specs: Their specifications.
+        data: Content of the file.
+        specs: Specifications of the flights.
 
     Raises:
-        ValueError: It has another number of flights; what is no such file raises what NumPy's reading of it does.
+        ValueError: The file has another number of flights. An invalid file raises an error of NumPy's reader.
     """
     with np.load(io.BytesIO(data), allow_pickle=False) as file:
         arrays: dict[str, np.ndarray] = dict(file)

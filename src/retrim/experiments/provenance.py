@@ -1,4 +1,4 @@
-"""Where results come from: commit, versions, hardware and command line."""
+"""Provenance of results: commit, versions, hardware and command line."""
 
 import contextlib
 import functools
@@ -16,18 +16,18 @@ import jax
 
 PACKAGES = ("retrim", "jax", "jaxlib", "equinox", "optax", "numpy")
 EXTRAS = ("rotorpy", "mujoco", "crazyflow", "foundation-policy")
-"""Packages that fly in some flights, where they are installed."""
+"""Optional packages that some flights use."""
 UNKNOWN = "unknown"
-"""In the place of a commit, where the package is no checkout."""
+"""Substitute for the commit if the package is not in a checkout."""
 PACKAGE = ("src", "pyproject.toml")
-"""What of a checkout is the package."""
+"""Paths of a checkout that belong to the package."""
 
 
 @functools.cache
 def commit() -> str:
-    """Return the commit of the checkout of this package, with ``-dirty`` for local changes of it; or ``unknown``.
+    """Return the commit of this package's checkout, with ``-dirty`` if the package has local changes, or ``unknown``.
 
-    Results that are written into the checkout, and notes that lie there, are no changes of the package.
+    Results and notes in the checkout do not count as changes of the package.
     """
     here = Path(__file__).resolve().parent
 
@@ -47,7 +47,7 @@ def commit() -> str:
 
 @functools.cache
 def code() -> str:
-    """Return a digest of the files of this package: the same code has the same, committed or changed or installed."""
+    """Return a digest of the files of this package; it depends on the code only, not on commits or installation."""
     here, digest = Path(__file__).resolve().parents[1], hashlib.sha256()
     for path in sorted(here.rglob("*")):
         if path.is_file() and "__pycache__" not in path.parts:
@@ -56,18 +56,18 @@ def code() -> str:
 
 
 def describe_code() -> str:
-    """Return the commit in words; of an installed package, which has none, its version and the digest of its code."""
+    """Return the commit in words; for an installed package, which has no commit, its version and code digest."""
     return f"Commit {commit()}" if commit() != UNKNOWN else f"retrim {version('retrim')}, installed, code {code()}"
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of Python, of the packages that compute, and of those extras that are installed."""
+    """Return the versions of Python, of the numerical packages, and of the installed extras."""
     return dict(_versions())
 
 
 @functools.cache
 def _versions() -> dict[str, str]:
-    """What is looked up in files of every package, and asked for with every flight of a sweep."""
+    """Return the versions, cached: each look-up reads package files, and every flight of a sweep needs them."""
     found = {name: version(name) for name in PACKAGES}
     for name in EXTRAS:
         with contextlib.suppress(PackageNotFoundError):
@@ -76,10 +76,10 @@ def _versions() -> dict[str, str]:
 
 
 def section_key(**what: Any) -> str:
-    """Return what tells a section apart: everything that it follows from, and the code that makes it.
+    """Return a key that identifies a section: a digest of its inputs, the code and the versions.
 
     Args:
-        **what: Numbers, texts, and lists and dictionaries of them.
+        **what: Inputs of the section: numbers, texts, and lists and dictionaries of them.
     """
     text = json.dumps({"code": code(), "versions": versions(), **what}, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]

@@ -1,4 +1,4 @@
-"""Figures of the blade-element plant beside published ones."""
+"""Figures of the blade-element plant compared with published ones."""
 
 from typing import Any
 
@@ -18,7 +18,7 @@ GOLDEN_HOVER = (
 
 
 def published() -> list[dict[str, Any]]:
-    """Our figures beside published ones."""
+    """Return our figures with the published ones."""
     big, little = five_inch(), three_inch()
     still = Settled(big, 1109.15, 0.0, 0.0)
     low = Settled(little, 1548.8, 0.0, 0.0)
@@ -46,7 +46,7 @@ def published() -> list[dict[str, Any]]:
 
 
 class Settled:
-    """One rotor in steady air, its inflow found."""
+    """Forces and induced velocity of one rotor in steady air."""
 
     def __init__(self, prop: Propeller, omega: float, v_hor: float, v_ver: float) -> None:
         forces, inflow = settled_rotor(prop, jnp.array(omega), jnp.array(v_hor), jnp.array(v_ver))
@@ -59,10 +59,10 @@ def settled_rotor(prop: Propeller, omega: Array, v_hor: Array, v_ver: Array) -> 
     """Return forces and inflow of a rotor in steady air.
 
     Args:
-        prop: Its blades.
+        prop: Propeller of the rotor.
         omega: Speed of the rotor [rad/s].
-        v_hor: Speed of the air in its plane [m/s].
-        v_ver: Speed along its axis, positive when descending [m/s].
+        v_hor: Speed of the air in the rotor plane [m/s].
+        v_ver: Speed along the rotor axis, positive when descending [m/s].
     """
     return rotor(prop, omega, v_hor, v_ver, Inflow.above(omega.dtype), steps=16)
 

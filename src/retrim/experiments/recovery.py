@@ -1,4 +1,4 @@
-"""When a disturbance changes, and how soon a flight has recovered from it."""
+"""Times at which a disturbance changes, and the recovery times of a flight."""
 
 from collections.abc import Sequence
 
@@ -12,17 +12,17 @@ from ..physics.effects import ExternalEffects
 from ..physics.state import State
 
 STEP = 0.1  # [s], between samples of a disturbance
-AT_ONCE = 0.5  # [s]
-FEW = 10  # a disturbance with more changes in a flight changes all the time
+AT_ONCE = 0.5  # [s], changes within this time count as one
+FEW = 10  # a disturbance with more changes in a flight counts as changing all the time
 
 
 def timeline(name: str, home: Array, seconds: float) -> tuple[np.ndarray, ExternalEffects, list[int]]:
-    """Sample what a disturbance does at a place.
+    """Sample the effects of a disturbance at a position.
 
     Args:
-        name: Disturbance.
-        home: Where, world [m].
-        seconds: For how long.
+        name: Name of the disturbance.
+        home: Position, world [m].
+        seconds: Length of the time line [s].
 
     Returns:
         Times [s], the effects at each (leading axis), and the samples at which they differ from the one before.
@@ -35,9 +35,9 @@ def timeline(name: str, home: Array, seconds: float) -> tuple[np.ndarray, Extern
 
 
 def change_times(name: str, home: Array, seconds: float) -> list[float]:
-    """Return when a disturbance changes in flight [s]; nothing for one that does all the time, or never.
+    """Return the times at which a disturbance changes in flight [s]; empty if it always changes, or never.
 
-    A change that follows another within half a second is part of it: a kick is one, not two.
+    Changes within half a second count as one; a kick is one change, not two.
     """
     times, _, changes = timeline(name, home, seconds)
     if len(changes) > FEW:
@@ -49,18 +49,18 @@ def change_times(name: str, home: Array, seconds: float) -> list[float]:
 def recoveries(
     t: np.ndarray, error: np.ndarray, changes: Sequence[float], limit: float, *, terminated: bool = False
 ) -> list[float]:
-    """Return how long after each change the error stays below ``limit`` until the next [s].
+    """Return the recovery time after each change [s]; then the error stays below ``limit`` until the next change.
 
     Args:
         t: Times of a flight [s].
-        error: Its error at each [m].
-        changes: When the world changed [s].
-        limit: [m]
-        terminated: The flight was; it has not recovered.
+        error: Error at each time [m].
+        changes: Times at which the world changed [s].
+        limit: Largest error after recovery [m].
+        terminated: Whether the flight was terminated, which counts as no recovery.
 
     Returns:
-        One time for each change, infinite where the limit is exceeded at the end; without changes, one time from the
-        start of the flight.
+        One time for each change, infinite if the error is above the limit at the end; without changes, one time from
+        the start of the flight.
     """
     starts = list(changes) or [0.0]
     found = list[float]()

@@ -1,11 +1,11 @@
-"""How long work tells what it does; the library itself never prints."""
+"""Interface for progress reports of long work; the library itself never prints."""
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from typing import Protocol, runtime_checkable
 
 Advance = Callable[[float, str], None]
-"""From the share that is done (0 to 1) and a short text to nothing."""
+"""Receives the completed share (0 to 1) and a short text."""
 
 
 @runtime_checkable
@@ -17,18 +17,18 @@ class Reporter(Protocol):
         ...
 
     def progress(self, title: str) -> AbstractContextManager[Advance]:
-        """Return a context in which the advance of one piece of work is received."""
+        """Return a context manager whose value receives the progress of one piece of work."""
         ...
 
 
 class Silent:
-    """Says nothing."""
+    """Reporter without output."""
 
     def say(self, text: str) -> None:
-        """Ignore it."""
+        """Ignore the line."""
 
     def progress(self, title: str) -> AbstractContextManager[Advance]:
-        """Ignore all of it."""
+        """Ignore the progress."""
         return nullcontext(_ignore)
 
 

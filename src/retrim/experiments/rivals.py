@@ -1,4 +1,4 @@
-"""Baselines that are trained before they fly: DATT, by reinforcement learning."""
+"""Baselines that need training before a flight: DATT, by reinforcement learning."""
 
 import time
 from collections.abc import Sequence
@@ -21,30 +21,30 @@ from .provenance import section_key
 from .reporter import Reporter
 from .run import Run
 
-DATT_STEPS = 20_000_000  # the paper's
+DATT_STEPS = 20_000_000  # as in the paper
 DATT_PPO: dict[str, Any] = {"envs": 64, "steps": 256, "minibatches": 8, "epochs": 6, "learning_rate": 2e-3}
 DATT_TAG = 2**30 + 5  # folded into a seed: DATT shares no key with the policies
 PARTLY = ".partly"
-"""Ending of a file with the state of a training that was cut."""
+"""File name suffix of the state of an interrupted training."""
 KEEP_EVERY = 30.0
-"""Time between two states of a training that are kept [s]."""
+"""Time between two saved states of a training [s]."""
 
 
 def check_steps(steps: int) -> None:
-    """Refuse a number of training steps that is none.
+    """Check the number of training steps.
 
     Raises:
-        ConfigError: It is below one, or beyond what a computer does in a day.
+        ConfigError: It is below one, or more than a computer can do in a day.
     """
     if not 1 <= steps <= 10**10:
         raise ConfigError(f"--datt-steps {steps} must be between 1 and 10,000,000,000")
 
 
 def check_rival(preset: Preset) -> None:
-    """Refuse a control period that does not fit the look-ahead.
+    """Check that the control period of a preset divides DATT's look-ahead step and is at most 20 ms.
 
     Raises:
-        ConfigError: It names the preset.
+        ConfigError: It does not, or is longer; the message names the preset.
     """
     apart = APART / preset.dt
     if abs(apart - round(apart)) > 1e-6 or preset.dt > 0.02:
@@ -55,7 +55,7 @@ def check_rival(preset: Preset) -> None:
 
 
 def steps_made(steps: int) -> int:
-    """Return the steps that are made where ``steps`` are asked for: whole updates."""
+    """Return the number of training steps for a request of ``steps``, rounded up to whole updates."""
     settings = PpoSettings(**DATT_PPO)
     return settings.updates(steps) * settings.envs * settings.steps
 
@@ -68,10 +68,10 @@ def trained_datt(
     Args:
         preset: Vehicle, control period and declared lag.
         seeds: Seeds of networks, references and episodes.
-        run: Its ``trained`` keeps the networks, and the state of a training that is cut, which goes on from there; an
-            interruption leaves out the seeds that are not complete.
+        run: Its ``trained`` stores the networks, and the state of an interrupted training, which resumes from there.
+            After an interruption the incomplete seeds are missing in the result.
         reporter: Receives progress.
-        steps: Steps of training.
+        steps: Number of training steps.
     """
     setup, nets = Setup.of(preset), dict[int, DattNet]()
     tau = prediction_of(setup).tau
@@ -102,7 +102,10 @@ def trained_datt(
 def _trained(
     problem: DattProblem, state: PpoState, settings: PpoSettings, steps: int, path: Path, run: Run, reporter: Reporter
 ) -> PpoState | None:
-    """Learn, from where an earlier run was cut; None if this one is, too. Its state is beside ``path`` then."""
+    """Train, from the saved state of an earlier run if there is one.
+
+    Return None if this run is interrupted, too; its state is then saved next to ``path``.
+    """
     partly, updates = path.with_suffix(PARTLY), settings.updates(steps)
     title = f"DATT, seed {path.stem.rpartition('_seed')[2]}"
     if (kept := kept_tree(partly, state, kind="ppo", reporter=reporter)) is not None:
@@ -125,4 +128,4 @@ def _trained(
 
 
 RIVALS = {"datt": trained_datt}
-"""By method: from a preset and seeds to what is flown in place of the policies."""
+"""Training functions by method: they return the networks for a preset and seeds, which replace the policies."""

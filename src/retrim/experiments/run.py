@@ -1,4 +1,4 @@
-"""The folder of a run: created once, results written whole, an interruption remembered."""
+"""The folder of a run: it is created once, files are written atomically, and an interruption is recorded."""
 
 import contextlib
 import json
@@ -16,14 +16,14 @@ from .stopwatch import Stopwatch
 
 SCHEMA = "retrim.results/2"
 PARTS = "sections"
-"""Folder of the parts of a run that are finished, whatever happens to the rest."""
+"""Folder of the finished parts of a run, which an interruption does not affect."""
 INTERRUPTED = 130  # exit code
 
 
 class Run:
     """Folder, stopwatch and stop token of one command.
 
-    ``stop`` is set by the first Ctrl-C, also where the KeyboardInterrupt itself is lost; long work looks at it.
+    The first Ctrl-C sets ``stop``, even if the KeyboardInterrupt itself is lost; long computations poll it.
     """
 
     def __init__(
@@ -39,12 +39,12 @@ class Run:
         """Choose the folder and check that it can be written.
 
         Args:
-            command: Names the folder if ``out`` is None: a new one under ``runs/``.
+            command: Name of the command; if ``out`` is None, the folder is a new one under ``runs/`` with this name.
             out: The folder.
             stop: Set when the run should end early.
-            remark: What its documents say of how they were made.
-            trained: Folder of what is trained, for several runs; the run's own by default.
-            executor: Who trains and flies, in other processes; by default this one does.
+            remark: Remark for its documents on how they were made.
+            trained: Folder of trained networks, which several runs may share; the run's own folder by default.
+            executor: Executor with other processes for training and flights; by default this process does both.
 
         Raises:
             ConfigError: The folder cannot be written.
@@ -53,40 +53,40 @@ class Run:
         self.remark = remark
         self.trained = trained or self.folder
         self.executor, self.failed = executor, False
-        self.pages: list[Path] = []  # that its documents have written
+        self.pages: list[Path] = []  # pages that its documents have written
         self.watch = Stopwatch()
         self.taken_over = 0
-        """Parts, and groups of flights, that an earlier run had made."""
+        """Number of parts and groups of flights that were taken from an earlier run."""
         self.stop = stop or threading.Event()
-        commit(), code()  # as they are now: the run may last for hours
+        commit(), code()  # cached now, since the files may change during a run of hours
         check_writable(self.folder)
 
     def of_earlier(self) -> str:
-        """Return what becomes of what lies in the folder, in a line; empty if there is nothing."""
+        """Return a line that reports if the run resumes or replaces earlier results; empty if the folder has none."""
         if any((self.folder / PARTS).glob("*")):
             return f"results in {self.folder}: what the same code made there of the same things stays, the rest goes"
         return f"results in {self.folder} are replaced" if any(self.folder.glob("*.json")) else ""
 
     @property
     def interrupted(self) -> bool:
-        """Whether the run was told to end early."""
+        """Whether the run was stopped early."""
         return self.stop.is_set()
 
     @property
     def exit_code(self) -> int:
-        """0; 130 for a run that was interrupted, 1 for one of which a part failed."""
+        """Exit code: 0, or 130 after an interruption, or 1 if a part failed."""
         return INTERRUPTED if self.interrupted else int(self.failed)
 
     @contextlib.contextmanager
     def interruptible(self) -> Iterator[None]:
-        """Let a Ctrl-C end the block early, and be remembered, instead of raising further."""
+        """Let a Ctrl-C end the block early and set ``stop``, instead of raising further."""
         try:
             yield
         except KeyboardInterrupt:
             self.stop.set()
 
     def write_text(self, name: str, text: str) -> Path:
-        """Write a file of the folder, whole; return its path."""
+        """Write a file of the folder atomically; return its path."""
         path = self.folder / name
         write_whole(path, text)
         return path

@@ -1,4 +1,4 @@
-"""Compile time apart from run time."""
+"""Measures JAX compile time separately from run time."""
 
 import threading
 import time
@@ -13,7 +13,7 @@ EVENTS = (
 
 
 class Stopwatch:
-    """Separates compiling (tracing, lowering, XLA, reading the compile cache) from running, from its creation on."""
+    """Measures compile time (tracing, lowering, XLA, reading the compile cache) and run time since its creation."""
 
     def __init__(self) -> None:
         self._began = time.perf_counter()
@@ -27,7 +27,7 @@ class Stopwatch:
             self.compiled(max(self._began, now - duration_secs), now)
 
     def compiled(self, start: float, end: float) -> None:
-        """Note that something was being compiled; overlapping intervals count once."""
+        """Add an interval of compilation; overlapping intervals count once."""
         with self._lock:
             while self._compiling and self._compiling[-1][1] >= start:
                 before = self._compiling.pop()
@@ -36,13 +36,13 @@ class Stopwatch:
 
     @property
     def compile_s(self) -> float:
-        """Seconds so far in which something was being compiled."""
+        """Compile time so far [s]."""
         with self._lock:
             return sum((end - start for start, end in self._compiling), start=0.0)
 
     @property
     def total_s(self) -> float:
-        """Seconds since the start."""
+        """Time since the start [s]."""
         return time.perf_counter() - self._began
 
     def sentence(self) -> str:

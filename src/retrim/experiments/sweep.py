@@ -50,15 +50,15 @@ class Sweep:
     disturbances: tuple[str, ...] = Field(default=("none",), min_length=1)
     plants: tuple[str, ...] = Field(default=("bem",), min_length=1)
     vehicles: tuple[str | VehicleSpec, ...] = ()
-    """Vehicles that fly; that of training by default. A file is looked up beside the sweep's, and its content kept."""
+    """Vehicles of the flights; by default that of training. Paths are relative to the sweep file; contents are kept."""
     sensors: tuple[str, ...] = Field(default=("ideal",), min_length=1)
     references: tuple[str, ...] = ()
-    """What tracking policies follow."""
+    """References of tracking policies."""
     starts: int = Field(default=1, ge=1, le=100_000, strict=True)
     seconds: float | None = Field(default=None, ge=1.0, le=36_000.0, strict=True)
     """Length of a flight; the task's own by default."""
     overlay: dict[str, Any] = Field(default_factory=dict)
-    """Values on top of every preset, as in a preset's own TOML file: a vehicle file is looked up beside the sweep's."""
+    """Values on top of every preset, as in its TOML file; a vehicle file is relative to the sweep file."""
 
     def scenarios(self) -> list[Scenario]:
         """Return every combination of disturbance, plant, vehicle, sensors and reference."""
@@ -80,7 +80,7 @@ def read_sweep(path: Path, trust: Collection[str] = ()) -> Sweep:
         trust: Python names that it may hold, as ``mine:task``.
 
     Raises:
-        ConfigError: It cannot be read, a key or value does not fit, or it names Python code that is not trusted.
+        ConfigError: It cannot be read, a key or value is invalid, or it names Python code that is not trusted.
     """
     tables = read_toml(path)
     if isinstance(overlay := tables.get("overlay"), dict):
@@ -93,26 +93,26 @@ def read_sweep(path: Path, trust: Collection[str] = ()) -> Sweep:
 
 
 def run_sweep(sweep: Sweep, run: Run, reporter: Reporter) -> Rows:
-    """Train and fly everything that the run's folder does not hold yet.
+    """Train all policies and fly all flights that are not yet in the run's folder.
 
-    Policies are kept in ``policies/``, each flight's row in ``flights.jsonl``; a run that was killed goes on from
-    those that this code made from these files. ``sweep.md``, ``sweep.json`` and ``sweep.png`` are written at the end,
-    and after an interruption.
+    Policies are stored in ``policies/``, and a row for each flight in ``flights.jsonl``. After a kill the run resumes
+    from those that the same code made from the same files. ``sweep.md``, ``sweep.json`` and ``sweep.png`` are written
+    at the end, and after an interruption.
 
     Returns:
         One row per preset, scenario and method.
 
     Raises:
-        ConfigError: Something does not exist or does not fit together; found before anything is trained.
+        ConfigError: A name does not exist, or two settings are incompatible; raised before any training.
     """
     check_seeds(sweep.seeds)
     presets = [changed(load(name), **sweep.overlay) for name in sweep.presets]
     fleets = [_fleet(preset, _untrained(preset, sweep), sweep) for preset in presets]
     for fleet in fleets:
         for scenario in sweep.scenarios():
-            scenario.make(fleet.preset.vehicle, dt=fleet.preset.dt)  # a package may be missing
+            scenario.make(fleet.preset.vehicle, dt=fleet.preset.dt)  # fails if a package is missing
     kept = _Kept(run.folder / "flights.jsonl")
-    # Once, before anything is flown: a file that is changed meanwhile is another one for the next run only.
+    # The keys are made once, before the first flight; a file that changes meanwhile affects the next run only.
     keys = [{spec: _key(fleet.preset, spec, fleet.seconds) for spec in fleet.specs} for fleet in fleets]
     for preset, of_fleet in zip(presets, keys, strict=True):
         with run.interruptible():
@@ -131,12 +131,12 @@ def _fleet(preset: Preset, policies: Mapping[int, Policy], sweep: Sweep) -> Flee
 
 
 def _untrained(preset: Preset, sweep: Sweep) -> dict[int, Policy]:
-    """Stand-ins, to plan flights before anything is trained."""
+    """Return untrained policies, to plan the flights before training."""
     return dict.fromkeys(sweep.seeds, Setup.of(preset).new_policy(random.key(0)))
 
 
 def _fly(fleet: Fleet, keys: Mapping[FlightSpec, str], kept: "_Kept", run: Run, reporter: Reporter) -> None:
-    """Fly what is missing, and keep what has landed."""
+    """Fly the missing flights, and store the rows of completed ones."""
     missing = [spec for spec, key in keys.items() if key not in kept.rows]
     if not missing or run.interrupted:
         return
@@ -160,7 +160,7 @@ def _fly(fleet: Fleet, keys: Mapping[FlightSpec, str], kept: "_Kept", run: Run, 
 
 
 class _Kept:
-    """Rows of flights that are over, one line of JSON each; a torn last line, and what failed, is flown again."""
+    """Rows of completed flights, one line of JSON each. Failed flights and those of unreadable lines fly again."""
 
     def __init__(self, path: Path) -> None:
         self._path, self.rows = path, dict[str, dict[str, Any]]()
@@ -174,13 +174,13 @@ class _Kept:
         self.earlier = frozenset(self.rows)
 
     def add(self, rows: Mapping[str, Mapping[str, Any]]) -> None:
-        """Keep rows by their keys; the whole file is written."""
+        """Add rows by their keys, and rewrite the file."""
         self.rows |= {key: {"key": key, **row} for key, row in rows.items()}
         write_whole(self._path, "".join(json.dumps(each) + "\n" for each in self.rows.values()))
 
 
 def _is_record(row: Any) -> bool:
-    """Whether a line holds what is summed up of a flight."""
+    """Return whether a line is the record of a flight, with valid types."""
     if not (isinstance(row, dict) and isinstance(row.get("key"), str) and row.keys() >= {*GROUP, *FIGURES, "metric"}):
         return False
     texts = all(row[name] is None or isinstance(row[name], str) for name in (*GROUP, "metric"))
@@ -193,7 +193,7 @@ def _key(preset: Preset, spec: FlightSpec, seconds: float) -> str:
 
 
 def _report(sweep: Sweep, kept: Sequence[dict[str, Any]], run: Run, reporter: Reporter) -> Rows:
-    """Write the documents of the flights that are over, in the order of the sweep."""
+    """Write the documents of the completed flights, in the order of the sweep."""
     groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
     for row in kept:
         groups.setdefault(tuple(row[name] for name in GROUP), []).append(row)
@@ -217,7 +217,7 @@ def _report(sweep: Sweep, kept: Sequence[dict[str, Any]], run: Run, reporter: Re
 
 
 def _bar_groups(groups: Mapping[tuple[Any, ...], list[dict[str, Any]]]) -> dict[str, dict[str, list[float]]]:
-    """Errors of flights by scenario and method, infinite for those that crashed."""
+    """Return the errors of flights by scenario and method; they are infinite for crashed flights."""
     shown: dict[str, dict[str, list[float]]] = {}
     varied = [i for i, name in enumerate(GROUP[:-1]) if len({group[i] for group in groups}) > 1] or [5]
     for group, flights in groups.items():

@@ -23,7 +23,7 @@ from .reporter import Reporter, Silent
 
 
 class Trained(NamedTuple):
-    """Result of pretraining; after an interruption the last state that was reached."""
+    """Result of pretraining; after an interruption its last state."""
 
     policy: Policy
     losses: list[float]
@@ -36,7 +36,7 @@ def train(
     """Pretrain a policy.
 
     Args:
-        setup: What to train.
+        setup: Setup of the preset to train.
         seed: Seed of weights and starts.
         reporter: Receives the progress.
         stop: Ends training after the current steps; Ctrl-C does the same, and sets it.
@@ -72,18 +72,18 @@ def trained_elsewhere(
     """Pretrain a policy for each seed, all at once, in other processes.
 
     Args:
-        preset: What to train.
+        preset: Preset to train with.
         seeds: Seeds of weights and starts.
-        executor: Hands a seed to whoever is free.
+        executor: Executor with other processes, which trains one seed per job.
         reporter: Receives the progress.
-        stop: Gives up what is not trained yet; Ctrl-C does the same, and sets it.
-        landed: Receives each policy as it comes.
+        stop: Aborts the unfinished trainings; Ctrl-C does the same, and sets it.
+        landed: Receives each policy when it is trained.
 
     Returns:
-        By seed. Complete, but after ``stop``.
+        Policies by seed; all of them, unless ``stop`` was set.
 
     Raises:
-        JobError: A training failed; told once the others have come.
+        JobError: A training failed; raised after the others are completed.
     """
     jobs = {executor.submit(train_job, dump(preset), seed): seed for seed in seeds}
     found, failed, waiting = dict[int, Policy](), list[str](), set(jobs)
@@ -119,21 +119,21 @@ def nominal_error(setup: Setup, policy: Policy, *, n: int = 64, seed: int = 1) -
 
     Args:
         setup: Preset of the policy.
-        policy: What flies.
-        n: Number of roll-outs, from starts of its training.
+        policy: The policy.
+        n: Number of roll-outs, from starts as in training.
         seed: Seed of the starts.
     """
     return _mean_error(setup, _long(setup).env, policy, n, seed)
 
 
 def model_error(setup: Setup, policy: Policy, residual: FittedResidual, *, n: int = 64, seed: int = 1) -> float:
-    """Return the same in the model that a residual corrects, as the policy sees it in flight."""
+    """Return the same error in the model with a residual, with the observation that the policy has in flight."""
     learner = _long(setup).learner
     return _mean_error(setup, learner.view(learner.env, residual), policy, n, seed)
 
 
 def _long(setup: Setup) -> Setup:
-    """The set-up with roll-outs of 6 s."""
+    """Return the setup with roll-outs of 6 s."""
     return Setup.of(changed(setup.preset, pretrain={"horizon": round(6.0 / setup.preset.dt)}))
 
 

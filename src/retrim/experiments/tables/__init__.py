@@ -1,4 +1,4 @@
-"""The paper's tables and figures, one file each; every one is a function of a run and a reporter."""
+"""The paper's tables and figures, one file each; each table is a function of a run and a reporter."""
 
 from .ablation import ablation as ablation
 from .buses import buses as buses
@@ -23,4 +23,4 @@ MADE = (
     hover, reversing, track, phase, vision, plants, model, fast, ablation, design, efficiency, transfer, raptor,
     buses, tuning, scaling,
 )  # fmt: skip
-"""Those of ``retrim reproduce``; the gauntlet is a command of its own."""
+"""Tables of ``retrim reproduce``; the gauntlet has its own command."""

@@ -1,4 +1,4 @@
-"""Ablation: each lever removed from the default preset and added to the paper's, beside control without learning."""
+"""Ablation: each component removed from our preset and added to the paper's, next to control without learning."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -39,16 +39,16 @@ def ablation(
     seconds: float = 24.0,
     starts: int = 8,
 ) -> None:
-    """Which lever does what: each off our preset, each on the paper's, beside control without learning.
+    """Effect of each component: removed from our preset, added to the paper's, next to control without learning.
 
     Args:
-        run: Folder of ablation_hover.md or ablation_track.md, and of the JSON beside it. The same command goes on where
-            it was killed.
+        run: Folder of ablation_hover.md or ablation_track.md, and of its JSON file. The same command resumes after a
+            kill.
         reporter: Receives progress and the sections.
         task: hover or track.
         seeds: Training seeds; each also seeds the starts, the gusts and the learners of its flights.
         seconds: Length of a flight [s].
-        starts: Flights per disturbance, lever and seed.
+        starts: Flights per disturbance, component and seed.
     """
     check_seeds(seeds)
     check_flights(starts, seconds)
@@ -94,7 +94,7 @@ def _flown(
     starts: int,
     seconds: float,
 ) -> tuple[TableSection, list[dict[str, Any]]]:
-    """Fly one lever under all disturbances; return its line of the table, and the rows behind it."""
+    """Fly one component under all disturbances; return its line of the table, and the rows behind it."""
     run, reporter = document.run, document.reporter
     cells, found = list[str](), list[dict[str, Any]]()
     for reference in REFERENCES[task]:
@@ -111,14 +111,14 @@ def _flown(
 
 
 def _follows(preset: Preset, reference: str | None) -> Preset:
-    """Return the preset of a policy for ``reference``: without preview it is trained on the reference that it flies."""
+    """Return the preset of a policy for ``reference``; a policy without preview is trained on this reference."""
     if reference is None or preset.track is None or preset.track.looks_ahead:
         return preset
     return changed(preset, track={"reference": reference})
 
 
 def _study(preset: Preset, studies: dict[str, Study], seeds: Sequence[int], run: Run, reporter: Reporter) -> Study:
-    """Policies of a preset; those whose training is the same are trained once."""
+    """Return the policies of a preset; presets with the same training share them."""
     key = dump(replace(preset, adapt=Adapt()))
     if key not in studies:
         studies[key] = train_all(preset, seeds, run, reporter)

@@ -1,4 +1,4 @@
-"""What a table of errors leaves out: intervals, recovery, worst error, phase and effort."""
+"""Supplement of a table of errors: intervals, recovery, worst error, phase and effort."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -9,12 +9,12 @@ from .document import TableSection
 
 
 def figures_table(found: Sequence[dict[str, Any]], title: str, levels: Mapping[str, str]) -> TableSection:
-    """Lay the other figures of a section out, at its last level: methods down.
+    """Return the supplementary figures of a section at its last level, a row per method.
 
     Args:
         found: Rows of results.
-        title: Of the section.
-        levels: Disturbances, and what they are called.
+        title: Title of the section.
+        levels: Disturbances and their labels.
     """
     level = list(levels)[-1]
     tracks = any(row.get("behind_s") is not None for row in found)

@@ -1,4 +1,4 @@
-"""How long messages take over each bus."""
+"""Latency of messages over each bus."""
 
 from collections.abc import Sequence
 from contextlib import closing
@@ -25,7 +25,7 @@ COLUMNS = ("bus", "message", "p50 [ms]", "p99 [ms]", "max [ms]", "arrived")
 
 
 def buses(run: Run, reporter: Reporter) -> None:
-    """How long messages take over shared memory, zenoh (also between two network namespaces) and ROS 1.
+    """Latency of messages over shared memory, zenoh (also between two network namespaces) and ROS 1.
 
     Args:
         run: Folder of buses.md and buses.json.

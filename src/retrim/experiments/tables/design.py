@@ -43,15 +43,15 @@ def design(
     starts: int = 8,
     epochs: int = POLICY_EPOCHS,
 ) -> None:
-    """The design study: which model, whose gradient, and whether it flows through the residual; time and error.
+    """The design study: time and error by model, by source of the gradient, and with or without residual gradients.
 
     Args:
         run: Folder of design.md and design.json.
         reporter: Receives progress and the section.
         preset: A preset for hover, to train the base policies with.
         seeds: Training seeds.
-        starts: Flights that are scored, of each seed.
-        epochs: Of re-training; a multiple of ten.
+        starts: Scored flights per seed.
+        epochs: Epochs of re-training; a multiple of ten.
     """
     (loaded,) = table_presets([preset], "hover", seeds=seeds, starts=starts, seconds=SCORED_S)
     if epochs < CHUNK or epochs % CHUNK:

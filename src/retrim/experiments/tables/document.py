@@ -11,7 +11,7 @@ from ..provenance import describe_code, describe_hardware
 from ..reporter import Reporter
 from ..run import Run
 
-MOST = 2000  # characters of a cell
+MOST = 2000  # largest number of characters of a text
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class TableSection:
     about: str = ""
     """Text above the table."""
     picture: Path | None = None
-    """A picture below it, in the folder of the document."""
+    """Picture below the table, in the folder of the document."""
 
     def markdown(self) -> list[str]:
         """Return the section as lines of Markdown."""
@@ -39,7 +39,7 @@ class TableSection:
 
 
 def as_text(text: str) -> str:
-    """Return a text on one line in which Markdown finds no link and no HTML, whoever wrote it."""
+    """Return a text on one line, escaped so that Markdown finds no links or HTML in untrusted text."""
     return _escaped(one_line(text, MOST))
 
 
@@ -77,7 +77,7 @@ class Document:
     data: str | None = None
     """Name of the JSON file; that of the document by default."""
     sections: list[TableSection] = field(default_factory=list)
-    """What was added."""
+    """Sections so far."""
     _rows: list[dict[str, Any]] = field(default_factory=list)
 
     def add(self, section: TableSection, rows: Sequence[dict[str, Any]] = ()) -> None:

@@ -1,4 +1,4 @@
-"""What each method costs: the paper's figures of compute and of samples, beside ours."""
+"""Cost of each method: the paper's figures of compute and of samples, compared with ours."""
 
 import tempfile
 from pathlib import Path
@@ -42,13 +42,13 @@ def efficiency(
     presets: tuple[str, ...] = ("hover/retrim", "hover/fast", "hover/paper"),
     datt_steps: int = DATT_STEPS,
 ) -> None:
-    """What each method costs: steps and time of training, of an update in flight, and of one decision.
+    """Cost of each method: steps and time of training, of an update in flight, and of one decision.
 
     Args:
         run: Folder of efficiency.md and efficiency.json.
         reporter: Receives progress and the section.
         presets: Presets for hover.
-        datt_steps: Steps of training DATT.
+        datt_steps: Training steps of DATT.
     """
     loaded = table_presets(presets, "hover", seeds=(0,), starts=1, seconds=1.0)
     if not loaded:
@@ -82,7 +82,7 @@ def efficiency(
             rows.append({"method": name, "decision_s": decision_s(setup, baseline.controller(setup, random.key(0)))})
     if not run.interrupted:
         watch = Stopwatch()
-        with tempfile.TemporaryDirectory() as folder:  # trained afresh, whatever the run's folder has
+        with tempfile.TemporaryDirectory() as folder:  # always trained anew, even if the run's folder has the network
             afresh = Run("efficiency", Path(folder), stop=run.stop)
             nets: dict[int, DattNet] = trained_datt(loaded[0], [0], afresh, reporter, steps=datt_steps)
         compiling = watch.compile_s

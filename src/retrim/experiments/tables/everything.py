@@ -40,17 +40,17 @@ PLAN: tuple[tuple[Callable[..., None], str, Options], ...] = (
     (raptor, "beside RAPTOR", {}),
     (track, "Table II", {"methods": WITH_DATT}),
 )
-"""Table, what of the paper it is, and its options. What is timed comes first, when the machine is least busy."""
+"""Table, its place in the paper, and its options. Timed tables come first, when the machine is least busy."""
 QUICK_LEAVES_OUT = (phase, plants)
 AT_LEAST = "at least "
-"""Where an earlier run was killed, whose time nobody has noted; one that was interrupted is counted."""
+"""Prefix of a time that lacks the time of a killed run; the time of an interrupted run is recorded and counted."""
 
 
 def everything(run: Run, reporter: Reporter, *, quick: bool = False) -> None:
-    """All tables of the paper: an overview, and a folder for each. The same command goes on where it was killed.
+    """All tables of the paper: an overview, and a folder for each. The same command resumes after a kill.
 
     Args:
-        run: Folder of everything.md, or everything_quick.md, and of a folder for each table.
+        run: Folder of everything.md or everything_quick.md, and of a folder for each table.
         reporter: Receives progress and the sections.
         quick: One seed, two starts and short flights, in a folder quick/; other plants and the paper's
             formulation of tracking are left out.
@@ -83,7 +83,7 @@ def everything(run: Run, reporter: Reporter, *, quick: bool = False) -> None:
             row |= before
         else:
             took = _read(run, begun) or {"s": 0.0, "at_least": False}
-            _write(run, begun, took | {"at_least": True})  # unless this run comes to tell how long it took
+            _write(run, begun, took | {"at_least": True})  # overwritten or removed below unless this run is killed
             try:
                 make(part, reporter, **options)
             except PlantError as error:
@@ -96,7 +96,7 @@ def everything(run: Run, reporter: Reporter, *, quick: bool = False) -> None:
                 _write(run, begun, took)
             else:
                 (run.folder / begun).unlink()
-                if page.is_file():  # of other code or options another page may be there one day
+                if page.is_file():  # the digest shows whether other code or options have overwritten the page
                     _write(run, done, took | {"page": digest_of(page)})
         rows.append(row)
     lines = [
@@ -110,13 +110,13 @@ def everything(run: Run, reporter: Reporter, *, quick: bool = False) -> None:
 
 
 def _minutes(rows: Sequence[dict[str, Any]]) -> str:
-    """Return how long tables took together."""
+    """Return the total time of tables [min]."""
     at_least = any(row["at_least"] for row in rows)
     return f"{AT_LEAST * at_least}{sum(row['s'] for row in rows) / 60:.1f}"
 
 
 def _read(run: Run, name: str) -> dict[str, Any] | None:
-    """Return what an earlier run has noted; None if it did not."""
+    """Return the note of an earlier run; None if there is no such file."""
     try:
         noted: dict[str, Any] = json.loads((run.folder / name).read_text())
     except OSError:

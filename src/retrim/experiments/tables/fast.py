@@ -37,13 +37,13 @@ def fast(
     Args:
         run: Folder of fast.md, fast.json and the pictures.
         reporter: Receives progress and the sections.
-        preset: Preset to train and fly; its vehicle flies.
-        references: What is flown: shapes with a top speed [m/s], and CSV files.
-        methods: How they fly.
+        preset: Preset to train and fly, on its own vehicle.
+        references: Shapes with a top speed [m/s], and CSV files.
+        methods: Methods of the flights.
         seeds: Training seeds.
         seconds: Length of a flight [s].
         starts: Flights per disturbance, method and seed.
-        plant: Where the policies fly.
+        plant: Plant of the flights.
     """
     (loaded,) = table_presets([preset], "track", seeds=seeds, starts=starts, seconds=seconds)
     sections = [_section(loaded, reference, plant, methods) for reference in references]

@@ -1,4 +1,4 @@
-"""The gauntlet: one policy under everything that changes."""
+"""The gauntlet: one policy under many changes of the world."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
@@ -29,10 +29,10 @@ from .study import fly_all, refuse_misfits, table_presets, train_all
 METHODS: dict[str, tuple[str, ...]] = {
     "hover": ("base", "base-i", "base-do", "geometric-i", "indi", "full"),
     "track": ("base", "base-i", "base-do", "geometric-i", "indi", "full"),
-    "vision": ("base", "base-do", "full"),  # what every preset can fly
+    "vision": ("base", "base-do", "full"),  # methods that every preset supports
 }
 FAULT_METHODS = ("base", "base-do", "geometric-i", "indi", "full", "lora")
-CORES = 2  # that a condition keeps busy: its adapting flights, of a few starts, are all that takes long
+CORES = 2  # that one condition uses; only its adapting flights, from a few starts, take long
 METRICS = {"steady": "[m]", "late": "[m]", "peak": "[m]", "recovery_5cm": "[s]", "recovery_2cm": "[s]"}
 INTRO = """\
 Made by `retrim gauntlet`. The preset's own vehicle on plant `bem`, with {sensors} sensors, unless the row says
@@ -67,24 +67,24 @@ def gauntlet(
     count: int = 200,
     draw: int = 0,
 ) -> None:
-    """A policy under everything that changes: recovery, steady and worst error, as one heat map.
+    """A policy under many changes of the world: recovery, steady and worst error, as one heat map.
 
     Args:
         run: Folder of gauntlet.md, results.json and the pictures.
         reporter: Receives progress and the table.
         preset: A preset for hover, tracking or vision, to train with.
-        only: Conditions to fly; all by default. One whose plant is not installed is left out, with a line.
-        methods: How the policies fly; by default base, base-i, base-do and full, and beside them geometric-i and indi;
-            for vision base, base-do and full.
+        only: Conditions to fly; all by default. A condition whose plant is not installed is left out and reported.
+        methods: Methods of the flights; by default base, base-i, base-do, geometric-i, indi and full, and for vision
+            base, base-do and full.
         seeds: Training seeds; each also seeds the starts, the gusts and the learners of its flights.
         seconds: Length of a flight [s]; those of hidden vehicles last 10 s, or 25 s on figure-8s.
         starts: Flights per condition, method and seed.
-        sensors: What the conditions are measured with that name no sensors themselves: ideal, mocap, onboard or rough.
+        sensors: Sensors of the conditions that do not name their own: ideal, mocap, onboard or rough.
         faults: Fly faults of measurements and vehicle at hover instead, and check that adapting is never worse than not
-            adapting; by default base, base-do, geometric-i, indi, full and lora.
-        vehicles: own: the vehicle of the preset under all conditions; hidden: many vehicles that no method is told, at
-            hover under a push, or on figure-8s with a preset for tracking. Without --methods, the page compares
-            hover/any or track/any with methods for a known vehicle.
+            adapting; by default with base, base-do, geometric-i, indi, full and lora.
+        vehicles: own: the vehicle of the preset under all conditions; hidden: many vehicles that are unknown to every
+            method, at hover under a push, or on figure-8s with a preset for tracking. Without --methods, the page
+            compares hover/any or track/any with methods for a known vehicle.
         count: Number of hidden vehicles.
         draw: Seed of the hidden vehicles.
     """
@@ -129,7 +129,7 @@ def gauntlet(
                 flown[name] = own
                 found += rows_of(name, own, change_times(scenario.disturbance, home, seconds))
         if found:
-            run.write_results(found, seeds=seeds)  # a kill loses what is in the air
+            run.write_results(found, seeds=seeds)  # written now, so that a kill loses running flights only
     if found:
         if faults:
             document.more["promise"] = promise_rows(flown)
@@ -141,10 +141,10 @@ def gauntlet(
 
 
 def _installed(preset: Preset, asked: Mapping[str, Scenario]) -> tuple[dict[str, Scenario], list[str]]:
-    """Return the conditions whose plants are installed, and a line on each other one.
+    """Return the conditions whose plants are installed, and a line on each of the others.
 
     Raises:
-        PlantError: None of them is.
+        PlantError: No condition has an installed plant.
     """
     found, lacking, why = dict[str, Scenario](), list[str](), None
     for name, scenario in asked.items():
@@ -163,9 +163,9 @@ def rows_of(name: str, flights: Sequence[Flight], changes: Sequence[float]) -> l
     """Return a row for each method and metric of a condition.
 
     Args:
-        name: The condition.
-        flights: Its flights.
-        changes: When its world changed [s].
+        name: Name of the condition.
+        flights: Flights of the condition.
+        changes: Times at which its world changed [s].
     """
     found = list[dict[str, Any]]()
     for method in dict.fromkeys(flight.spec.method for flight in flights):
@@ -243,7 +243,7 @@ def _cell(row: dict[str, Any]) -> str:
 
 
 def _best_and_worst(flown: dict[str, list[Flight]]) -> Any:
-    """Time lines of the flights with the smallest and the largest peak of the last method, beside the base policy's."""
+    """Plot the errors of all methods from the starts at which the last method had its smallest and largest peak."""
     last = [(name, f) for name, flights in flown.items() for f in flights if f.spec.method == flights[-1].spec.method]
     ranked = sorted(last, key=lambda pair: pair[1].peak)
     panels = []

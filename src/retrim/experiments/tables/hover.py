@@ -39,10 +39,10 @@ def hover(
         seeds: Training seeds; each also seeds the starts and the learners of its flights.
         seconds: Length of a flight [s].
         starts: Flights per disturbance, method and seed.
-        plant: Where the policies fly.
-        sensors: What they are shown of the state.
-        methods: How they fly, and baselines that need none of the policies; these fly once, beside the first preset.
-        datt_steps: Steps of training DATT, if it is among the methods.
+        plant: Plant of the flights.
+        sensors: Sensors that measure the state for the policies.
+        methods: Methods for the policies, and baselines without a policy; baselines fly once, with the first preset.
+        datt_steps: Training steps of DATT, if it is among the methods.
     """
     loaded = table_presets(presets, "hover", seeds=seeds, starts=starts, seconds=seconds)
     scenario = Scenario(plant=plant, sensors=sensors)

@@ -1,4 +1,4 @@
-"""Sections that a run has finished are kept in its folder: the same command goes on where it was killed."""
+"""Stores the finished sections of a run in its folder, so that the same command resumes after a kill."""
 
 import dataclasses
 import hashlib
@@ -21,9 +21,9 @@ def keep(run: Run, key: str, section: TableSection, rows: list[dict[str, Any]]) 
 
 
 def kept(run: Run, key: str) -> tuple[TableSection, list[dict[str, Any]]] | None:
-    """Return a section that an earlier run of this folder has finished, with its rows; None if there is none.
+    """Return a section that an earlier run has finished in this folder, with its rows; None if it is not there.
 
-    Another run may have drawn over its picture since: then it is made again.
+    It is also None if another run has overwritten the picture of the section, which is then made again.
     """
     path = run.folder / PARTS / f"{key}.json"
     if not path.is_file():
@@ -43,10 +43,10 @@ def kept(run: Run, key: str) -> tuple[TableSection, list[dict[str, Any]]] | None
 
 
 def files_behind(*names: str | None) -> dict[str, str]:
-    """Return digests of the files that stand behind names: of CSV files, and of the modules of ``module:name``.
+    """Return digests of the files that names refer to: CSV files, and the modules of ``module:name``.
 
     Args:
-        *names: Of anything, sums of them too. Modules that they name have been imported.
+        *names: Names of any kind, and sums of names. Their modules must have been imported.
     """
     found = dict[str, str]()
     for part in (part for name in names if name for part in name.split("+")):
@@ -58,14 +58,14 @@ def files_behind(*names: str | None) -> dict[str, str]:
 
 
 def named_in(preset: Preset) -> list[str | None]:
-    """Return the names in a preset behind which a file may stand."""
+    """Return the names in a preset that may refer to a file."""
     trained_on = None if preset.track is None else preset.track.reference
     vehicle = preset.vehicle if isinstance(preset.vehicle, str) else None
     return [preset.task, preset.adapt.residual, trained_on, vehicle]
 
 
 def named_by(scenario: Scenario) -> list[str | None]:
-    """Return the names in a scenario behind which a file may stand."""
+    """Return the names in a scenario that may refer to a file."""
     vehicle = scenario.vehicle if isinstance(scenario.vehicle, str) else None
     return [scenario.plant, scenario.sensors, scenario.disturbance, scenario.reference, vehicle]
 

@@ -1,4 +1,4 @@
-"""Flights of a table that is not made yet are kept in its folder: the same command goes on where it was killed."""
+"""Stores the flights of an unfinished table in its folder, so that the same command resumes after a kill."""
 
 import hashlib
 import shutil
@@ -22,21 +22,21 @@ from .kept import files_behind, named_by, named_in
 
 FLIGHTS = f"{PARTS}/flights"
 Group = tuple[Hashable, str]
-"""Of a specification; see :attr:`FlightSpec.group`."""
+"""Group key of a specification; see :attr:`FlightSpec.group`."""
 
 
 class KeptFlights:
     """The flights of a fleet in the folder of a run.
 
-    Each group of flights that one program can fly is kept once it is complete, so that the lots of the other groups
-    stay the same and fly the same, bit for bit.
+    A group has the flights that one program can fly. It is written when it is complete, so that the batches of the
+    other groups do not change and their results stay the same, bit for bit.
     """
 
     def __init__(self, run: Run, fleet: Fleet) -> None:
-        """Find what an earlier run of the folder has flown of the same fleet, by the same code."""
+        """Read the flights of the same fleet that an earlier run has written to the folder with the same code."""
         self._run, self._over = run, dict[FlightSpec, Flight]()
         self._groups = dict[Group, list[FlightSpec]]()
-        for spec in dict.fromkeys(fleet.specs):  # who names a method twice has its flights once
+        for spec in dict.fromkeys(fleet.specs):  # a method that is named twice flies once
             self._groups.setdefault(spec.group, []).append(spec)
         policies = {str(seed): _digest_of(policy) for seed, policy in fleet.policies.items()}
         about = {"preset": dump(fleet.preset), "policies": policies, "seconds": fleet.seconds}
@@ -49,11 +49,11 @@ class KeptFlights:
             self._keys[group] = section_key(**about, **what)
         found = [self._read(group) for group in self._groups]
         self.earlier = {flight.spec: flight for flights in found for flight in flights}
-        """What need not be flown again."""
+        """Flights of an earlier run, which this run does not repeat."""
         run.taken_over += sum(map(bool, found))
 
     def landed(self, flights: Sequence[Flight]) -> None:
-        """Keep each group that is whole with these flights."""
+        """Write each group that these flights complete."""
         self._over |= {flight.spec: flight for flight in flights}
         for group in dict.fromkeys(flight.spec.group for flight in flights):
             specs = self._groups[group]
@@ -61,23 +61,23 @@ class KeptFlights:
                 write_whole(self._path(group), packed([self._over.pop(spec) for spec in specs]))
 
     def _read(self, group: Group) -> list[Flight]:
-        """Return the flights of a group; none if they are not there, or cannot be read."""
+        """Return the flights of a group; an empty list if the file is missing or cannot be read."""
         try:
             return unpacked(self._path(group).read_bytes(), self._groups[group])
         except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
-            return []  # they are flown again
+            return []  # the group flies again
 
     def _path(self, group: Group) -> Path:
         return self._run.folder / FLIGHTS / f"{self._keys[group]}.npz"
 
 
 def forget_flights(run: Run) -> None:
-    """Remove the flights in the folder of a run, once what they were flown for is written."""
+    """Remove the flights in the folder of a run, after their table is written."""
     shutil.rmtree(run.folder / FLIGHTS, ignore_errors=True)
 
 
 def _digest_of(policy: Any) -> str:
-    """Return a digest of the numbers of what flies."""
+    """Return a digest of the arrays of a policy."""
     digest = hashlib.sha256()
     for leaf in jax.tree.leaves(eqx.filter(policy, eqx.is_array)):
         digest.update(np.asarray(leaf).tobytes())

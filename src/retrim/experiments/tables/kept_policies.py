@@ -1,4 +1,4 @@
-"""Policies that a run has trained are kept in its folder: nobody waits for them twice, and `retrim fly` takes them."""
+"""Stores trained policies in the folder of a run, so that they are trained once and `retrim fly` can use them."""
 
 import re
 from collections.abc import Sequence
@@ -18,23 +18,23 @@ from .kept import files_behind, named_in
 
 POLICIES = "policies"
 UNSAFE = re.compile(r"[^\w.+=-]+")
-"""In the name of a preset, which may be a path; what no file should be called."""
+"""Characters of a preset's name (which may be a path) that are unsafe in a file name."""
 
 
 def trained_policies(preset: Preset, seeds: Sequence[int], run: Run, reporter: Reporter) -> dict[int, Policy]:
     """Return a policy for each seed; those that ``run.trained`` has are not trained again.
 
     Args:
-        preset: What to train.
+        preset: Preset to train with.
         seeds: Seeds of weights and starts.
-        run: Its ``trained`` keeps the policies, of this code and of the files behind the preset.
+        run: Its ``trained`` stores the policies, for this code and the files that the preset refers to.
         reporter: Receives progress.
 
     Returns:
-        By seed, in their order; an interruption leaves out those that are not complete.
+        Policies by seed, in order; after an interruption incomplete ones are missing.
 
     Raises:
-        JobError: A training failed in another process; told once the others have come.
+        JobError: A training failed in another process; raised after the others are completed.
     """
     made_of = section_key(preset=dump(preset), files=files_behind(*named_in(preset)))
     stem = f"{UNSAFE.sub('-', preset.name)}-{made_of[:8]}"
@@ -55,7 +55,7 @@ def trained_policies(preset: Preset, seeds: Sequence[int], run: Run, reporter: R
     if missing and run.executor is not None and not run.interrupted:
         trained_elsewhere(preset, missing, run.executor, reporter=reporter, stop=run.stop, landed=landed)
         missing = []
-    setup = Setup.of(preset)  # one: its programs are shared by the seeds
+    setup = Setup.of(preset)  # one set-up, so that the seeds share its programs
     for seed in missing:
         if run.interrupted:
             break

@@ -1,4 +1,4 @@
-"""Sections laid out as the paper's tables: methods down, levels of disturbance across."""
+"""Table sections in the paper's layout: a row per method, a column per level of disturbance."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -25,39 +25,39 @@ from .kept_flights import forget_flights
 from .study import Study, fly_all, refuse_misfits, train_all
 
 LEVELS = {"none": "no disturbance", "small": "small, 0.5 m/s² per axis", "large": "large, 2 m/s² per axis"}
-"""The paper's disturbances, and what they are called."""
+"""The paper's disturbances and their labels."""
 PaperRows = Mapping[str, tuple[str, str, str]]
-"""Figures of the paper for the three levels [m], by method."""
+"""The paper's figures for the three levels [m], by method."""
 METHODS = ("base", "base-i", "base-do", "geometric", "geometric-i", "indi", "mppi", "l1-mpc", "full", "lora")
-"""Those of the tables of the paper, but for what takes minutes of training."""
+"""Methods of the paper's tables, except for those that need minutes of training."""
 
 
 def of_policies(methods: Sequence[str]) -> tuple[str, ...]:
-    """Return those methods that fly a policy of the table's preset."""
+    """Return the methods that fly a policy of the table's preset."""
     others = {*BASELINES, *RIVALS}
     return tuple(method for method in methods if method not in others and find_method(method).on_board is None)
 
 
 @dataclass(frozen=True)
 class Levels:
-    """One section of a table as the paper's: methods down, levels of disturbance across."""
+    """One section in the paper's layout: a row per method, a column per level of disturbance."""
 
     title: str
     preset: Preset
     scenario: Scenario
-    """Where it is flown, but for the disturbance."""
+    """Scenario of the flights; each level replaces its disturbance."""
     stem: str
     """Name of the picture."""
     methods: Sequence[str] = ("base", "full", "lora")
     paper: PaperRows = field(default_factory=dict)
     levels: Mapping[str, str] = field(default_factory=lambda: LEVELS)
-    """Disturbances, and what they are called."""
+    """Disturbances and their labels."""
     drawn: Sequence[str] = ("base", "full")
-    """Methods in the picture, which is of the last level."""
+    """Methods in the picture, which shows the last level."""
 
     @property
     def scenarios(self) -> list[Scenario]:
-        """One for each level."""
+        """Scenario of each level."""
         return [replace(self.scenario, disturbance=level) for level in self.levels]
 
 
@@ -69,17 +69,17 @@ def fly_levels(
     seconds: float | None,
     datt_steps: int = DATT_STEPS,
 ) -> None:
-    """Train, fly and lay out every section; the document is written after each, and when it is interrupted.
+    """Train, fly and lay out every section; write the document after each, and after an interruption.
 
     Args:
         document: Receives the sections. Its seeds are those of training.
-        sections: What to fly; a preset is trained once.
+        sections: Sections of the table; each preset is trained once.
         starts: Flights per disturbance, method and seed.
         seconds: Length of a flight; the task's own by default.
-        datt_steps: Steps of training DATT, where it is among the methods.
+        datt_steps: Training steps of DATT, if it is among the methods.
 
     Raises:
-        ConfigError: Something does not exist, or does not fit together; nothing has been trained.
+        ConfigError: A name does not exist, or two settings are incompatible; raised before any training.
     """
     run, reporter, studies = document.run, document.reporter, dict[tuple[str, bool], Study]()
     check_steps(datt_steps)
@@ -104,7 +104,7 @@ def fly_levels(
         key = dump(section.preset), trains
         if key not in studies and trains:
             studies[key] = train_all(section.preset, document.seeds, run, reporter)
-        elif key not in studies:  # nobody flies a policy: seeds are all that is asked of it
+        elif key not in studies:  # no method flies a policy, so that only the seeds of the study matter
             untrained = Setup.of(section.preset).new_policy(random.key(0))
             studies[key] = Study(section.preset, dict.fromkeys(document.seeds, untrained), ())
         made = _level_section(
@@ -122,7 +122,7 @@ def fly_levels(
 
 
 def _files_behind(section: Levels) -> dict[str, str]:
-    """What is not in retrim and not in the preset."""
+    """Return digests of the files that the section depends on, outside retrim and the preset."""
     named = list[str | None](section.methods)
     for each in section.scenarios:
         named += named_by(each)
@@ -139,7 +139,7 @@ def _level_section(
     seconds: float | None,
     datt_steps: int,
 ) -> tuple[TableSection, list[dict[str, Any]]] | None:
-    """The section and its rows of results; None if nothing was flown."""
+    """Return the section and its rows of results; None if no flight was completed."""
     methods, title = section.methods, section.title
     own = [method for method in methods if method not in RIVALS]
     flown = []
@@ -176,7 +176,7 @@ def level_table(
     title: str,
     levels: Mapping[str, str] = LEVELS,
 ) -> TableSection:
-    """Lay rows of results out as the paper does: methods down, disturbances across, its figures in brackets."""
+    """Return rows of results in the paper's layout: methods down, disturbances across, its figures in brackets."""
     by = {(row["method"], row["disturbance"]): row for row in found}
     cells = list[tuple[str, ...]]()
     for method in methods:
@@ -192,7 +192,7 @@ def level_table(
 
 
 def _in_step(row: dict[str, Any] | None) -> str:
-    """Error but for the best constant shift in time, and distance from the nearest point of the reference [m]."""
+    """Return the error after the best constant time shift, and the distance from the reference's nearest point [m]."""
     if row is None or row.get("unshifted_m") is None or "cross_track_m" not in row:
         return "-"
     return f"{metres(row['unshifted_m'])}; {metres(row['cross_track_m'])}"

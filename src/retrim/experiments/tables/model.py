@@ -1,4 +1,4 @@
-"""The blade-element plant: curves and figures beside published ones."""
+"""The blade-element plant: curves and figures compared with published ones."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -51,7 +51,7 @@ def model(run: Run, reporter: Reporter) -> None:
 
 
 def thrust_panel() -> Panel:
-    """Thrust of the 5.1 in rotor in still air, against the published thrust map."""
+    """Plot the thrust of the 5.1 in rotor in still air, with the published thrust map."""
     speeds = np.linspace(200.0, 2300.0, 30)
     ours = np.array([Settled(five_inch(), float(w), 0.0, 0.0).thrust for w in speeds])
     points = np.array(GOLDEN_HOVER)
@@ -68,7 +68,7 @@ def thrust_panel() -> Panel:
 
 
 def drag_panel() -> Panel:
-    """Deceleration of a level vehicle at hover thrust against the speed of flight."""
+    """Plot the deceleration of a level vehicle at hover thrust against its speed."""
     curves, speeds = list[Curve](), np.linspace(0.0, 10.0, 41)
     for i, name in enumerate(("small", "kingfisher")):
         bem = BemQuadrotor.of(VEHICLES[name](), DT)
@@ -100,7 +100,7 @@ def _force(bem: BemQuadrotor, s: BemState, effects: ExternalEffects) -> Float[Ar
 
 
 def inflow_panel() -> Panel:
-    """Induced velocity against descent, with and without the vortex-ring rule."""
+    """Plot the induced velocity against the descent speed, with and without the vortex-ring rule."""
     descents = np.linspace(-6.0, 14.0, 81)
     ruled, plain = list[float](), list[float]()
     for v in descents:
@@ -121,7 +121,7 @@ def inflow_panel() -> Panel:
 
 
 def rate_panel() -> Panel:
-    """Response of the roll rate to a step of the command."""
+    """Plot the responses of roll and yaw rate to a step of the command."""
     curves = list[Curve]()
     for name in VEHICLES:
         bem = BemQuadrotor.of(VEHICLES[name](), DT)
@@ -135,7 +135,7 @@ def rate_panel() -> Panel:
 
 
 def step_panel() -> Panel:
-    """Response of the acceleration to a step of collective thrust."""
+    """Plot the response of the acceleration to a step of collective thrust."""
     curves = []
     for name in VEHICLES:
         bem = BemQuadrotor.of(VEHICLES[name](), DT)
@@ -147,7 +147,7 @@ def step_panel() -> Panel:
 
 
 def sag_panel() -> Panel:
-    """Vertical acceleration under u_hover while the battery sags."""
+    """Plot the vertical acceleration under u_hover while the battery sags."""
     bem, sag, times = BemQuadrotor.of(VEHICLES["small"](), DT), disturbance("battery"), np.linspace(0.0, 120.0, 61)
     x = State.at(jnp.zeros(3))
     found = []
@@ -164,7 +164,7 @@ def sag_panel() -> Panel:
 
 @eqx.filter_jit
 def _flown(bem: BemQuadrotor, u: Command, steps: int) -> RotorState:
-    """The state after each millisecond, from hover."""
+    """Return the state after each millisecond, from hover."""
     effects = ExternalEffects.calm(jnp.zeros(3).dtype)
 
     def step(s: BemState, _: None) -> tuple[BemState, RotorState]:

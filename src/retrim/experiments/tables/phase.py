@@ -56,11 +56,11 @@ def phase(
         reporter: Receives progress and the sections.
         readings: blind, relative, relative-delay, both.
         references: circle, figure8, star.
-        methods: How they fly.
+        methods: Methods of the flights.
         seeds: Training seeds.
         seconds: Length of a flight [s].
         starts: Flights per disturbance, method and seed.
-        plant: Where they fly.
+        plant: Plant of the flights.
     """
     _check("reading", readings, READINGS)
     _check("reference", references, PAPER)

@@ -18,11 +18,11 @@ COLUMNS = (
     "crashed",
 )  # fmt: skip
 Group = tuple[str, Scenario, tuple[str, ...]]
-"""Title, scenario, and the disturbances that are flown in it."""
+"""Title, scenario, and disturbances of a group of flights."""
 
 
 def groups() -> tuple[Group, ...]:
-    """Return the groups of the table; a function, since scenarios are checked when they are made."""
+    """Return the groups of the table. It is a function because scenarios are validated on creation."""
     return (
         ("bem", Scenario(), ("none", "small", "large")),
         ("bem, wind of 4 m/s: steady, Dryden gusts, the jet of a fan", Scenario(), ("wind", "gusts", "fan")),
@@ -64,13 +64,13 @@ def plants(
     seconds: float = 30.0,
     starts: int = 8,
 ) -> None:
-    """Hover of one policy, as it is and adapted, in many scenarios and on plants that others wrote.
+    """Hover of one policy, without and with adaptation, in many scenarios and on independent simulators.
 
     Args:
         run: Folder of plants.md and plants.json.
         reporter: Receives progress and the sections.
         preset: Preset to train with, for the small quadrotor.
-        plant: Plants to fly on. One whose package is not installed is left out, with a line that says so.
+        plant: Plants to fly on. A plant whose package is not installed is left out, and the page has a note on it.
         seeds: Training seeds; each also seeds the starts, the gusts and the learners of its flights.
         seconds: Length of a flight [s].
         starts: Flights per disturbance, method and seed.

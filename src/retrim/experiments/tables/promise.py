@@ -1,4 +1,4 @@
-"""The promise of the monitor, checked flight by flight: adapting is never worse than not adapting."""
+"""Check of the monitor's promise, flight by flight: adapting is never worse than not adapting."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -12,7 +12,7 @@ from .document import TableSection
 
 ADAPTING = ("full", "lora")
 BASE, OBSERVER = "base", "base-do"
-FACTOR, MARGIN = 1.2, 0.005  # times the better of base and observer, and [m]: bound on the steady error
+FACTOR, MARGIN = 1.2, 0.005  # bound on the steady error: factor on the better of base and observer, plus a margin [m]
 ABOUT = """\
 crashed although the base policy survived: flights, paired by seed and start. steady: mean error over the last 2 s of
 the flights that survived. bound: 1.2 times the smaller steady error of base policy and observer, plus 5 mm."""
@@ -78,6 +78,6 @@ def promise_section(rows: Sequence[dict[str, Any]]) -> TableSection:
 
 
 def _steady(flights: Sequence[Flight], method: str) -> float:
-    """Return the mean steady error of the flights that survived; infinite if none did."""
+    """Return the mean steady error of the flights that survived; infinite if all crashed."""
     survivors = [f.steady for f in flights if f.spec.method == method and not f.log.terminated]
     return float(np.mean(survivors)) if survivors else float("inf")

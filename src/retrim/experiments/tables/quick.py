@@ -1,4 +1,4 @@
-"""A quick look at a table: one training seed, two starts, short flights."""
+"""Quick versions of the tables: one training seed, two starts, short flights."""
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
@@ -26,21 +26,21 @@ QUICK: dict[str, Options] = {
     "scaling": {"flights": (12, 40), "seconds": 6.0},
     "tuning": {"candidates": 12, "starts": 1, "methods": ("geometric", "geometric-i", "indi")},
 }
-"""By table: options that are smaller."""
+"""Options of the quick version, by table."""
 ALONE = ("model", "efficiency", "buses", "tuning", "design", "scaling")
-"""Tables that this process makes alone."""
+"""Tables that do not use other machines."""
 GO_ON = (
     "hover", "track", "phase", "vision", "fast", "transfer", "raptor", "ablation", "reversing", "plants", "everything"
 )  # fmt: skip
-"""Tables that are made in parts, and whose command goes on where it was killed."""
+"""Tables that are made in parts; the same command resumes after a kill."""
 REMARK = "A quick look, smaller than the table: figures to look at, not to quote."
 
 
 def options_of(make: Callable[..., None]) -> list[Parameter]:
-    """Return the options of a table's command: those of the function that makes it, ``on``, ``quick`` and ``out``.
+    """Return the options of a table's command: those of its function, and ``on``, ``quick`` and ``out``.
 
-    Its own are the keyword-only parameters. A function that flies no fleets gets no ``on``; one that has no quick look,
-    or one of its own, no ``quick``.
+    Options of a function are its keyword-only parameters. Tables in ``ALONE`` do not get ``on``. Tables without a
+    quick version, or with a ``quick`` option of their own, do not get ``quick``.
     """
     options = [each for each in inspect.signature(make).parameters.values() if each.kind is Parameter.KEYWORD_ONLY]
     if make.__name__ not in ALONE:
@@ -64,20 +64,20 @@ def help_of(make: Callable[..., None]) -> str:
 
 
 def folder_of(make: Callable[..., None], *, quick: bool = False) -> Path | None:
-    """Return the folder of a table that nobody names: always the same where its command goes on; None for a new one."""
+    """Return the default folder of a table; None for a new folder, if its command does not resume after a kill."""
     if make.__name__ not in GO_ON:
         return None
-    whole = make.__name__ == "everything"  # it has a folder of its own for the quick look
+    whole = make.__name__ == "everything"  # it has its own folder for the quick version
     return Path("runs") / f"reproduce-{'all' if whole else make.__name__}{'-quick' * (quick and not whole)}"
 
 
 def looked(make: Callable[..., None], chosen: Mapping[str, Any], words: Sequence[str] = ()) -> tuple[Options, str]:
-    """Return the options of a table, and what its documents should say of them.
+    """Return the options of a table, and a remark on them for its documents.
 
     Args:
-        make: The function that makes it.
-        chosen: Options as they were asked; with ``quick`` those that differ from their defaults stay.
-        words: The command's: an option that they name stays, too.
+        make: Function that makes the table.
+        chosen: Options of the command; ``quick`` does not change those that differ from their defaults.
+        words: Words of the command line; ``quick`` does not change the options that they name, either.
     """
     if make.__name__ not in QUICK:
         return dict(chosen), ""

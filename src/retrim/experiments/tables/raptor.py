@@ -1,4 +1,4 @@
-"""RAPTOR, the foundation policy, beside ours: hover and a figure-8, undisturbed and disturbed."""
+"""RAPTOR, the foundation policy, compared with ours: hover and a figure-8, undisturbed and disturbed."""
 
 from ...config.loading import with_vehicle
 from ...config.scenario import Scenario
@@ -37,14 +37,15 @@ def raptor(
     seconds: float = 30.0,
     starts: int = 8,
 ) -> None:
-    """RAPTOR, a policy of motor commands that needs no re-training, beside ours.
+    """RAPTOR, a policy of motor commands that needs no re-training, compared with ours.
 
     Args:
         run: Folder of raptor.md, raptor.json and the pictures.
         reporter: Receives progress and the sections.
         presets: One for hover and one for tracking.
-        vehicles: They fly, and policies are trained for each; small and large lift more than RAPTOR was made for.
-        methods: How they fly.
+        vehicles: Vehicles of the flights; policies are trained for each. small and large lift more than RAPTOR was
+            made for.
+        methods: Methods of the flights.
         seeds: Training seeds.
         seconds: Length of a flight [s].
         starts: Flights per condition, method and seed.

@@ -19,7 +19,7 @@ from .kept_flights import forget_flights
 from .study import fly_all, table_presets, train_all
 
 PERIOD = 15.0  # [s]
-MOST = 6  # updates that are told one by one
+MOST = 6  # largest number of updates of which each has a column
 METHODS: dict[str, str] = {
     "base": "base policy",
     "base-i": "integral action",
@@ -52,7 +52,7 @@ def reversing(
         run: Folder of reversing.md, reversing.json and the picture.
         reporter: Receives progress and the section.
         preset: A preset for hover, to train with.
-        plant: Where the policy flies.
+        plant: Plant of the flights.
         seeds: Training seeds.
         seconds: Length of a flight [s].
         starts: Flights per method and seed.
@@ -92,7 +92,10 @@ def _peak(row: dict[str, Any]) -> str:
 
 
 def _moments(adapt: Adapt, seconds: float) -> tuple[np.ndarray, list[int]]:
-    """When the errors are read [s], for each reversal: at it, and at the end of what updates lead to; and which."""
+    """Return the times at which errors are read [s], and the numbers of the updates.
+
+    Each row belongs to a reversal: its time, the times at which the updates take effect, and the end of the period.
+    """
     turns = np.arange(PERIOD, seconds - PERIOD / 2, PERIOD)
     swaps = np.arange(adapt.update_latency, PERIOD, adapt.update_every)
     updates = list(range(len(swaps)))
@@ -104,7 +107,7 @@ def _moments(adapt: Adapt, seconds: float) -> tuple[np.ndarray, list[int]]:
 
 
 def _errors(flight: Flight, moments: np.ndarray, span: float = 1.0) -> np.ndarray:
-    """Mean over the time before each moment [m]."""
+    """Return the mean error over the last ``span`` seconds before each moment [m]."""
     t = flight.log.t
     found = [flight.error[(t > end - span) & (t <= end + 1e-6)].mean() for end in moments.flat]
     return np.array(found).reshape(moments.shape)
@@ -117,7 +120,7 @@ def _section(
     for i, reversal in enumerate(moments[:, 0]):
         for method, name in METHODS.items():
             table = [found[i] for found in errors[method]]
-            columns = np.array(table).T  # empty where none was flown to its end
+            columns = np.array(table).T  # empty if no flight was completed
             cells = [mean_and_deviation(column) for column in columns]
             cells = cells or ["-"] * moments.shape[1]
             lines.append((f"reversed at {reversal:g} s, {name}", *cells))

@@ -1,4 +1,4 @@
-"""How time and memory grow with the number of flights."""
+"""Growth of time and memory with the number of flights."""
 
 import pickle
 import resource
@@ -47,14 +47,14 @@ def scaling(
     flights: tuple[int, ...] = (12, 40, 120, 400, 1000),
     seconds: float = 12.0,
 ) -> None:
-    """Flights by the dozen to the ten thousand: time, flights a second, memory, and how they grow.
+    """From a dozen to ten thousand flights: time, flights per second, memory, and their growth.
 
     Args:
         run: Folder of scaling.md, scaling.json and the picture.
         reporter: Receives progress and the table.
         preset: A preset for hover, to train with.
-        flights: How many, one number after another, each a multiple of four: half of them adapt, and they fly in
-            gusts, or with a load.
+        flights: Numbers of flights, each a multiple of four. One half of the flights adapts; one half is in gusts, the
+            other one with a load.
         seconds: Length of a flight [s].
     """
     (loaded,) = table_presets([preset], "hover", seeds=(0,), starts=1, seconds=seconds)

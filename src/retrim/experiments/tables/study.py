@@ -1,4 +1,4 @@
-"""What every table does: train policies, fly them, lay methods and disturbances out as the paper does."""
+"""Common steps of all tables: check the options, train the policies, fly them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -29,7 +29,7 @@ class Study:
     preset: Preset
     policies: dict[int, Any]
     errors: tuple[float, ...]
-    """Error of each in its own model [m]."""
+    """Error of each policy in its own model [m]."""
 
     def about(self) -> str:
         """Return one sentence on the policies."""
@@ -43,7 +43,7 @@ def table_presets(
     """Load the presets of a table, and check its sizes before anything is trained.
 
     Raises:
-        ConfigError: A preset does not exist or is for another task, or the sizes cannot be flown.
+        ConfigError: A preset does not exist or is for another task, or a size is out of range.
     """
     check_seeds(seeds)
     check_flights(starts, seconds)
@@ -51,7 +51,7 @@ def table_presets(
 
 
 def train_all(preset: Preset, seeds: Sequence[int], run: Run, reporter: Reporter) -> Study:
-    """Train a policy for each seed, or take it from the run; an interruption leaves those that are complete."""
+    """Train a policy for each seed, or read it from the run; after an interruption return the completed ones."""
     setup, policies, errors = Setup.of(preset), dict[int, Policy](), list[float]()
     for seed, policy in trained_policies(preset, seeds, run, reporter).items():
         if run.interrupted:
@@ -68,7 +68,7 @@ def refuse_misfits(
     """Plan the flights of a table with a policy that has not been trained.
 
     Raises:
-        ConfigError: Something does not exist, or does not fit together.
+        ConfigError: A name does not exist, or two settings are incompatible.
         PlantError: The package of a plant is not installed.
     """
     for scenario in scenarios:
@@ -91,18 +91,18 @@ def fly_all(
     """Fly every combination, with progress.
 
     Args:
-        study: What flies.
-        scenarios: Where.
-        run: Its folder keeps the flights, and those that an earlier run has kept there are not flown again.
+        study: Policies to fly.
+        scenarios: Scenarios of the flights.
+        run: Its folder stores the flights; flights that an earlier run has stored there are not repeated.
         reporter: Receives progress.
-        methods: How they fly.
+        methods: Methods of the flights.
         starts: Flights per scenario, method and seed.
         seconds: Length of a flight [s]; the task's own by default.
-        keep: Keep them, until the table forgets them; what a flight has learnt is not kept.
+        keep: Store the flights until the table removes them; their learner states are not stored.
 
     Raises:
         PlantError: The package of a plant is not installed.
-        JobError: Flights failed in another process; a table with holes is not made.
+        JobError: Flights failed in another process; an incomplete table is not written.
     """
     if not study.policies or run.interrupted:
         return Flights([], interrupted=True)

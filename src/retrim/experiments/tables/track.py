@@ -58,18 +58,18 @@ def track(
     starts: int = 8,
     plant: str = "bem",
 ) -> None:
-    """Table II: circle, figure-8 and star under three disturbances, and a figure-8 that training never saw.
+    """Table II: circle, figure-8 and star under three disturbances, and a figure-8 that is not part of training.
 
     Args:
         run: Folder of track.md, track.json and the pictures.
         reporter: Receives progress and the sections.
         presets: Presets to train and fly.
-        methods: How they fly, and baselines that need none of the policies; these fly once, beside the first preset.
-        datt_steps: Steps of training DATT, if it is among the methods.
+        methods: Methods for the policies, and baselines without a policy; baselines fly once, with the first preset.
+        datt_steps: Training steps of DATT, if it is among the methods.
         seeds: Training seeds.
         seconds: Length of a flight [s].
         starts: Flights per disturbance, method and seed.
-        plant: Where the policies fly.
+        plant: Plant of the flights.
     """
     loaded = table_presets(presets, "track", seeds=seeds, starts=starts, seconds=seconds)
     sections = [
@@ -82,7 +82,7 @@ def track(
 
 
 def _sections(preset: Preset, plant: str, methods: Sequence[str]) -> list[Levels]:
-    """Return a section for each reference; policies with preview are trained once for all, others for each."""
+    """Return a section per reference; a policy with preview is trained on all of them, others on one each."""
 
     def section(
         title: str, preset: Preset, reference: str, paper: PaperRows, methods: Sequence[str] = methods

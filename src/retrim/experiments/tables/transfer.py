@@ -1,4 +1,4 @@
-"""The paper's real flights in simulation (Sec. IV-D): a load, a fan, and a policy on a vehicle that it never saw."""
+"""The paper's real flights in simulation (Sec. IV-D): a load, a fan, and a policy on an unknown vehicle."""
 
 from ...config.scenario import Scenario
 from ...errors import ConfigError
@@ -17,7 +17,7 @@ and the last 10 s of tracking [m]: mean ± standard deviation over flights. No m
 thrust command is normalised by the mass that the flight controller knows. Learning is charged to flight time by the
 preset's fixed latencies. The paper gives no figures for these flights."""
 FLOWN = ("base", "base-i", "base-do", "geometric-i", "indi", "l1-mpc", "full", "lora")
-"""Those that answer a load or a wind, and the base policy."""
+"""Methods that compensate for a load or a wind, and the base policy."""
 HOVER_LEVELS = {"none": "alone", "payload": "with a load", "fan": "in front of a fan", "payload+fan": "load and fan"}
 TRACK_LEVELS = {"none": "calm air", "wind=4": "wind of 4 m/s"}
 
@@ -34,18 +34,18 @@ def transfer(
     plant: str = "bem",
     datt_steps: int = DATT_STEPS,
 ) -> None:
-    """What the paper flew for real: a load, a fan, and a policy on a vehicle that it never saw.
+    """The paper's real flights in simulation: a load, a fan, and a policy on an unknown vehicle.
 
     Args:
         run: Folder of transfer.md, transfer.json and the pictures.
         reporter: Receives progress and the sections.
         presets: One for hover and one for tracking.
-        methods: How they fly, and baselines that need none of the policies.
+        methods: Methods for the policies, and baselines without a policy.
         seeds: Training seeds.
         seconds: Length of a flight [s].
         starts: Flights per condition, method and seed.
-        plant: Where they fly; bem or simple.
-        datt_steps: Steps of training DATT, if it is among the methods.
+        plant: Plant of the flights; bem or simple.
+        datt_steps: Training steps of DATT, if it is among the methods.
     """
     (hover,) = table_presets(presets[:1], "hover", seeds=seeds, starts=starts, seconds=seconds)
     (track,) = table_presets(presets[1:], "track", seeds=seeds, starts=starts, seconds=seconds)

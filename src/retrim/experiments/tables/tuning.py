@@ -1,4 +1,4 @@
-"""Settings of the classical baselines, by random search on flights that no table flies."""
+"""Settings of the classical baselines, by random search on conditions that are not part of any table."""
 
 import contextlib
 from collections.abc import Sequence
@@ -37,10 +37,10 @@ CONDITIONS: dict[Shown, tuple[tuple[str, str, str, str | None], ...]] = {
         ("vision/retrim", "push=-1.8", "ideal", None),
     ),
 }
-"""By what the controllers are shown: preset, for task and declared lag; disturbance, sensors and reference."""
+"""Conditions by input of the controllers: preset (for task and declared lag), disturbance, sensors and reference."""
 SHOWN = {"state": "the measured state", "keypoints": "the pose that a filter estimates from keypoints"}
-CRASH = 1.0  # [m], the error that a crashed flight counts as
-SETTLING = 3.0  # [s] at the start that do not count
+CRASH = 1.0  # [m], error of a crashed flight in the score
+SETTLING = 3.0  # [s], start of a flight that does not count
 
 
 def tuning(
@@ -55,18 +55,18 @@ def tuning(
     seed: int = 100,
     plant: str = "bem",
 ) -> None:
-    """Settings of the classical baselines: the best of random candidates on pushes, starts and seeds of their own.
+    """Settings of the classical baselines: the best of random candidates, on separate pushes, starts and seeds.
 
     Args:
-        run: Folder of tuning.md and tuning.json; what they are shown is in the names where it is not the state.
+        run: Folder of tuning.md and tuning.json; the names contain the input of the controllers unless it is the state.
         reporter: Receives progress and the sections.
-        methods: Which baselines.
-        shown: What they fly by: the measured state, or the pose that a filter estimates from keypoints.
-        candidates: Settings that are tried for each, beside the present ones; a third of them for MPPI.
-        starts: Flights of a candidate under each condition.
+        methods: Baselines to tune.
+        shown: Input of the controllers: the measured state, or the pose that a filter estimates from keypoints.
+        candidates: Number of settings to try for each baseline, in addition to the present ones; a third for MPPI.
+        starts: Flights per candidate and condition.
         seconds: Length of a flight [s]; the first 3 s do not count.
         seed: Seed of candidates, starts and gusts.
-        plant: Where they fly; bem or simple.
+        plant: Plant of the flights; bem or simple.
     """
     check_seeds([seed])
     check_flights(starts, seconds)
@@ -112,7 +112,7 @@ def tuning(
 
 
 def _drawn(baseline: Baseline, n: int, seed: int) -> list[Settings]:
-    """Candidates; a baseline's own follow from the seed alone."""
+    """Return random candidates; those of a baseline depend on the seed only."""
     low, high = np.array(list(baseline.ranges.values())).T
     shares = np.asarray(random.uniform(random.key(seed), (n, len(low))))
     drawn = low * (high / low) ** shares
@@ -130,7 +130,7 @@ def _flown(
     seed: int,
     stop: Any,
 ) -> list[float]:
-    """Score of each candidate, all flown as one batch."""
+    """Return the score of each candidate; all candidates fly as one batch."""
     specs = [FlightSpec(scenario, "base", start, seed) for start in range(starts)]
     begun, dt = setup.flight_starts(starts, seed), setup.preset.dt
     made = [scenario.make("small", dt=dt, seed=spec.plant_seed) for _ in tried for spec in specs]
@@ -158,7 +158,7 @@ def _rows(name: str, tried: Sequence[Settings], scores: np.ndarray) -> list[dict
 
 
 def _section(name: str, tried: Sequence[Settings], scores: np.ndarray) -> TableSection:
-    """The present settings and the best three."""
+    """Return a table of the present settings and the best three."""
     best = [int(i) for i in np.argsort(scores)[:3]]
     columns = ("settings", *tried[0], "score [m]")
     shown = [("present", 0), *((f"{'best' if k == 0 else f'{k + 1}.'}", i) for k, i in enumerate(best))]

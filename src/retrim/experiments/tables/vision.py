@@ -50,12 +50,12 @@ def vision(
         run: Folder of vision.md, vision.json and the pictures.
         reporter: Receives progress and the sections.
         presets: Presets to train and fly; vision/paper trains for several minutes.
-        methods: How they fly; by default each preset flies what it can: baselines by the estimate of a pose filter,
-            and base-do in the frame of felt gravity.
+        methods: Methods of the flights; by default all that the preset supports: baselines with the estimate of a pose
+            filter, and base-do in the frame of felt gravity.
         seeds: Training seeds.
         seconds: Length of a flight [s].
         starts: Flights per disturbance, method and seed.
-        plant: Where the policies fly.
+        plant: Plant of the flights.
     """
     loaded = table_presets(presets, "vision", seeds=seeds, starts=starts, seconds=seconds)
     if trained := [method for method in methods if method in RIVALS]:
@@ -73,7 +73,7 @@ def _section(preset: Preset, scenario: Scenario, methods: Sequence[str]) -> Leve
 
 
 def _flyable(preset: Preset) -> list[str]:
-    """Methods of the other tables that a policy which sees keypoints, or a filter of its pose, can fly."""
+    """Return the methods of the other tables that work with keypoints or with the pose that a filter estimates."""
     cannot = {"base-i"}
     if preset.adapt.frame != "gravity":
         cannot.add("base-do")
