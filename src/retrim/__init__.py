@@ -1,9 +1,9 @@
 """retrim: re-train neural flight policies in seconds, in flight.
 
-Pretrain a policy in a differentiable simulator, fly it on a plant, learn from the last seconds of flight what the
-simulator missed, re-train the policy in the corrected simulator, and swap it in, while the vehicle keeps flying.
+Pretrain a policy in a differentiable simulator and fly it on a plant. In flight, learn the error of the simulator from
+the last seconds, re-train the policy in the corrected simulator, and replace it while the vehicle keeps flying.
 
-Names are imported when they are first used, so that ``import retrim`` is quick. ``__init__.pyi`` lists them.
+Names are imported on first use, so that ``import retrim`` is fast. ``__init__.pyi`` lists them.
 """
 
 import os
@@ -12,12 +12,12 @@ from importlib.metadata import version
 
 import lazy_loader
 
-# All must be set before the package that reads them is first imported; a value of the user's stands.
-# XLA reports every program that its compile cache loads on a machine whose tuning flags differ.
+# Each variable must be set before the first import of the package that reads it; values set by the user are kept.
+# XLA logs every program that its compile cache loads on a machine with different tuning flags.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
-# GPUs round the factors of products to ten bits unless told otherwise: flights would not be those of a CPU.
+# By default, GPUs round the factors of products to ten bits, so that flights would differ from those on a CPU.
 os.environ.setdefault("JAX_DEFAULT_MATMUL_PRECISION", "float32")
-# The plant crazyflow needs SciPy to follow the array API, and says so where SciPy came first.
+# The plant crazyflow needs SciPy with the array API, and reports an error if SciPy was imported before.
 if "scipy" not in sys.modules:
     os.environ.setdefault("SCIPY_ARRAY_API", "1")
 

@@ -1,24 +1,24 @@
-"""Every error that retrim raises on purpose, under one root. Each is one line of limited length."""
+"""Exceptions of retrim, with a common base class. Each message is one line of limited length."""
 
 LONGEST = 480
-"""Characters of a message: what was given may be megabytes."""
+"""Maximum length of a message [characters]; invalid input can have megabytes."""
 CUT = " ... "
 
 
 class RetrimError(Exception):
-    """Root of all errors of this package. The message names what was wrong and what would be right."""
+    """Base class of all errors of this package. The message states the mistake and the correct input."""
 
     def __init__(self, message: str = "") -> None:
-        """Build one; ``message`` becomes a printable line of limited length."""
+        """Build an error; ``message`` becomes a printable line of limited length."""
         super().__init__(one_line(message))
 
 
 def one_line(text: str, most: int = LONGEST) -> str:
-    """Return a text as one printable line: control characters escaped, the middle of a long one left out.
+    """Return a text as one printable line: control characters are escaped, and the middle of a long text is omitted.
 
     Args:
-        text: Any; it may hold what a stranger wrote.
-        most: Characters that are left.
+        text: Any text, also from an untrusted source.
+        most: Maximum length of the line [characters].
     """
     if len(text) > 4 * most:  # escaping megabytes is slow
         text = text[: 2 * most] + CUT + text[-most:]
@@ -30,17 +30,17 @@ def one_line(text: str, most: int = LONGEST) -> str:
 
 
 def printable(text: str) -> str:
-    """Return a text whose control characters are escaped, but for the ends of lines: it cannot steer a terminal."""
+    """Escape the control characters of a text, except line feeds, so that it cannot control a terminal."""
     return "".join(sign if sign.isprintable() or sign == "\n" else ascii(sign)[1:-1] for sign in text)
 
 
 def excerpt(value: object, most: int = 60, *, quotes: bool = True) -> str:
-    """Return a value of a file as a message may show it: in quotation marks, escaped, and not long.
+    """Return a value from a file for a message: in quotation marks, escaped, and shortened.
 
     Args:
-        value: Any.
-        most: Characters that are left.
-        quotes: Whether a text has quotation marks.
+        value: Any value.
+        most: Maximum length [characters].
+        quotes: Whether to put a text in quotation marks.
     """
     text = value[: 4 * most] if isinstance(value, str) else value
     shown = repr(text) if quotes or not isinstance(text, str) else text
@@ -52,28 +52,28 @@ class ConfigError(RetrimError, ValueError):
 
 
 class FrameError(ConfigError):
-    """A task, observation or controller that cannot be turned into another frame."""
+    """A task, observation or controller that cannot be rotated into another frame."""
 
 
 class PlantError(RetrimError, RuntimeError):
-    """A plant refused what it was asked for, or it is gone."""
+    """A plant rejected a request, or is no longer available."""
 
 
 class JobError(RetrimError, RuntimeError):
-    """Work that was handed to another process has failed there, or nobody can be reached who would do it."""
+    """Work that was sent to another process failed there, or no process could be reached to do it."""
 
 
 class MessageError(RetrimError, ValueError):
-    """Bytes that must not be used: truncated, damaged, of another kind, or with values that are not finite."""
+    """Bytes that must not be used: they are truncated, damaged, of another kind, or have values that are not finite."""
 
 
 class CheckpointError(RetrimError, ValueError):
-    """A file with a policy or with what was learnt that must not be flown."""
+    """A policy file or learner-state file that must not be used in flight."""
 
 
 class LogError(RetrimError, ValueError):
-    """A flight log that cannot be read, or whose columns cannot be what the map says that they are."""
+    """A flight log that cannot be read, or whose columns cannot have the meaning that the column map states."""
 
 
 class TrainingError(RetrimError, RuntimeError):
-    """Training that has come to nothing: its loss is not a number."""
+    """Training that failed: its loss is not a number."""

@@ -1,6 +1,6 @@
-"""rospy, which comes with the system (Debian: ``python3-rospy``), not from a package index: found, and joined.
+"""Find rospy and start its node. rospy is a system package (Debian: ``python3-rospy``), not one of a package index.
 
-No other file imports it.
+No other file imports rospy.
 """
 
 import importlib
@@ -15,17 +15,17 @@ from urllib.parse import urlparse
 from .errors import ConfigError
 
 SYSTEM = Path("/usr/lib/python3/dist-packages")
-"""Where Debian puts packages; a virtual environment does not look there."""
+"""Package folder of Debian, which virtual environments do not search."""
 
 
 def join(master: str) -> Any:
-    """Make this process a node of ROS 1, once, and return rospy.
+    """Make this process a ROS 1 node, unless it is one already, and return rospy.
 
     Args:
-        master: Where the rosmaster is, as ``http://127.0.0.1:11311``.
+        master: Address of the rosmaster, as ``http://127.0.0.1:11311``.
 
     Raises:
-        ConfigError: rospy is not installed, or there is no master.
+        ConfigError: rospy is not installed, or the rosmaster cannot be reached.
     """
     address = urlparse(master)
     try:
@@ -33,7 +33,7 @@ def join(master: str) -> Any:
     except OSError as error:
         raise ConfigError(f"ROS: no rosmaster at {master!r} ({error})") from error
     os.environ["ROS_MASTER_URI"] = master
-    if address.hostname in ("127.0.0.1", "localhost"):  # otherwise its sockets listen everywhere
+    if address.hostname in ("127.0.0.1", "localhost"):  # otherwise its sockets listen on all interfaces
         os.environ["ROS_IP"] = "127.0.0.1"
     rospy = system_module("rospy")
     rospy.init_node("retrim", anonymous=True, disable_signals=True, disable_rosout=True, disable_rostime=True)
@@ -41,10 +41,10 @@ def join(master: str) -> Any:
 
 
 def system_module(name: str) -> ModuleType:
-    """Return a module of ROS; the system's packages come after ours.
+    """Return a ROS module; system packages are searched after those of the environment.
 
     Raises:
-        ConfigError: It is not installed.
+        ConfigError: The module is not installed.
     """
     if str(SYSTEM) not in sys.path and SYSTEM.is_dir():
         sys.path.append(str(SYSTEM))

@@ -1,4 +1,4 @@
-"""Signals that end a command and keep what is done: Ctrl-C, SIGTERM, and SIGHUP of a terminal that was closed."""
+"""Signals that end a command and keep its results: Ctrl-C, SIGTERM, and SIGHUP from a closed terminal."""
 
 import contextlib
 import os
@@ -13,7 +13,7 @@ Handler = Callable[[int, FrameType | None], None]
 
 
 def ending_signals() -> list[signal.Signals]:
-    """Return the signals that end a command; SIGHUP is none where ``nohup`` has it ignored."""
+    """Return the signals that end a command; SIGHUP is excluded if ``nohup`` made the process ignore it."""
     found = [signal.SIGINT, signal.SIGTERM]
     if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
         found.append(signal.SIGHUP)
@@ -22,7 +22,7 @@ def ending_signals() -> list[signal.Signals]:
 
 @contextlib.contextmanager
 def handled_by(handler: Handler) -> Iterator[None]:
-    """Let a function answer the signals that end a command; in any thread but the main one this does nothing."""
+    """Call a function on the signals that end a command. This works in the main thread, and has no effect in others."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -41,7 +41,7 @@ def handled_by(handler: Handler) -> Iterator[None]:
 
 @contextlib.contextmanager
 def stopped_by(stop: threading.Event) -> Iterator[None]:
-    """Let the signals set ``stop`` and raise: a KeyboardInterrupt that JAX swallows is not lost."""
+    """Make the signals set ``stop`` and raise KeyboardInterrupt; ``stop`` stays set if JAX swallows the exception."""
 
     def handle(number: int, frame: FrameType | None) -> None:
         stop.set()
@@ -60,7 +60,7 @@ def stopped_by(stop: threading.Event) -> Iterator[None]:
 
 
 def leave_lost_terminal() -> None:
-    """Let standard outputs go nowhere that led to a terminal that is gone; what is written there is an error."""
+    """Redirect standard outputs of a closed terminal to the null device, since writes to them would raise errors."""
     for descriptor in (1, 2):
         with contextlib.suppress(OSError):
             if stat.S_ISCHR(os.fstat(descriptor).st_mode) and not os.isatty(descriptor):

@@ -1,3 +1,3 @@
-"""The command ``retrim``: one file per command. Commands parse, call the library, print, and return an exit code."""
+"""The command ``retrim``, with one module per command. Commands parse options, call the library, and print results."""
 
 from .main import main as main

@@ -11,10 +11,10 @@ from .console import RichReporter, show_paths, started
 
 
 def bench(works: tuple[str, ...] = tuple(WORKS), out: Path | None = None) -> Callable[[threading.Event], int]:
-    """Time the work of the paper's runtime study and of this project, each in a process of its own.
+    """Measure the run time of workloads of the paper's runtime study and of this project, each in its own process.
 
     Args:
-        works: Which; all by default.
+        works: Workloads to measure; all by default.
         out: Folder for bench.json and bench.md; a new one under runs/ by default.
     """
 

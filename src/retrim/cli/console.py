@@ -1,4 +1,4 @@
-"""Output of the commands: lines and progress, in a terminal and in a log file."""
+"""Output of the commands: lines and progress, for terminals and log files."""
 
 import time
 from collections.abc import Iterator, Sequence
@@ -17,11 +17,11 @@ from ..experiments.tables.document import TableSection
 
 console = Console(highlight=False)
 Trust = tyro.conf.UseAppendAction[tuple[str, ...]]  # `--trust a:b --trust c:d`
-LINE_EVERY = 10.0  # [s], where the output is no terminal
+LINE_EVERY = 10.0  # [s]: interval of progress lines if the output is not a terminal
 
 
 class RichReporter:
-    """Progress bars in a terminal; elsewhere a line now and then."""
+    """Reporter with progress bars in a terminal, and periodic lines elsewhere."""
 
     def say(self, text: str) -> None:
         """Print plain text."""
@@ -29,7 +29,7 @@ class RichReporter:
 
     @contextmanager
     def progress(self, title: str) -> Iterator[Advance]:
-        """Show the advance of one piece of work."""
+        """Show the progress of one task."""
         if not console.is_terminal:
             yield _lines(title)
             return
@@ -43,7 +43,7 @@ class RichReporter:
 
 
 def _lines(title: str) -> Advance:
-    """Print a line at the start, at the end, and every ten seconds."""
+    """Return a function that prints a line at the start, at the end, and every ten seconds."""
     began, last = time.monotonic(), [float("-inf")]
 
     def advance(share: float, note: str) -> None:
@@ -58,21 +58,21 @@ def _lines(title: str) -> Advance:
 
 
 def started(run: Run) -> Run:
-    """Return a run, after a line if it goes on from an earlier one of its folder, or replaces its results."""
+    """Return the run, and report if it resumes or overwrites an earlier one."""
     if said := run.of_earlier():
         console.print(said, markup=False, soft_wrap=True)
     return run
 
 
 def refuse(message: str) -> int:
-    """Print one clear line and return the exit code of a refusal."""
+    """Print an error in one line, and return its exit code."""
     console.print(f"[bold red]retrim:[/] {escape(one_line(message))}", soft_wrap=True)
     return 1
 
 
 def show_table(section: TableSection) -> None:
     """Print a table."""
-    if section.title:  # as a line of its own, since a table wraps a title that is wider
+    if section.title:  # on its own line, since a table wraps titles that are wider than itself
         console.print(f"[bold]{escape(section.title)}[/]", soft_wrap=True)
     table = Table()
     for column in section.columns:
@@ -83,11 +83,11 @@ def show_table(section: TableSection) -> None:
 
 
 def show_paths(paths: Sequence[object]) -> None:
-    """Print the paths of files that were written."""
+    """Print the paths of written files."""
     for path in paths:
         console.print(f"[bold]{escape(str(path))}[/]", soft_wrap=True)
 
 
 def _styled(text: str) -> str:
-    """Markdown's bold as the terminal's."""
+    """Convert bold text from Markdown to terminal markup."""
     return f"[bold]{escape(text.replace('**', ''))}[/]" if text.startswith("**") else escape(text)

@@ -1,4 +1,4 @@
-"""``retrim demo``: the whole loop in a minute."""
+"""``retrim demo``: pretraining, flight and adaptation in a minute."""
 
 import sys
 import threading
@@ -19,14 +19,14 @@ def demo(
     seed: int = 0,
     out: Path | None = None,
 ) -> Callable[[threading.Event], int]:
-    """Pretrain a hover policy, push it with disturbances that it never saw, and re-train it while it flies.
+    """Pretrain a hover policy, apply disturbances that were not in training, and re-train the policy in flight.
 
     Args:
         preset: hover/retrim and hover/fast train in seconds; hover/paper and hover/released take about a minute.
-        plant: simple: rotors with linear drag, the quickest; bem: blade-element rotors; the others are extras.
+        plant: simple: rotors with linear drag, the fastest; bem: blade-element rotors; the others are extras.
         seconds: Length of a flight.
         starts: Flights per disturbance and method, each from another start.
-        seed: Seed of everything.
+        seed: Seed of training and flights.
         out: Folder for the policy, results.json and the pictures; a new one under runs/ by default.
     """
 

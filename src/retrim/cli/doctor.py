@@ -1,4 +1,4 @@
-"""``retrim doctor``: is this installation fit to fly?"""
+"""``retrim doctor``: check the installation."""
 
 import threading
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from .console import console
 
 
 def doctor() -> Callable[[threading.Event], int]:
-    """Print versions, device and cache, and look for the known faults of dependencies; exit code 1 if one is there."""
+    """Print versions, device and cache, and check for known faults of dependencies; exit code 1 if a fault is found."""
     return lambda stop: _doctor()
 
 

@@ -18,11 +18,11 @@ def export(
 
     Args:
         policy: A policy.safetensors, or the folder that holds one.
-        to: npz: arrays, with a runner that needs NumPy only; onnx; c: one header of C99, without allocation; delta: a
-            low-rank delta alone, for the runner.
-        delta: A low-rank delta.safetensors, to put on the policy.
-        trust: Python name that a file may hold, as mine:task; its code is run. Once for each name.
-        out: The file; by default policy.npz, policy.onnx, policy.h or delta.npz in the current folder.
+        to: npz: arrays, with a runner that needs NumPy only; onnx; c: one C99 header, without allocation; delta: only a
+            low-rank delta, for the runner.
+        delta: A low-rank delta.safetensors, to add to the policy.
+        trust: Python name that a file may contain, as mine:task; its code is run. Repeat the option for each name.
+        out: File to write; by default policy.npz, policy.onnx, policy.h or delta.npz in the current folder.
     """
 
     def ordered(stop: threading.Event) -> int:

@@ -1,4 +1,4 @@
-"""The option ``--save-vehicle`` of the commands that fly."""
+"""The option ``--save-vehicle`` of the flight commands."""
 
 from pathlib import Path
 
@@ -11,13 +11,13 @@ from .console import refuse
 
 
 def check_vehicle_file(path: Path | None) -> None:
-    """Check the file of ``--save-vehicle`` before anything flies.
+    """Check the file of ``--save-vehicle`` before the flight.
 
     Args:
-        path: File to write; None for none.
+        path: File to write; None if the option is not given.
 
     Raises:
-        ConfigError: It is no TOML file, or its folder does not exist.
+        ConfigError: The name does not end in .toml, or the folder does not exist.
     """
     if path is None:
         return
@@ -28,12 +28,12 @@ def check_vehicle_file(path: Path | None) -> None:
 
 
 def save_flight_vehicle(flight: Flight, setup: Setup, path: Path | None) -> tuple[list[Path], int]:
-    """Write the vehicle that a flight shows; return the files that were written, and the exit code.
+    """Write the vehicle that is identified from a flight; return the written files and the exit code.
 
     Args:
-        flight: The flight.
-        setup: Set-up of the policy that flew.
-        path: File to write; None for none.
+        flight: Flight to identify the vehicle from.
+        setup: Set-up of the policy in the flight.
+        path: File to write; None if the option is not given.
     """
     if path is None:
         return [], 0

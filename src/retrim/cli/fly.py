@@ -40,26 +40,26 @@ def fly(
     trust: Trust = (),
     out: Path | None = None,
 ) -> Callable[[threading.Event], int]:
-    """Fly a policy on a plant, as it is and, with --adapt full or lora, adapting as it flies.
+    """Fly a policy on a plant, unchanged and, with --adapt full or lora, with adaptation in flight.
 
     Args:
         policy: A policy.safetensors, or the folder that holds one.
-        resume: Instead of a policy: a learnt.safetensors of an earlier flight (policy, residual, optimiser states),
-            to go on from.
-        delta: A low-rank delta.safetensors of an earlier flight, to put on the policy.
-        where: Plant, vehicle and what disturbs the flight.
+        resume: Instead of a policy: learnt.safetensors of an earlier flight (policy, residual, optimiser states),
+            from which to continue.
+        delta: A low-rank delta.safetensors of an earlier flight, to add to the policy.
+        where: Plant, vehicle and disturbances of the flight.
         adapt: full, lora: re-train in flight, all weights or a few; base-i: integral action; base-do: observer; none:
-            as it is; geometric, geometric-i, indi, mppi, l1-mpc, raptor: another controller; or module:name.
+            unchanged policy; geometric, geometric-i, indi, mppi, l1-mpc, raptor: another controller; or module:name.
         residual: Residual model: ensemble, regression, layered, linear, or module:name.
-        config: TOML file that overlays the policy's own preset, for example with a table [adapt].
-        latency: fixed: learning costs the preset's flight time, so that a run repeats bit for bit; measured: what the
-            clock says.
+        config: TOML file with values that replace those of the policy's preset, for example a table [adapt].
+        latency: fixed: learning takes the flight time of the preset, so that a run is reproducible bit for bit;
+            measured: it takes the measured computing time.
         seconds: Length of a flight; 30 s for hover, 60 s for tracking by default.
         starts: Number of flights, each from another start.
-        seed: Seed of the starts, of the learners and of what is random in the scenario, 0 to 4294967295.
-        save_vehicle: Write the vehicle that the last flight shows to this vehicle file (TOML), to pretrain for.
-        trust: Python name that a file may hold, as mine:task; its code is run. Once for each name.
-        out: Folder for results.json, events.jsonl, logs/, what was learnt and the picture; a new one under runs/ by
+        seed: Seed of the starts, the learners and the random parts of the scenario, 0 to 4294967295.
+        save_vehicle: Vehicle file (TOML) to write, with the vehicle identified in the last flight, for pretraining.
+        trust: Python name that a file may contain, as mine:task; its code is run. Repeat the option for each name.
+        out: Folder for results.json, events.jsonl, logs/, learned parameters and the picture; a new one under runs/ by
             default.
     """
 
@@ -68,7 +68,7 @@ def fly(
         if where.is_vehicle:
             if delta or config or starts != 1 or latency != "fixed":
                 raise ConfigError("a vehicle is flown live: without --delta, --config, --starts and --latency")
-            from .live import live  # here: other flights need nothing of it
+            from .live import live  # here: other flights do not need this module
 
             return live(
                 policy,
@@ -100,7 +100,7 @@ def fly(
 
 
 def _fly(fleet: Fleet, setup: Setup, scenario: Scenario, run: Run, vehicle_file: Path | None) -> int:
-    flights = list[Flight]()  # a Ctrl-C may come before there are any
+    flights = list[Flight]()  # a Ctrl-C may come before the first flight ends
     with run.interruptible(), RichReporter().progress("flying") as advance:
         advance(0.0, "compiling the programs of a flight (kept in a cache for the next time)")
         flights = fleet.run(stop=run.stop, progress=told_by(advance)).flown
@@ -124,7 +124,7 @@ def _fly(fleet: Fleet, setup: Setup, scenario: Scenario, run: Run, vehicle_file:
 
 
 def _warn(setup: Setup, scenario: Scenario) -> None:
-    """Say what the vehicle that flies cannot fly of the reference."""
+    """Warn if the reference exceeds the limits of the vehicle."""
     if wrong := setup.limits_exceeded(scenario.make_vehicle(setup.preset.vehicle)):
         who = scenario.vehicle_name(setup.preset.vehicle)
         console.print(f"[yellow]warning:[/] vehicle {who} cannot fly all of reference {scenario.reference}: {wrong}")

@@ -17,14 +17,15 @@ from .console import RichReporter, Trust, console
 def learn(
     addresses: tyro.conf.Positional[tuple[str, ...]], key: Path | None = None, trust: Trust = ()
 ) -> Callable[[threading.Event], int]:
-    """Learn for flights on other machines: `retrim live --learners ADDRESS` flies one.
+    """Learn for flights on other machines, which are started there by `retrim live --learners ADDRESS`.
 
-    One process learns for several flights, too. Ctrl-C ends it; the flights go on with their last policies.
+    One process can learn for several flights. Ctrl-C ends it; the flights continue with their last policies.
 
     Args:
-        addresses: Flights: zenoh:HOST:PORT of a machine that flies, or ros:HOST:PORT/quad1 of a rosmaster and vehicle.
-        key: File with the key that the flights have, too, or RETRIM_KEY; needed where they are on other machines.
-        trust: Python name that a flight may name, as mine:task; its code is run here. Once for each name.
+        addresses: Addresses of flights: zenoh:HOST:PORT of a flight computer, or ros:HOST:PORT/quad1 of a rosmaster
+            and a vehicle.
+        key: File with the key that the flights have, too, or RETRIM_KEY; needed for flights on other machines.
+        trust: Python name that a flight may send, as mine:task; its code is run here. Repeat the option for each name.
     """
 
     def ordered(stop: threading.Event) -> int:

@@ -32,7 +32,7 @@ from ..transport.remote import LOOPBACK
 from .console import RichReporter, Trust, console, refuse, show_paths, show_table, started
 from .flight_vehicle import check_vehicle_file, save_flight_vehicle
 
-LINE_EVERY = 5.0  # [s], where the output is no terminal
+LINE_EVERY = 5.0  # [s]: interval of status lines if the output is not a terminal
 
 
 def live(
@@ -57,32 +57,34 @@ def live(
     trust: Trust = (),
     out: Path | None = None,
 ) -> Callable[[threading.Event], int]:
-    """Fly against the clock, and learn at the same time: a process for control, for each learner, and for the plant.
+    """Fly in real time and learn at the same time, with processes for control, for each learner, and for the plant.
 
-    Ctrl-C lands the vehicle: the end of a flight without `--seconds`, whose exit code is 0.
+    Ctrl-C lands the vehicle. A flight without `--seconds` ends in this way, and its exit code is 0.
 
     Args:
         policy: A policy.safetensors, or the folder that holds one; without one, a policy is trained first.
-        resume: A learnt.safetensors of an earlier flight, to go on from.
-        preset: Preset to train with where there is neither.
-        where: Plant, vehicle and what disturbs the flight.
+        resume: A learnt.safetensors of an earlier flight, from which to continue.
+        preset: Preset to train with if there is neither --policy nor --resume.
+        where: Plant, vehicle and disturbances of the flight.
         adapt: full, lora: learn in flight; base-i, base-do, none: fly without learning; or module:name.
         residual: Residual model: ensemble, regression, layered, linear, or module:name.
         seconds: Length of the flight; until Ctrl-C by default.
-        fence: How far from its reference the vehicle may be along any axis before the fallback flies [m].
-        policy_age: Age [s] of the flight that the policy was learnt from, above which the fallback flies; any age.
-        seed: Seed of the start, of the learners and of what is random in the scenario.
-        learners: Where learners on another machine, started by `retrim learn`, reach this one: zenoh:HOST:PORT (this
-            machine listens there), or ros:HOST:PORT of a rosmaster. By default they run here.
-        key: File with a key that `retrim learn` has, too, or RETRIM_KEY; needed for learners on another machine.
-        page: Show the flight in a browser, with knobs, also with `--seconds`; without it, that is the default.
-        no_page: Show it in the terminal only.
-        page_host: Address that the page listens on; its printed address has a token, without which nothing is answered.
-        page_port: Port of the page, or the next one that is free.
+        fence: Largest distance from the reference along any axis before the fallback controller takes over [m].
+        policy_age: Largest age of the flight data of a learned policy before the fallback takes over [s]; unlimited by
+            default.
+        seed: Seed of the start, the learners and the random parts of the scenario.
+        learners: Address at which learners on another machine, started by `retrim learn`, reach this one:
+            zenoh:HOST:PORT (this machine listens there), or ros:HOST:PORT of a rosmaster. By default they run here.
+        key: File with the key that `retrim learn` has, too, or RETRIM_KEY; needed for learners on another machine.
+        page: Show the flight in a browser, with controls, also with `--seconds`. Without `--seconds`, this is the
+            default.
+        no_page: Show the flight in the terminal only.
+        page_host: Address that the page listens on. The printed address has a token, which every request needs.
+        page_port: Port of the page; the next free port if it is in use.
         record: FILE.mcap for Foxglove and PlotJuggler, by default flight.mcap in the folder; or FILE.rrd for rerun.
-        save_vehicle: Write the vehicle that the flight shows to this vehicle file (TOML), to pretrain for.
-        trust: Python name that a file may hold, as mine:task; its code is run. Once for each name.
-        out: Folder of what the flight leaves; a new one under runs/ by default.
+        save_vehicle: Vehicle file (TOML) to write, with the vehicle identified in the flight, for pretraining.
+        trust: Python name that a file may contain, as mine:task; its code is run. Repeat the option for each name.
+        out: Folder for the results of the flight; a new one under runs/ by default.
     """
 
     def ordered(stop: threading.Event) -> int:
@@ -110,14 +112,14 @@ def live(
             setup, weights, scenario, "base" if adapt == "none" else adapt, seconds or LONGEST, seed, fence, run.folder,
             state, address, ground, policy_age=policy_age or float("inf"), record=record, until_stopped=seconds is None,
         )  # fmt: skip
-        with interrupts_only_set(run.stop):  # a Ctrl-C lands the vehicle; whoever is in the air is not dropped
+        with interrupts_only_set(run.stop):  # a Ctrl-C must land the vehicle, not end the processes
             return _fly(request, run, save_vehicle)
 
     return ordered
 
 
 def _fly(request: LiveRequest, run: Run, vehicle_file: Path | None) -> int:
-    """Fly one flight, and show what it leaves."""
+    """Run one flight, and show its results."""
     done = fly_live(request, run, RichReporter(), _display, lambda url: _open_page(url, run.folder))
     if done is None:
         return INTERRUPTED
@@ -131,7 +133,7 @@ def _fly(request: LiveRequest, run: Run, vehicle_file: Path | None) -> int:
 
 
 def _open_page(url: str, folder: Path) -> None:
-    """Say where the page is, and open it where there is a screen."""
+    """Print the address of the page, and open it in a browser if the output is a terminal."""
     console.print(f"page: {url}", markup=False, soft_wrap=True)
     if console.is_terminal:
         open_page(url, folder)
@@ -139,7 +141,7 @@ def _open_page(url: str, folder: Path) -> None:
 
 @contextmanager
 def _display(events: LiveEvents) -> Iterator[Callable[[Status, list[Event]], None]]:
-    """Show a flight as a table in a terminal, and as a line now and then elsewhere; events as they come."""
+    """Show a flight as a table in a terminal or as periodic lines elsewhere, and events when they occur."""
     last = float("-inf")
 
     def show(status: Status, new: list[Event]) -> None:

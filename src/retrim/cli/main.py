@@ -1,6 +1,6 @@
-"""The command line: picks the command, turns errors into one clear line and an exit code.
+"""Entry point of the command line: it selects the command, and turns errors into one line and an exit code.
 
-Modules of commands are imported when they are needed, so that help is quick.
+Modules of commands are imported only when they are needed, so that --help is fast.
 """
 
 import os
@@ -44,13 +44,14 @@ HELP = "\n".join(
 def main(words: Sequence[str] | None = None) -> None:
     """Run a command and exit.
 
-    Exit codes: 0 done, 1 refused with a message, 2 wrong usage, 130 interrupted, with what was done kept.
+    Exit codes: 0 for success, 1 for an error with a message, 2 for wrong usage, 130 for an interruption; results up to
+    then are kept.
 
     Args:
         words: Command and options; ``sys.argv`` by default.
     """
     if words is not None:
-        sys.argv = ["retrim", *words]  # what results say they were made by
+        sys.argv = ["retrim", *words]  # results record this command line
     sys.exit(_run(sys.argv[1:]))
 
 
@@ -78,7 +79,7 @@ def _run(words: list[str]) -> int:
         print("interrupted", file=sys.stderr)
         return 130
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nobody reads any more; say nothing at exit
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # pipe is closed: avoid errors at exit
         return 1
 
 

@@ -33,16 +33,16 @@ def pretrain(
     """Train a policy from scratch in the nominal model and save it.
 
     Args:
-        task: What the policy learns: hover, track, vision, or module:name of a task of your own.
-        preset: Preset to train with, as hover/retrim or hover/paper; by default the task's own.
+        task: Task of the policy: hover, track, vision, or module:name of a custom task.
+        preset: Preset to train with, as hover/retrim or hover/paper; by default that of the task.
         vehicle: Vehicle to train for: small, large, kingfisher, a vehicle file, as my_quad.toml, or module:name.
-        reference: What to track: circle, figure8, star, a CSV file, module:name, or a family, as circle+star.
-        residual: Residual model of later adaptation: ensemble, regression, layered, linear, or module:name.
-        config: TOML file that overlays the preset, for example with a table [pretrain].
-        updates: Optimiser steps, instead of the preset's.
-        envs: Starts per step, instead of the preset's.
+        reference: Reference to track: circle, figure8, star, a CSV file, module:name, or a family, as circle+star.
+        residual: Residual model for later adaptation: ensemble, regression, layered, linear, or module:name.
+        config: TOML file with values that replace those of the preset, for example a table [pretrain].
+        updates: Number of optimiser steps; by default that of the preset.
+        envs: Number of starts per step; by default that of the preset.
         seed: Seed of the initial weights and of the starts, 0 to 4294967295.
-        trust: Python name that a file may hold, as mine:task; its code is run. Once for each name.
+        trust: Python name that a file may contain, as mine:task; its code is run. Repeat the option for each name.
         out: Folder for policy.safetensors and results.json; a new one under runs/ by default.
     """
 

@@ -19,11 +19,11 @@ def replay(
     asked: tyro.conf.OmitArgPrefixes[tyro.conf.UseAppendAction[Replay]] = Replay(),  # noqa: B008
     out: Path | None = None,
 ) -> Callable[[threading.Event], int]:
-    """Read a flight log: what the nominal model missed, and how well that is foretold; identify, adapt.
+    """Read a flight log, and report the error of the nominal model and how well it is predicted; identify, adapt.
 
     Args:
-        log: CSV, NPZ, ULog of PX4, bag of ROS 1 or 2, or MCAP; the last three need the extra `logs`.
-        asked: What to do with it.
+        log: Log file: CSV, NPZ, ULog of PX4, bag of ROS 1 or 2, or MCAP; the last three need the extra `logs`.
+        asked: Options of the replay.
         out: Folder for the report, its picture, vehicle.toml and the policy; a new one under runs/ by default.
     """
 

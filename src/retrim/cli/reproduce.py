@@ -1,4 +1,4 @@
-"""``retrim reproduce``: a command for each table, with the options of the function that makes it."""
+"""``retrim reproduce``: one command per table, with the options of the function that makes the table."""
 
 import inspect
 import sys
@@ -17,10 +17,10 @@ Ordered = Callable[[threading.Event], int]
 
 
 def command_of(make: Callable[..., None], called: str = "reproduce") -> Callable[..., Ordered]:
-    """Return a command with the options of a table, and ``out``.
+    """Return a command with the options of a table, and with ``out`` and ``on``.
 
     Args:
-        make: It makes a document from a run and a reporter.
+        make: Function that makes a document from a run and a reporter.
         called: Name of the command, for the folder of its runs.
     """
     name, options = make.__name__, options_of(make)

@@ -17,14 +17,14 @@ def sweep(
 ) -> Callable[[threading.Event], int]:
     """Fly every combination of a sweep file: presets x scenarios x methods x seeds.
 
-    The folder holds the policies and every flight's row while the sweep runs: the same command with the same --out
-    goes on after an interruption or a kill.
+    The folder contains the policies and the result of every flight while the sweep runs. After an interruption or a
+    kill, the same command with the same --out continues the sweep.
 
     Args:
         file: TOML file with any of: presets, seeds, methods, disturbances, plants, vehicles, sensors, references,
-            starts, seconds, and a table [overlay] with values on top of the presets.
-        on: tcp://HOST:PORT or tls://HOST:PORT of a Dask scheduler, whose workers train and fly.
-        trust: Python name that a file may hold, as mine:task; its code is run. Once for each name.
+            starts, seconds, and a table [overlay] with values that replace those of the presets.
+        on: tcp://HOST:PORT or tls://HOST:PORT of a Dask scheduler, whose workers run the training and the flights.
+        trust: Python name that a file may contain, as mine:task; its code is run. Repeat the option for each name.
         out: Folder for sweep.md, sweep.json and sweep.png; by default runs/ and the file's name.
     """
 

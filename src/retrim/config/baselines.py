@@ -1,7 +1,7 @@
-"""Classical controllers beside the policies, given what a preset declares of the vehicle: delay, lag and limits.
+"""Classical baseline controllers. They receive the declared delay, lag and limits of the vehicle.
 
-``retrim reproduce tuning`` found their settings, on pushes, starts and seeds of its own, once for a measured state and
-once for the pose that is estimated from keypoints: see docs/results/tuning.md and tuning_keypoints.md.
+``retrim reproduce tuning`` tuned their settings with separate pushes, starts and seeds, once for a measured state and
+once for a pose estimated from keypoints: see docs/results/tuning.md and tuning_keypoints.md.
 """
 
 from collections.abc import Callable, Mapping
@@ -26,58 +26,58 @@ from .command_paths import ACTUATOR_LAG, declared_path, lag_of
 if TYPE_CHECKING:
     from .setup import Setup
 
-INTEGRAL_LIMIT = 6.0  # [m/s^2], as the largest disturbance that the policies' observer answers
-HORIZON = 0.8  # [s], of MPPI
-L1_POLE = -0.2  # [1/s], as flown on hardware with DATT; its size hardly matters while it is small beside 1 / dt
+INTEGRAL_LIMIT = 6.0  # [m/s^2]: same as the largest disturbance that the observer of the policies compensates
+HORIZON = 0.8  # [s]: horizon of MPPI
+L1_POLE = -0.2  # [1/s], as in the hardware flights of DATT; its size matters little if it is small compared to 1 / dt
 
-DATT_ESTIMATOR = 0.5  # [s], time constant of the filter; DATT's own is 2 s
+DATT_ESTIMATOR = 0.5  # [s]: time constant of the filter; the DATT authors use 2 s
 
 Settings = Mapping[str, float]
 
 
 @dataclass(frozen=True)
 class Baseline:
-    """A controller that needs no policy, its settings, and where they were searched."""
+    """A controller without policy, its settings, and the ranges of their search."""
 
     label: str
     """Name in tables."""
     make: Callable[["Setup", Settings, Key[Array, ""]], AbstractController[Any]]
-    """From a set-up, settings, and a seed for what is random."""
+    """Function of a set-up, settings and a random key that returns the controller."""
     settings: Settings
-    """For a measured state."""
+    """Settings for a measured state."""
     settings_from_keypoints: Settings
-    """For a pose that a filter estimates from keypoints: it is late and shakes, so slower loops fly better."""
+    """Settings for a pose that a filter estimates from keypoints. It is late and noisy, so slower loops fly better."""
     ranges: Mapping[str, tuple[float, float]]
-    """Smallest and largest value that the search draws, evenly in the logarithm."""
+    """Smallest and largest value of the search, which draws uniformly in the logarithm."""
     cost: int = 1
-    """The search tries one candidate where it tries so many of a controller that is quick."""
+    """Relative cost of a rollout; the tuning search divides its number of candidates by it."""
 
     def controller(self, setup: "Setup", key: Key[Array, ""] | None = None) -> AbstractController[Any]:
         """Return the controller with its settings."""
         return self.make(setup, self.settings_for(setup), random.key(0) if key is None else key)
 
     def settings_for(self, setup: "Setup") -> Settings:
-        """Return the settings for what the controller is shown."""
+        """Return the settings for the observation of the set-up: a measured state, or keypoints."""
         seen = isinstance(setup.flown.observation_in_flight, OccludedKeypoints)
         return self.settings_from_keypoints if seen else self.settings
 
 
 def prediction_of(setup: "Setup") -> Prediction:
-    """Return the nominal model of a preset's vehicle."""
+    """Return the nominal model of the vehicle of a preset."""
     preset, lag = setup.preset, lag_of(setup.preset, setup.vehicle)
-    tau = jnp.array(ACTUATOR_LAG) if lag is None else lag.omega[0]  # of all axes: a baseline hardly yaws
+    tau = jnp.array(ACTUATOR_LAG) if lag is None else lag.omega[0]  # roll lag for all axes: a baseline hardly yaws
     return Prediction(tau, preset.dt, preset.plant_delay_ticks)
 
 
 def slowness(setup: "Setup") -> float:
-    """Return how many times later a vehicle turns after a command than in the search for settings, at least 1."""
+    """Return the ratio of command delay plus rate lag to its value in the tuning search, at least 1."""
     path = declared_path(setup.preset, setup.vehicle)
     delay, lag = float(path.delay), float(path.response.rate_lag[0])
     return max(1.0, (delay + lag) / (delay + ACTUATOR_LAG))
 
 
 def _gains(setup: "Setup", s: Settings) -> Gains:
-    """The same loops, but slower as the vehicle is: a time that is n times as long makes a gain of 1/s^k n^k less."""
+    """Return the gains, scaled to the slowness n of the vehicle: a gain in 1/s^k is divided by n^k."""
     n = slowness(setup)
     values = (s["position"] / n**2, s["velocity"] / n, s["attitude"] / n, s.get("integral", 0.0) / n**3)
     return Gains(*(jnp.array(value) for value in values))
@@ -129,7 +129,7 @@ def _mppi(setup: "Setup", s: Settings, key: Key[Array, ""]) -> Mppi:
 
 
 def datt_of(setup: "Setup", net: DattNet) -> Datt:
-    """Return a trained network of DATT in flight."""
+    """Return the controller of a trained DATT network."""
     dt, vehicle = setup.preset.dt, setup.vehicle
     estimator = L1Estimator(jnp.array(L1_POLE), jnp.exp(jnp.array(-dt / DATT_ESTIMATOR)), dt)
     return Datt(
@@ -193,6 +193,6 @@ BASELINES: dict[str, Baseline] = {
         cost=3,
     ),
 }  # fmt: skip
-"""By name of the method. Positions [1/s^2], velocities and attitudes [1/s], integrals [1/s^3], time constants of filter
-and estimator [s]; of MPPI the noise of thrust [m/s^2] and rates [rad/s], its correlation [s], the temperature, and
-costs per second of position [1/m], velocity [s/m] and attitude."""
+"""Baselines by method name. Units: position gains [1/s^2], velocity and attitude gains [1/s], integral gains [1/s^3],
+time constants of filter and estimator [s]. MPPI: noise of thrust [m/s^2] and rates [rad/s], its correlation time [s],
+the temperature, and costs per second of position [1/m], velocity [s/m] and attitude."""

@@ -1,4 +1,4 @@
-"""The command paths that a preset describes: that of its model, and what it declares of the plant.
+"""Command paths of a preset: the path of its training model, and the declared path of the plant.
 
 | where | delay | lag |
 |---|---|---|
@@ -20,14 +20,15 @@ from .presets import Preset
 from .vehicle_file import VehicleSpec
 from .vehicles import is_published
 
-ACTUATOR_LAG = 0.033  # [s], where a preset declares none: what quadrotors of this size have
+ACTUATOR_LAG = 0.033  # [s]: typical lag of small quadrotors, for presets without a declared lag
 
 
 def lag_of(preset: Preset, vehicle: Vehicle) -> Command | None:
     """Return the time constants of thrust and rates [s], or None for a model without lag.
 
-    They are the vehicle's where they are known. A published vehicle has those of the preset; the rates of any other one
-    follow as those of its simulated rate loop do, and its thrust as its motors do.
+    A vehicle with known rate lag has its own time constants. Published vehicles have the time constants of the preset.
+    For other vehicles, the body rates have the rise times of the simulated rate loop, and the thrust has the time
+    constant of the motors.
     """
     if vehicle.rate_lag is not None:
         return Command(vehicle.motor_tau, vehicle.rate_lag)
@@ -38,7 +39,7 @@ def lag_of(preset: Preset, vehicle: Vehicle) -> Command | None:
 
 
 def response_of(preset: Preset, vehicle: Vehicle) -> ActuatorResponse | None:
-    """Return how thrust and rates of a preset's model follow commands, or None if they follow at once."""
+    """Return the response of thrust and rates to commands in the model of a preset, or None for a model without lag."""
     lag = lag_of(preset, vehicle)
     if lag is None:
         return None
@@ -47,10 +48,10 @@ def response_of(preset: Preset, vehicle: Vehicle) -> ActuatorResponse | None:
 
 
 def delayed(preset: Preset) -> Preset:
-    """Return a preset with the command delay of its vehicle, where its file says one, in the model and declared.
+    """Return a preset with the command delay of its vehicle file, if there is one, in the model and the declared plant.
 
     Raises:
-        ConfigError: It is more ticks than a preset may have.
+        ConfigError: The delay has more ticks than a preset supports.
     """
     vehicle = preset.vehicle
     if not isinstance(vehicle, VehicleSpec) or vehicle.command_delay is None:
@@ -66,22 +67,22 @@ def delayed(preset: Preset) -> Preset:
 
 
 def model_path(preset: Preset, vehicle: Vehicle) -> CommandPath:
-    """Return the command path of a preset's model of training."""
+    """Return the command path of the training model of a preset."""
     return CommandPath.of(_delay(preset, preset.delay_ticks), response_of(preset, vehicle))
 
 
 def declared_path(preset: Preset, vehicle: Vehicle) -> CommandPath:
-    """Return the command path that a preset declares of the plant."""
+    """Return the command path of the plant, as declared by a preset."""
     return CommandPath.of(_delay(preset, preset.plant_delay_ticks), response_of(preset, vehicle))
 
 
 def _delay(preset: Preset, ticks: int) -> float:
-    """Return the delay of the vehicle file, which need not be whole ticks, or that of the preset [s]."""
+    """Return the delay of the vehicle file, which need not be whole ticks, or the delay of the preset [s]."""
     vehicle = preset.vehicle
     stated = vehicle.command_delay if isinstance(vehicle, VehicleSpec) else None
     return ticks * preset.dt if stated is None else stated
 
 
 def longest_delay(preset: Preset) -> float:
-    """Return the longest delay that queues of commands have room for [s]; the same for all usual presets."""
+    """Return the longest delay that command queues can store [s]; the same for all usual presets."""
     return max(LONGEST_DELAY, preset.dt * max(preset.delay_ticks, preset.plant_delay_ticks))

@@ -1,4 +1,4 @@
-"""The conditions of the gauntlet: everything that changes, and everything that differs from training."""
+"""Conditions of the gauntlet: changes in flight, and differences between training and flight."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -15,12 +15,12 @@ from .vehicles import make_vehicle
 
 
 def conditions(preset: Preset, sensors: str = "ideal") -> dict[str, Scenario]:
-    """Return what is flown with a preset, by name: at hover, or on every reference that it was trained on.
+    """Return the scenarios of a preset by name: at hover, or on every reference that it was trained on.
 
     Args:
-        preset: What is flown.
-        sensors: What every condition is measured with; with others than ideal ones, those conditions are left out that
-            name sensors of their own or fly a plant without sensors.
+        preset: Preset of the policy.
+        sensors: Sensor model of every condition. If it is not ``ideal``, conditions that name their own sensors or use
+            a plant without sensors are omitted.
     """
     found = _at_hover() if preset.track is None else _on_references(preset, preset.track.reference.split("+"))
     if sensors == "ideal":
@@ -61,14 +61,14 @@ FLOWN = {
     "none-rough": ("none", "rough"),
     "gusts-rough": ("gusts", "rough"),
 }
-"""On each reference: disturbance and sensors."""
+"""Conditions on each reference: disturbance and sensors."""
 
 
 def fault_conditions(preset: Preset) -> dict[str, Scenario]:
-    """Return faults of measurements and of the vehicle, by name, each beside a small push.
+    """Return faults of the measurements and of the vehicle by name, each combined with a small push.
 
     Args:
-        preset: What is flown, at hover.
+        preset: Preset of a hover policy.
     """
     heavier = f"{PUSH}+payload={0.5 * float(make_vehicle(preset.vehicle).mass):.4g}"
     return {name: Scenario(PUSH, fault=name) for name in FAULTS if name != NO_FAULT} | {
@@ -123,7 +123,7 @@ def _at_hover() -> dict[str, Scenario]:
 def _like(
     like: Vehicle, name: str, *, mass: float = 1.0, thrust: float = 1.0, inertia: float = 1.0, motor_tau: float = 1.0
 ) -> VehicleSpec:
-    """Return a vehicle like another, some of its numbers multiplied; its propellers follow from its thrust."""
+    """Return a scaled copy of a vehicle. Arguments are factors; the propellers are derived from the thrust."""
     return VehicleSpec(
         name=name,
         mass=mass * float(like.mass),
@@ -142,7 +142,7 @@ def _three(values: Array) -> tuple[float, float, float]:
 
 
 def _random_vehicle(like: Vehicle, n: int) -> VehicleSpec:
-    """Return a vehicle of 0.7 to 1.6 times the mass of another, with inertia, thrust and motors to match."""
+    """Return a vehicle with 0.7 to 1.6 times the mass of another one, and random inertia, thrust and motor lag."""
     draw = np.random.default_rng(n)
     mass = float(draw.uniform(0.7, 1.6))
     inertia, thrust, motors = mass * draw.uniform(0.8, 1.25), draw.uniform(0.8, 1.2), draw.uniform(0.7, 2.0)

@@ -1,4 +1,4 @@
-"""Disturbances by name, with a size if wanted: ``wind=6+payload=0.1``."""
+"""Registry of disturbances, with optional sizes: ``wind=6+payload=0.1``."""
 
 from collections.abc import Callable
 
@@ -14,9 +14,9 @@ from .registry import Registry
 from .sizes import name_and_size
 
 DisturbanceFactory = Callable[[Key[Array, ""], float | None], Disturbance]
-"""From a key, for what is random, and a size (None for the default) to a disturbance."""
+"""Function of a random key and a size (or None, the default size) that returns a disturbance."""
 
-SEED_TAG = 2**30 + 3  # folded into a seed: disturbances share no key with starts, learners and sensors
+SEED_TAG = 2**30 + 3  # folded into seeds, so that disturbances share no key with starts, learners and sensors
 
 DISTURBANCES: Registry[DisturbanceFactory] = Registry("disturbance", example="sums as wind+payload=0.1, or module:name")
 register_disturbance = DISTURBANCES.register
@@ -26,11 +26,11 @@ def disturbance(names: str, seed: int = 0) -> Disturbance:
     """Return a disturbance by name.
 
     Args:
-        names: As ``wind``, ``wind=6`` (with a size), or a sum ``wind=6+payload``.
-        seed: What is random about the disturbance follows from it.
+        names: Name, as ``wind``; name with a size, as ``wind=6``; or a sum, as ``wind=6+payload``.
+        seed: Seed of the random parts of the disturbance.
 
     Raises:
-        ConfigError: There is no such disturbance, or it has no such size.
+        ConfigError: The disturbance does not exist, or does not accept this size.
     """
     parts = list[Disturbance]()
     for i, part in enumerate(names.split("+")):
@@ -84,20 +84,20 @@ _BUILT_IN: dict[str, DisturbanceFactory] = {
     ),
     "step": lambda key, size: Step(jnp.full(3, _bounded(size, 2.0, -10.0, 10.0, "m/s^2")), jnp.array(8.0)),
     "early-step": lambda key, size: Step(jnp.full(3, _bounded(size, 2.0, -10.0, 10.0, "m/s^2")), jnp.array(4.0)),
-    "kick": lambda key, size: Kick(  # a speed gained within 0.1 s, level and diagonal
+    "kick": lambda key, size: Kick(  # size: speed gained within 0.1 s, horizontal and diagonal
         10.0 * _diagonal(_bounded(size, 3.0, 0.0, 10.0, "m/s")), jnp.array(8.0), jnp.array(0.1)
     ),
     "reversing": lambda key, size: Reversing(  # Sec. IV-B.3
         jnp.full(3, _bounded(size, 0.5, -10.0, 10.0, "m/s^2")), jnp.array(15.0)
     ),
-    # The bounds are the paper's for training DATT, +-1 m/s^2.
+    # The bounds, +-1 m/s^2, are those of the paper for the training of DATT.
     "walk": lambda key, size: RandomWalk.of(_bounded(size, 0.5, 0.0, 10.0, "m/s^2"), 1.0, key=key),
     "wind": lambda key, size: SteadyWind(_diagonal(_bounded(size, 4.0, 0.0, 20.0, "m/s"))),
     "gusts": lambda key, size: Dryden.of(_diagonal(_bounded(size, 4.0, 0.5, 20.0, "m/s")), key=key),
     "fan": _fan,
-    "payload": lambda key, size: Payload.of(_bounded(size, 0.07, 0.0, 20.0, "kg")),  # the paper's: 190 g become 260 g
+    "payload": lambda key, size: Payload.of(_bounded(size, 0.07, 0.0, 20.0, "kg")),  # the paper: 190 g become 260 g
     "pickup": lambda key, size: Payload.of(_bounded(size, 0.07, 0.0, 20.0, "kg"), picked=8.0, dropped=20.0),
-    "battery": lambda key, size: BatterySag(  # thrust lost per second, as a share
+    "battery": lambda key, size: BatterySag(  # size: relative loss of thrust per second
         jnp.array(_bounded(size, 0.002, 0.0, 0.1, "1/s")), jnp.array(0.8)
     ),
     "weak-rotor": lambda key, size: WeakRotor.of(0, _bounded(size, 0.9, 0.3, 1.0, "of its thrust")),

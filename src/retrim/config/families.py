@@ -1,4 +1,4 @@
-"""The family of vehicles of a preset, and the parts of a flight that only such presets have."""
+"""The vehicle family of a preset, and the flight components that only such presets have."""
 
 from typing import Any
 
@@ -18,12 +18,12 @@ from .presets import Preset
 from .tasks import find_task
 from .vehicle_file import VehicleSpec
 
-TRUST = 2.0  # a delay or a lag of a vehicle file may be wrong by this factor
-LEAST = 0.01  # [s]: a shorter delay or lag may be wrong by this much
+TRUST = 2.0  # assumed error factor of a delay or lag in a vehicle file
+LEAST = 0.01  # [s]: assumed error of a short delay or lag
 
 
 def make_family(preset: Preset) -> PathFamily | None:
-    """Return the family of a preset; None if it is for one vehicle.
+    """Return the family of a preset, or None for a preset with one vehicle.
 
     Raises:
         ConfigError: A range is empty or impossible.
@@ -44,10 +44,10 @@ def make_family(preset: Preset) -> PathFamily | None:
 
 
 def prior_belief(preset: Preset, family: PathFamily) -> PathBelief:
-    """Return what is known of a vehicle before take-off: what its file states may be wrong by a factor of two.
+    """Return the belief about a vehicle before take-off. Values of its file may be wrong by a factor of two.
 
     Args:
-        preset: Its vehicle may be a vehicle file.
+        preset: Preset whose vehicle may come from a vehicle file.
         family: Family of the preset.
     """
     vehicle = preset.vehicle
@@ -68,12 +68,13 @@ def prior_belief(preset: Preset, family: PathFamily) -> PathBelief:
 
 
 def policy_controller(preset: Preset, task: AbstractTask, policy: Policy) -> PolicyController:
-    """Return a policy behind the observation of flight.
+    """Return a policy with the observation used in flight.
 
     Args:
-        preset: A policy for a family that rests at home is shifted, so that it commands hover there.
+        preset: Preset of the policy. In a task without reference, a policy for a family is shifted so that it commands
+            hover at home.
         task: Task of the flight.
-        policy: Policy that flies.
+        policy: Policy of the flight.
     """
     observation = task.observation_in_flight
     if preset.family is None or find_task(preset.task).has_reference:
@@ -82,7 +83,7 @@ def policy_controller(preset: Preset, task: AbstractTask, policy: Policy) -> Pol
 
 
 def track_actuators(controller: AbstractController[Any], preset: Preset) -> AbstractController[Any]:
-    """Return a controller that is told thrust and body rates, if its preset is for a family of vehicles.
+    """Return a controller that receives the present thrust and body rates, if its preset is for a family of vehicles.
 
     Args:
         controller: Controller of a policy.
@@ -97,7 +98,7 @@ def track_actuators(controller: AbstractController[Any], preset: Preset) -> Abst
 
 
 def identify_vehicle(controller: AbstractController[Any], preset: Preset) -> IdentifiedFlight:
-    """Return a controller that is told the vehicle as it is identified in flight.
+    """Return a controller that receives the parameters of the vehicle, identified in flight.
 
     Args:
         controller: Controller of a policy for a family; see :func:`track_actuators`.
@@ -117,7 +118,7 @@ def identify_vehicle(controller: AbstractController[Any], preset: Preset) -> Ide
 
 
 def declared_vehicle(preset: Preset) -> Float[Array, "2"] | None:
-    """Return command delay and rate lag of the vehicle file [s], if it states both."""
+    """Return command delay and rate lag of the vehicle file [s], or None if the file does not state both."""
     vehicle = preset.vehicle
     if not isinstance(vehicle, VehicleSpec) or vehicle.command_delay is None or vehicle.rate_lag is None:
         return None
@@ -129,7 +130,7 @@ def _lag(vehicle: VehicleSpec) -> float | None:
 
 
 def _interval(value: float | None) -> tuple[float, float]:
-    """Return the interval of a time that a vehicle file states [s]; everything if it states none."""
+    """Return the interval of a time constant from a vehicle file [s]; unbounded if the file does not state it."""
     if value is None:
         return 0.0, jnp.inf
     return min(value / TRUST, max(value - LEAST, 0.0)), max(value * TRUST, value + LEAST)

@@ -1,4 +1,4 @@
-"""Faults of measurements by name, with a size if wanted: ``velocity-spikes=3``."""
+"""Registry of measurement faults, with optional sizes: ``velocity-spikes=3``."""
 
 from collections.abc import Callable
 from functools import partial
@@ -26,20 +26,20 @@ from .sizes import name_and_size
 NO_FAULT = "none"
 
 FaultFactory = Callable[[float | None], AbstractMeasurementFault | None]
-"""From a size (None for the default) to a fault."""
+"""Function of a size (or None, the default size) that returns a fault."""
 
 FAULTS: Registry[FaultFactory] = Registry("fault", example="module:name of a function of a size")
 register_fault = FAULTS.register
 
 
 def measurement_fault(name: str) -> AbstractMeasurementFault | None:
-    """Return a fault of measurements by name.
+    """Return a measurement fault by name.
 
     Args:
-        name: As ``late``, or with a size, as ``late=3``; ``none`` for none.
+        name: Name, as ``late``, or name with a size, as ``late=3``; ``none`` returns None.
 
     Raises:
-        ConfigError: There is no such fault, or it has no such size.
+        ConfigError: The fault does not exist, or does not accept this size.
     """
     kind, size = name_and_size(name, "fault")
     try:

@@ -1,4 +1,4 @@
-"""What a set-up draws from a seed beside training: fresh policies, starts of flights, and deltas of low rank."""
+"""Random objects of a set-up, apart from training: untrained policies, starts of flights, and low-rank deltas."""
 
 from functools import partial
 
@@ -15,17 +15,17 @@ from ..physics.vehicle import Vehicle
 from ..tasks.hover import TILT, Hover
 from ..tasks.observation import StateObs
 
-START_TAG = 2**30 + 1  # folded into a seed for the starts of flights: they share no key with training
-LOW_RANK_TAG = 2**30 + 4  # folded into a learner's key for the delta that it starts from
+START_TAG = 2**30 + 1  # folded into the seed of flight starts, so that their keys differ from those of training
+LOW_RANK_TAG = 2**30 + 4  # folded into the key of a learner, for its initial delta
 
 
 @partial(jax.jit, static_argnames=("size", "hidden"))
 def untrained(size: int, vehicle: Vehicle, key: Key[Array, ""], hidden: tuple[int, ...]) -> Policy:
-    """Return a policy of observations of a size, by a program that every set-up of these sizes shares.
+    """Return an untrained policy. All set-ups with the same sizes share the compiled program.
 
     Args:
-        size: Of the observation.
-        vehicle: It gives the limits of the commands.
+        size: Size of the observation.
+        vehicle: Vehicle with the command limits.
         key: Consumed.
         hidden: Widths of the hidden layers.
     """
@@ -36,8 +36,8 @@ def flight_starts(home: Float[Array, "3"], n: int, seed: int) -> list[State]:
     """Return ``n`` starts: +- 1 m per axis from ``home``, 18 degrees about each axis, 0.1 m/s.
 
     Args:
-        home: World frame [m].
-        n: How many.
+        home: Centre of the starts, world frame [m].
+        n: Number of starts.
         seed: The same seed gives the same starts.
     """
     batch = _starts(home, random.fold_in(random.key(seed), START_TAG), n)
@@ -45,14 +45,14 @@ def flight_starts(home: Float[Array, "3"], n: int, seed: int) -> list[State]:
 
 
 def low_rank(policy: Policy | LoraPolicy, key: Key[Array, ""]) -> LoraPolicy:
-    """Return ``policy`` with a fresh low-rank delta, unless it has one.
+    """Return ``policy`` with a new low-rank delta, unless it already has one.
 
     Args:
         policy: Full policy, or one with a delta.
-        key: That of the learner.
+        key: Key of the learner.
 
     Raises:
-        ValueError: The policy has other than three layers, or one too narrow for its rank.
+        ValueError: The policy does not have three layers, or a layer is too narrow for its rank.
     """
     if isinstance(policy, LoraPolicy):
         return policy

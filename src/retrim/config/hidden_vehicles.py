@@ -1,7 +1,7 @@
-"""Vehicles that no method knows: a benchmark population, drawn from one size factor.
+"""Benchmark population of vehicles that are unknown to the methods, drawn from one size factor.
 
-Small vehicles turn fast and large ones turn slowly, so mass, inertia, delay and lags grow together. Ranges that were
-drawn independently of each other would contain impossible vehicles.
+Small vehicles turn fast and large ones turn slowly, so mass, inertia, delay and lags grow together. Independent ranges
+of these values would contain impossible vehicles.
 """
 
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from .scenario import Scenario
 from .vehicle_file import VehicleSpec
 
 LIGHTEST, HEAVIEST = 0.03, 3.0  # [kg]
-RATE_LAG = (0.015, 0.15)  # [s], of the lightest and the heaviest vehicle
+RATE_LAG = (0.015, 0.15)  # [s]: lightest and heaviest vehicle
 DELAY = (0.0, 0.06)  # [s]
 THRUST_LAG = (0.01, 0.08)  # [s]
 SPREAD, DELAY_SPREAD = 0.2, 0.012  # standard deviation of the logarithm of lags, and of the delay [s]
@@ -27,12 +27,12 @@ SEED_TAG = 46
 
 @dataclass(frozen=True)
 class HiddenVehicle:
-    """A vehicle of the population. No method is told any of its numbers."""
+    """A vehicle of the population. Methods do not receive its parameters."""
 
     spec: VehicleSpec
-    """Mass, limits, lags and damping. It states the delay, too."""
+    """Mass, limits, lags, damping and delay."""
     size: float
-    """0 for the lightest, 1 for the heaviest."""
+    """Size factor: 0 for the lightest vehicle, 1 for the heaviest."""
     thrust_gain: float
     """Thrust over commanded thrust."""
 
@@ -60,7 +60,7 @@ class HiddenVehicle:
         return self.thrust_gain * self.spec.thrust_max / (self.spec.mass * STANDARD_GRAVITY)
 
     def scenario(self, disturbance: str, *, sensors: str = "ideal", reference: str | None = None) -> Scenario:
-        """Return a flight of the vehicle on the second-order plant.
+        """Return the scenario of a flight with this vehicle on the second-order plant.
 
         Args:
             disturbance: Name of a disturbance.
@@ -121,5 +121,5 @@ def _draw(draw: np.random.Generator, number: int) -> HiddenVehicle:
 
 
 def _rounded(value: float) -> float:
-    """Return three digits, as a vehicle file would state."""
+    """Round to three digits, as in a vehicle file."""
     return float(f"{value:.3g}")

@@ -1,4 +1,4 @@
-"""What a policy of a preset is trained in and by, the learner beside its flight, and the frame that it is flown in."""
+"""Nominal model, optimiser, in-flight learner and control frame of a preset."""
 
 import functools
 import math
@@ -32,20 +32,23 @@ from .command_paths import declared_path, longest_delay, response_of
 from .presets import Preset, Pretrain
 from .tasks import find_task
 
-OBSERVER_TAU = 0.05  # [s]: half of it is unstable where the plant's delay is 40 ms longer than declared
-WANDER = 4.0  # [m/s^2] in a second
-TILT_LIMIT = 6.0  # [m/s^2], largest disturbance that turns a frame: gravity keeps a downward part
+OBSERVER_TAU = 0.05  # [s]: half of this is unstable if the delay of the plant is 40 ms longer than declared
+WANDER = 4.0  # [m/s^2] in one second: random walk of the disturbance
+TILT_LIMIT = 6.0  # [m/s^2]: largest disturbance that rotates a frame, so that gravity keeps a downward component
 
 
 def nominal_model(preset: Preset, vehicle: Vehicle) -> AbstractDynamics[Any]:
-    """Return the point mass of Eq. (1) of the paper, behind the lag of the actuators where one is declared."""
+    """Return the point mass of Eq. (1) of the paper, with actuator lag if the preset or the vehicle has one."""
     model, response = PointMass(preset.dt), response_of(preset, vehicle)
     return model if response is None else Lagged(model, response)
 
 
 @functools.lru_cache(maxsize=32)
 def pretraining_optimiser(table: Pretrain) -> optax.GradientTransformation:
-    """Return Adam under a cosine, behind a clip; the same object for the same table, so that programs are shared."""
+    """Return the optimiser: gradient clipping, then Adam with a cosine schedule.
+
+    Equal tables give the same object, so that compiled programs are shared.
+    """
     rate = optax.cosine_decay_schedule(table.learning_rate, table.num_updates)
     return optax.chain(optax.clip_by_global_norm(table.max_grad_norm or math.inf), optax.adam(rate, b2=table.adam_b2))
 
@@ -54,12 +57,12 @@ def make_learner(preset: Preset, model: ResidualModel, env: Env) -> OnlineLearne
     """Return the learner of a preset.
 
     Args:
-        preset: Its table [adapt] says how to learn.
+        preset: Preset, whose table [adapt] has the parameters.
         model: Residual model.
         env: Environment of the flight.
 
     Raises:
-        ConfigError: The preset turns the frame of a task that cannot be turned, or trims one that does not rest.
+        ConfigError: The preset rotates the frame of a task that cannot be rotated, or trims a task that does not rest.
     """
     a, family = preset.adapt, env.family
     if a.frame != "world":
@@ -73,7 +76,7 @@ def make_learner(preset: Preset, model: ResidualModel, env: Env) -> OnlineLearne
         env,
         model,
         optimiser,
-        plant_delay_ticks=preset.plant_delay_ticks if family is None else 0,  # the identified path has the delay
+        plant_delay_ticks=preset.plant_delay_ticks if family is None else 0,  # the identified path contains the delay
         num_updates=a.num_updates,
         num_envs=a.num_envs,
         starts=TaskStarts() if a.task_starts is None else FlownStarts(jnp.array(a.start_noise), a.task_starts),
@@ -87,15 +90,16 @@ def make_learner(preset: Preset, model: ResidualModel, env: Env) -> OnlineLearne
 def _view(preset: Preset, task: AbstractTask) -> AbstractView:
     if preset.adapt.frame == "world":
         return WorldView()
-    limit = jnp.array(TILT_LIMIT)  # frames of a picture's memory are of one gravity
+    limit = jnp.array(TILT_LIMIT)  # all frames in an image memory have the same gravity
     return RestView(limit) if isinstance(task.observation, Keypoints) else GravityView(limit)
 
 
 def check_frame(preset: Preset, task: AbstractTask) -> None:
-    """Refuse the frame of felt gravity for a task that cannot be turned, and where nothing feels it.
+    """Raise if a preset does not support the frame of effective gravity.
 
     Raises:
-        ConfigError: It names the task, and what cannot be turned.
+        ConfigError: The task cannot be rotated, or its policy sees keypoints without a pose filter. The message names
+            the task, and the part that cannot be rotated.
     """
     seen = task.observation_in_flight
     if isinstance(seen, Keypoints):
@@ -112,14 +116,14 @@ def check_frame(preset: Preset, task: AbstractTask) -> None:
 def felt_frame(
     controller: AbstractController[Any], preset: Preset, vehicle: Vehicle, known: FittedResidual | None = None
 ) -> GravityFrame | SeenFrame:
-    """Return a controller, flown in the gravity that is felt: by a disturbance observer, or by its own pose filter.
+    """Return a controller in the frame of effective gravity, from a disturbance observer or from its own pose filter.
 
     Args:
-        controller: It can be turned.
-        preset: Its control period and declared delay are those of the observer.
-        vehicle: Its limits and its lag, too.
-        known: What was learnt of the residual and of the body rates; the observer sees the rest. A pose filter sees
-            it all.
+        controller: Controller that can be rotated into this frame.
+        preset: Preset with the control period and the declared delay of the observer.
+        vehicle: Vehicle with the command limits and the lag of the observer.
+        known: Learned residual, with the learned bias of the body rates. The observer estimates the remaining
+            disturbance. A pose filter does not use it, and estimates the whole disturbance.
     """
     limit = jnp.array(TILT_LIMIT)
     if isinstance(controller, PolicyController) and isinstance(controller.observation, OccludedKeypoints):

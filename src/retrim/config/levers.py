@@ -1,4 +1,4 @@
-"""The levers of an ablation: what sets our presets apart from the paper's, one change each."""
+"""Components of an ablation: the differences between our presets and those of the paper, one change each."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -12,11 +12,11 @@ NEVER = {"update_every": 3600.0}
 
 @dataclass(frozen=True)
 class Lever:
-    """One change of a preset, or one way to fly it."""
+    """One change of a preset or of the flight method."""
 
     label: str
     changes: dict[str, Any] = field(default_factory=dict)
-    """Keys of the preset, as :func:`retrim.changed` takes them."""
+    """Changed keys of the preset, in the format of :func:`retrim.changed`."""
     method: str = "full"
 
 
@@ -24,7 +24,7 @@ CONTROL = (
     Lever("base policy", method="base"),
     Lever("base policy + integral action", method="base-i"),
 )
-"""What no learning does."""
+"""Controls without learning."""
 
 LAYERS_OFF = (
     Lever("**all levers**"),
@@ -36,7 +36,7 @@ LAYERS_OFF = (
     Lever("all starts from the task", {"adapt": {"task_starts": None}}),
     Lever("a new Adam for each burst", {"adapt": {"optimiser": "fresh"}}),
 )
-"""The same for every task."""
+"""Ablations that are the same for every task."""
 
 OFF: dict[str, tuple[Lever, ...]] = {
     "hover": (
@@ -57,7 +57,7 @@ OFF: dict[str, tuple[Lever, ...]] = {
         Lever("no actuator lag in the model", {"actuator_tau": None}),
     ),
 }
-"""Each taken off our preset of a task."""
+"""Components by task, each removed from our preset."""
 
 ON: dict[str, tuple[Lever, ...]] = {
     "hover": (
@@ -80,4 +80,4 @@ ON: dict[str, tuple[Lever, ...]] = {
         Lever("+ lag, past commands and delay", {"actuator_tau": 0.033, "command_history": 2, "delay_ticks": 1}),
     ),
 }
-"""Each put on the paper's preset of a task."""
+"""Components by task, each added to the preset of the paper."""

@@ -1,4 +1,4 @@
-"""Presets from names, TOML files, flags and JSON; every mistake is one clear line."""
+"""Load presets from names, TOML files, flags and JSON. Every mistake gives an error message of one line."""
 
 import dataclasses
 import json
@@ -22,9 +22,9 @@ def load(name: str, overlay: Path | None = None, *, trust: Collection[str] = ())
     """Return a preset.
 
     Args:
-        name: As ``hover/fast``; ``PRESETS`` has all of them.
-        overlay: A TOML file with values on top.
-        trust: Python names that the file may hold, as ``mine:task``.
+        name: Name, as ``hover/fast``; ``PRESETS`` contains all of them.
+        overlay: TOML file with values that replace those of the preset.
+        trust: Python names that the file may contain, as ``mine:task``.
 
     Raises:
         ConfigError: There is no such preset, or the file cannot be used.
@@ -35,10 +35,10 @@ def load(name: str, overlay: Path | None = None, *, trust: Collection[str] = ())
 
 
 def load_for(task: str, name: str) -> Preset:
-    """Return a preset for a task: ``fast`` is short for ``hover/fast``. A task of one's own takes those for hover.
+    """Return a preset for a task. ``fast`` is short for ``hover/fast``; custom tasks use the hover presets.
 
     Raises:
-        ConfigError: There is no such preset, or it is for another task.
+        ConfigError: The preset does not exist, or is for another task.
     """
     preset = load(f"{task}/{name}" if f"{task}/{name}" in PRESETS else name)
     if preset.task == task:
@@ -49,15 +49,15 @@ def load_for(task: str, name: str) -> Preset:
 
 
 def overlaid(preset: Preset, overlay: Path, *, trust: Collection[str] = ()) -> Preset:
-    """Return a preset with the values of a TOML file on top.
+    """Return a preset, with values replaced by those of a TOML file.
 
     Args:
-        preset: What lies below.
-        overlay: The file; a relative vehicle file in it is looked up beside it.
-        trust: Python names that the file may hold, as ``mine:task``.
+        preset: Preset with the values to replace.
+        overlay: TOML file; the path of a vehicle file in it is relative to its folder.
+        trust: Python names that the file may contain, as ``mine:task``.
 
     Raises:
-        ConfigError: The file cannot be read, is not TOML, has a key or value that does not fit, or a Python name.
+        ConfigError: The file cannot be read, is not TOML, has an invalid key or value, or an untrusted Python name.
     """
     above = beside(read_toml(overlay), overlay.parent)
     whole = validated(Preset, merged(values(preset), above), source=str(overlay))
@@ -66,11 +66,11 @@ def overlaid(preset: Preset, overlay: Path, *, trust: Collection[str] = ()) -> P
 
 
 def beside(above: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Return values of a file with the content of the vehicle file that they name.
+    """Return the values of a file, with the path of a vehicle file replaced by its content.
 
     Args:
-        above: The values.
-        folder: Of their file; a relative vehicle file is looked up there.
+        above: Values of the file.
+        folder: Folder of the file, to which the path of a vehicle file is relative.
 
     Raises:
         ConfigError: The vehicle file cannot be used.
@@ -82,7 +82,7 @@ def beside(above: dict[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def with_vehicle(preset: Preset, vehicle: str | VehicleSpec) -> Preset:
-    """Return a preset for a vehicle: of a file its content, so that nothing outside the preset says what it flies.
+    """Return a preset for a vehicle. A vehicle file is stored by content, so that the preset is self-contained.
 
     Raises:
         ConfigError: There is no such vehicle, or its file cannot be used.
@@ -99,19 +99,19 @@ def values(preset: Preset) -> dict[str, Any]:
 def parse(text: str | bytes, *, source: str) -> Preset:
     """Return a preset from JSON, the inverse of :func:`dump`.
 
-    Whoever has it from a file or a message checks its names (:func:`retrim.config.trust.check_trust`).
+    Callers that read it from a file or a message must check its names (:func:`retrim.config.trust.check_trust`).
 
     Raises:
-        ConfigError: It is not a preset.
+        ConfigError: The text is not a valid preset.
     """
     return validated(Preset, text, source=source)
 
 
 def defaults_taken(preset: Preset, text: str | bytes) -> dict[str, Any]:
-    """Return the values of a preset that its JSON does not have, by dotted name: those of this release.
+    """Return the values of a preset that are missing in its JSON, and so are defaults of this release, by dotted name.
 
     Args:
-        preset: What :func:`parse` made of the text.
+        preset: Result of :func:`parse` for the text.
         text: JSON.
     """
     return dict(_absent(values(preset), json.loads(text), ""))
@@ -129,11 +129,11 @@ def changed(preset: Preset, **tables: Any) -> Preset:
     """Return a preset with some values replaced, as in ``changed(preset, adapt={"num_updates": 5})``.
 
     Args:
-        preset: What lies below.
-        **tables: Values, and tables of values.
+        preset: Preset with the values to replace.
+        **tables: New values, and tables of new values.
 
     Raises:
-        ConfigError: A key or value does not fit.
+        ConfigError: A key or value is invalid.
     """
     return validated(Preset, merged(values(preset), tables), source="preset")
 
@@ -144,6 +144,6 @@ def dump(preset: Preset) -> str:
 
 
 def merged(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
-    """Return ``below`` with the values of ``above`` on top, table by table."""
+    """Return ``below`` with values replaced by those of ``above``; nested tables are merged."""
     deep = {k: merged(below[k], v) for k, v in above.items() if isinstance(v, dict) and isinstance(below.get(k), dict)}
     return {**below, **above, **deep}

@@ -1,4 +1,4 @@
-"""Ways to fly a policy, by name: as it is, with classical compensation, or re-trained; and controllers without one."""
+"""Registry of flight methods: an unchanged, compensated or re-trained policy, and controllers without a policy."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -32,39 +32,39 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MethodRequest:
-    """What is asked of a method."""
+    """Inputs from which a method builds a pilot."""
 
     setup: "Setup"
     policy: Any
-    """A policy; for a method with a network of its own, that network."""
+    """Policy, or the network of a method that has its own."""
     key: Key[Array, ""] | None = None
-    """Seed of what is random in the method; None where nothing is."""
+    """Seed of the random parts of the method; None for a deterministic method."""
     latency: "Latency" = "fixed"
     state: LearnerState | None = None
-    """What an earlier flight learnt, to go on from."""
+    """Learner state of an earlier flight, from which to continue; None for a new one."""
 
     def controller(self) -> PolicyController:
-        """Return the policy behind the observation of flight."""
+        """Return the policy with the observation used in flight."""
         return policy_controller(self.setup.preset, self.setup.flown, self.policy.merged())
 
     def in_felt_frame(self) -> AbstractController[Any]:
-        """Return the policy in the gravity that is felt.
+        """Return the policy in the frame of effective gravity.
 
         Raises:
-            ConfigError: The task cannot be turned.
+            ConfigError: The task cannot be rotated into this frame.
         """
         check_frame(self.setup.preset, self.setup.env.task)
         return track_actuators(felt_frame(self.controller(), self.setup.preset, self.setup.vehicle), self.setup.preset)
 
     def by_state(self, controller: AbstractController[Any], called: str | None = None) -> AbstractController[Any]:
-        """Return a controller that needs the state as it can be flown: by a pose filter where keypoints are seen.
+        """Return a state-feedback controller that suits the observation: with a pose filter if it observes keypoints.
 
         Args:
-            controller: Any.
-            called: Name of the method, for a refusal; that of its class by default.
+            controller: Controller that needs the state.
+            called: Name of the method in error messages; by default the name of the controller class.
 
         Raises:
-            ConfigError: The preset shows keypoints, and no filter makes a state of them.
+            ConfigError: The policy observes keypoints, and the preset has no pose filter.
         """
         seen = self.setup.flown.observation_in_flight
         if isinstance(seen, OccludedKeypoints):
@@ -81,7 +81,7 @@ class MethodRequest:
         """Return the key.
 
         Raises:
-            ValueError: There is none.
+            ValueError: The request has no key.
         """
         if self.key is None:
             raise ValueError("a method that learns needs a key")
@@ -90,19 +90,19 @@ class MethodRequest:
 
 @dataclass(frozen=True)
 class MethodEntry:
-    """A way to fly a policy."""
+    """A flight method."""
 
     make: Callable[[MethodRequest], Pilot]
     label: str
     """Name in tables."""
     on_board: Callable[["Setup", Plant], Plant] | None = None
-    """Builds what commands the motors into a plant; None for a method that commands thrust and body rates."""
+    """Adds an on-board motor controller to a plant; None for a method that commands thrust and body rates."""
 
     def fitted(self, setup: "Setup", plant: Plant) -> Plant:
-        """Return the plant that the method flies.
+        """Return the plant, modified as the method requires.
 
         Raises:
-            ConfigError: It cannot fly this one.
+            ConfigError: The method does not support this plant.
             PlantError: A package is not installed.
         """
         return plant if self.on_board is None else self.on_board(setup, plant)
@@ -116,7 +116,7 @@ def find_method(name: str) -> MethodEntry:
     """Return the entry of a method.
 
     Raises:
-        ConfigError: There is none of that name.
+        ConfigError: There is no method of that name, or the registered object is not a :class:`MethodEntry`.
     """
     entry = METHODS.find(name)
     if not isinstance(entry, MethodEntry):

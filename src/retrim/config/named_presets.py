@@ -1,4 +1,4 @@
-"""The presets that have a name: the paper's, that of the authors' code, and ours."""
+"""Named presets: those of the paper, that of the authors' code, and ours."""
 
 import dataclasses
 
@@ -51,7 +51,7 @@ RETRIM = dataclasses.replace(
     ),
 )  # fmt: skip
 
-# One policy for many vehicles: it observes what is known of its vehicle, and that is identified in flight.
+# One policy for many vehicles: it observes the belief about its vehicle, which is identified in flight.
 ANY = dataclasses.replace(
     RETRIM,
     name="hover/any",
@@ -63,7 +63,7 @@ ANY = dataclasses.replace(
     pretrain=dataclasses.replace(
         RETRIM.pretrain, num_updates=1000, num_envs=64, learning_rate=5e-3, hidden_sizes=(256, 256)
     ),
-    adapt=dataclasses.replace(RETRIM.adapt, window=150, trim="free"),  # in flight, its output is shifted at each tick
+    adapt=dataclasses.replace(RETRIM.adapt, window=150, trim="free"),  # in flight, each tick shifts its output
 )
 
 FELT = Track(reference="circle+figure8+star", observation="flat", felt_copies=7)
@@ -108,10 +108,10 @@ VISION_RETRIM = dataclasses.replace(
     name="vision/retrim",
     reward="view",
     actuator_tau=0.033,
-    adapt=dataclasses.replace(RETRIM.adapt, trim="free"),  # a pose that is estimated wrongly is no rest
+    adapt=dataclasses.replace(RETRIM.adapt, trim="free"),  # a wrongly estimated pose is not at rest
 )
 
-# Starts within 10 cm as in the authors' code: from farther away the way back dominates the gradient. The window is 5 s.
+# Starts within 10 cm as in the authors' code: with larger distances, the return dominates the gradient. Window: 5 s.
 PAPER_TRACK = Preset(
     name="track/paper",
     task="track",
@@ -120,26 +120,26 @@ PAPER_TRACK = Preset(
 )
 
 PRESETS: dict[str, Preset] = {
-    # Ours: the frame of the gravity that is felt answers in a second, short bursts of learning take what it leaves.
+    # Ours: the frame of effective gravity compensates in a second, and short bursts of learning reduce the rest.
     "hover/retrim": RETRIM,
     # The same for any vehicle of a family, which is identified in flight.
     "hover/any": ANY,
-    # The same for tracking: trained on references as they are and as they are felt under a push.
+    # The same for tracking: trained on references and on copies of them in the effective gravity of a push.
     "track/retrim": TRACK_RETRIM,
     # The same for any vehicle of a family, which is identified in flight.
     "track/any": TRACK_ANY,
     # The same at up to 8 m/s, for the kingfisher.
     "track/fast": TRACK_FAST,
-    # The paper's loop with one tick of delay, the last two commands, and a small budget that reaches the same error.
+    # The loop of the paper with one tick of delay, the last two commands, and a small budget with the same final error.
     "hover/fast": FAST,
     # The delay and the observation of the authors' code: 2 ticks, the last three commands, 200 x 200 x 150.
     "hover/released": Preset(
         name="hover/released", command_history=3, delay_ticks=2, pretrain=Pretrain(num_updates=200, num_envs=200)
     ),
-    # As printed: o = [p, R, v], no delay in the model, 300 x 100 x 150. The paper gives no learning rates of an update.
-    # At 1e-3 for all weights, the noise of ten starts moves the policy by more than a small push does.
+    # As printed: o = [p, R, v], no delay in the model, 300 x 100 x 150. The paper does not state learning rates of
+    # updates. At 1e-3 for all weights, the noise of ten starts changes the policy more than a small push does.
     "hover/paper": Preset(adapt=Adapt(learning_rate=5e-4, low_rank_learning_rate=1e-3)),
-    # hover/fast at 100 Hz: the same times, twice the ticks.
+    # hover/fast at 100 Hz: the same times, with twice as many ticks.
     "hover/100hz": dataclasses.replace(
         FAST,
         name="hover/100hz",
@@ -150,21 +150,22 @@ PRESETS: dict[str, Preset] = {
         pretrain=dataclasses.replace(FAST.pretrain, horizon=300),
         adapt=dataclasses.replace(FAST.adapt, window=200),
     ),
-    # Ours: the reference seen ahead, a sharp reward, one tick of delay and actuator lag in the model.
+    # Ours: a preview of the reference, a sharp reward, one tick of delay and actuator lag in the model.
     "track/preview": TRACK,
-    # The paper's tracking: reward, network, budgets and loop as printed, o = [p, R, v] with the tracking error.
+    # Tracking of the paper: reward, network, budgets and loop as printed, o = [p, R, v] with the tracking error.
     "track/paper": PAPER_TRACK,
-    # The same without the tracking error, read literally: the policy cannot know the phase of its reference.
+    # The same without the tracking error, in a literal reading of the paper: the policy cannot observe the phase of its
+    # reference.
     "track/blind": dataclasses.replace(
         PAPER_TRACK, name="track/blind", track=Track(observation="blind", start_spread=0.1)
     ),
-    # Seven points on the ground, five frames, three commands, no state; every point is observed, as in the paper.
+    # Seven points on the ground, five frames, three commands, no state; all points are observed, as in the paper.
     "vision/ideal": VISION,
-    # The same, but points outside the image are not observed; pixels are noisy and some points are missed.
+    # The same, but points outside the image are not observed; pixels are noisy, and some points are missed.
     "vision/occluded": OCCLUDED,
-    # The same in the frame of the gravity that its pose filter feels, with short bursts of learning.
+    # The same in the frame of effective gravity, estimated by its pose filter, with short bursts of learning.
     "vision/retrim": VISION_RETRIM,
-    # The paper's sizes: raw pixels, 500 x 300, updates of 50 steps x 30 environments.
+    # Sizes of the paper: raw pixels, 500 x 300, updates of 50 steps x 30 environments.
     "vision/paper": Preset(
         name="vision/paper",
         task="vision",

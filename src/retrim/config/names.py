@@ -1,4 +1,4 @@
-"""Characters of names: what a file calls a preset, a vehicle or a task travels into pictures, pages and C headers."""
+"""Valid characters of names. Names of presets, vehicles and tasks are written to pictures, pages and C headers."""
 
 import re
 from typing import Annotated
@@ -11,14 +11,14 @@ MOST = 64
 PLAIN = re.compile(rf"[\w./+ -]{{1,{MOST}}}", re.ASCII)
 PYTHON = re.compile(r"[\w.]{1,100}:\w{1,64}")
 LONGEST = 1024
-"""Characters of a path, and of several names that are joined."""
+"""Maximum length of a path, and of several joined names [characters]."""
 
 
 def plain(name: str) -> str:
-    """Return a name, unless it has other characters than letters, digits, ``_ . / + -`` and spaces.
+    """Return a name if it consists of letters, digits, ``_ . / + -`` and spaces.
 
     Raises:
-        ValueError: It has.
+        ValueError: The name has other characters, is empty, or is too long.
     """
     if not PLAIN.fullmatch(name):
         raise ValueError(f"{excerpt(name)} must be 1 to {MOST} characters: A-Z a-z 0-9 _ . / + - and spaces")
@@ -29,16 +29,16 @@ def plain_or_python(name: str) -> str:
     """Return a plain name or ``module:name``.
 
     Raises:
-        ValueError: It is neither.
+        ValueError: The name has neither form.
     """
     return name if PYTHON.fullmatch(name) else plain(name)
 
 
 def printable(name: str) -> str:
-    """Return a name that may be a path: printable, and not endless.
+    """Return a name or path if it is printable and of limited length.
 
     Raises:
-        ValueError: It is not.
+        ValueError: The name is empty, too long, or not printable.
     """
     if not name.isprintable() or not 1 <= len(name) <= LONGEST:
         raise ValueError(f"{excerpt(name)} must be 1 to {LONGEST} printable characters")
@@ -46,12 +46,12 @@ def printable(name: str) -> str:
 
 
 def plain_from(text: str) -> str:
-    """Return a plain name that is like a text."""
+    """Return a plain name made from a text, with other characters replaced."""
     return re.sub(r"[^\w./+ -]", ".", text, flags=re.ASCII)[:MOST] or "unnamed"
 
 
 Plain = Annotated[str, AfterValidator(plain)]
-"""Of a preset or a vehicle."""
+"""Name of a preset or a vehicle."""
 TaskName = Annotated[str, AfterValidator(plain_or_python)]
 Printable = Annotated[str, AfterValidator(printable)]
-"""What is looked up: a name, ``module:name``, a path, or several joined by ``+``."""
+"""Name to look up: a registered name, ``module:name``, a path, or several of these joined by ``+``."""

@@ -1,4 +1,4 @@
-"""What commands the motors of a vehicle itself, in the place of its rate controller."""
+"""On-board controllers that command the motors directly, instead of the rate controller of the vehicle."""
 
 import dataclasses
 from typing import TYPE_CHECKING
@@ -14,11 +14,11 @@ if TYPE_CHECKING:
 
 
 def raptor(setup: "Setup", plant: Plant) -> SimPlant:
-    """Return a plant whose vehicle RAPTOR flies, along the reference of a set-up.
+    """Return a plant whose vehicle is controlled by RAPTOR, along the reference of a set-up.
 
     Raises:
-        ConfigError: The plant has no motors that can be commanded, or sensors that RAPTOR would not look at.
-        PlantError: The package of its network is not installed.
+        ConfigError: The plant does not support motor commands, or has sensors, which RAPTOR does not use.
+        PlantError: The package with the RAPTOR network is not installed.
     """
     if not isinstance(plant, SimPlant) or not isinstance(plant.simulation.model, BemQuadrotor):
         raise ConfigError("method 'raptor' commands motors, which plant 'bem' alone has: fly it there")

@@ -1,4 +1,4 @@
-"""Plants by name."""
+"""Registry of plants."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -32,27 +32,27 @@ from ..plants.sim import SimPlant
 from ..rospy_node import system_module
 from .registry import Registry
 
-DELAY = 0.02  # [s], of commands, where a scenario may choose it
+DELAY = 0.02  # [s]: default command delay of plants whose delay a scenario can set
 
 
 @dataclass(frozen=True)
 class PlantRequest:
-    """What a scenario asks of a plant."""
+    """Parameters of a plant, taken from a scenario."""
 
     vehicle: Vehicle
     disturbance: Disturbance
     sensors: SensorModel | None
     thrust_error: float
-    """By how much more than commanded the rotors give, as a share."""
+    """Relative thrust error; 0.1 means 10 % more thrust than commanded."""
     dt: float
     """Control period [s]."""
     seed: int
     delay: float = DELAY
     """Command delay [s]."""
     address: str = ""
-    """Where a vehicle is reached; what its link has by default if it is empty."""
+    """Address of the vehicle; the default address of its link if empty."""
     fault: AbstractMeasurementFault | None = None
-    """Fault of the measurements; None for none."""
+    """Fault of the measurements; None for a plant without faults."""
 
 
 @dataclass(frozen=True)
@@ -61,27 +61,28 @@ class PlantEntry:
 
     make: Callable[[PlantRequest], Plant]
     about: str
-    """What it simulates, in a few words."""
+    """Short description of the simulated system."""
     own_vehicle: str | None = None
-    """Name of the vehicle that it brings; None if it flies any."""
+    """Name of its built-in vehicle; None if the plant simulates any vehicle."""
     has_sensors: bool = False
-    """Whether it takes a sensor model."""
+    """Whether it supports sensor models."""
     has_faults: bool = False
-    """Whether its measurements can be faulty."""
+    """Whether it supports measurement faults."""
     has_thrust_error: bool = False
-    """Whether it takes an error of the thrust map."""
+    """Whether it supports an error of the thrust map."""
     has_delay: bool = False
-    """Whether it takes a command delay."""
+    """Whether it supports a chosen command delay."""
     is_vehicle: bool = False
-    """Whether it is a link to a vehicle, whose time does not wait and whose world cannot be disturbed. Its name may be
-    followed by an address, as ``mavlink:udp:127.0.0.1:14540``, and it makes a
+    """Whether it is a link to a vehicle, which runs in real time and whose world cannot be disturbed. An address may
+    follow its name, as in ``mavlink:udp:127.0.0.1:14540``, and it makes a
     :class:`~retrim.plants.bridges.vehicle_plant.VehiclePlant`."""
     has_world: bool = False
-    """Whether the world around a vehicle is simulated here, and can be disturbed."""
+    """Whether retrim simulates the world around the vehicle, so that disturbances can be applied."""
     check_address: Callable[[str], object] | None = None
-    """Raises ConfigError for what follows a vehicle's name, if it is no address; None: anything may."""
+    """Check of the address after the name of a vehicle; it raises ConfigError for an invalid one. None: no check."""
     needs: Callable[[], object] | None = None
-    """Raises an error if a program or package is not there; asked before anything is trained. None: it needs none."""
+    """Check that required programs or packages are installed, called before training. It raises an error if one is
+    missing. None: no requirements."""
 
 
 PLANTS: Registry[PlantEntry] = Registry("plant", example="module:name of a PlantEntry")
@@ -113,7 +114,7 @@ def _second_order(r: PlantRequest) -> Plant:
 
 
 def find_plant(name: str) -> tuple[object, str]:
-    """Return what is registered under a name, and the address that follows it.
+    """Return the object that is registered under a name, and the address after the name.
 
     Raises:
         ConfigError: There is no such plant.

@@ -1,7 +1,7 @@
-"""Every number of an experiment, once, as plain, validated values; :mod:`.named_presets` has those with a name.
+"""Presets: all parameters of an experiment, as plain, validated values. :mod:`.named_presets` contains the named ones.
 
-A preset is a tree of frozen dataclasses. A TOML file and then command-line flags may overlay it; an unknown name or an
-impossible value is an error that gives its path.
+A preset is a tree of frozen dataclasses. A TOML file and then command-line flags may replace its values. An unknown
+name or an impossible value raises an error that states its path.
 """
 
 import math
@@ -28,21 +28,21 @@ class Pretrain:
     """Training of the base policy in the nominal model."""
 
     num_updates: Count = 300
-    """Optimiser steps."""
+    """Number of optimiser steps."""
     num_envs: Count = 100
-    """Starts per step."""
+    """Number of starts per step."""
     horizon: Count = 150
-    """Ticks of a roll-out."""
+    """Length of a roll-out [ticks]."""
     learning_rate: LearningRate = 5e-3
-    """Adam's rate at the start; it falls to zero along a cosine. The paper gives none; the authors' code has 5e-3."""
+    """Initial learning rate of Adam, with a cosine schedule to zero. Not in the paper; the authors' code has 5e-3."""
     adam_b2: float = Field(default=0.999, ge=0, lt=1, strict=True)
-    """Adam's second decay."""
+    """Second decay rate of Adam."""
     max_grad_norm: Positive | None = None
-    """Largest norm of a gradient; none is clipped by default."""
+    """Largest gradient norm; no clipping by default."""
     hidden_sizes: tuple[Count, ...] = Field(default=(512, 512), min_length=1, max_length=8)
-    """Hidden layers of the policy."""
+    """Widths of the hidden layers of the policy."""
     max_start_yaw: float = Field(default=math.pi, ge=0, le=math.pi, strict=True)
-    """Starts have a yaw within +- this angle [rad]."""
+    """Largest yaw angle of starts, in both directions [rad]."""
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -50,67 +50,70 @@ class Adapt:
     """Adaptation in flight (paper, Sec. IV-A.3)."""
 
     window: int = Field(default=100, ge=12, le=100_000, strict=True)
-    """Ticks of flight that are remembered."""
+    """Length of the flight window that is kept [ticks]."""
     residual: Printable = "ensemble"
-    """Residual model: ensemble (the paper's), regression (ten physical numbers), layered (an ensemble on what the
-    regression leaves), linear (19 features, carried along the flight), or module:name."""
+    """Residual model: ensemble (the paper's), regression (ten physical numbers), layered (an ensemble on the
+    remaining error of the regression), linear (19 features, carried along the flight), or module:name."""
     memory: Seconds = 0.5
-    """Regression: a tick counts for 1/e of the newest after this long [s]."""
+    """Regression: time after which the weight of a tick falls to 1/e of that of the newest [s]."""
     thrust_prior: float = Field(default=0.05, gt=0, le=1.0, strict=True)
-    """Regression: standard deviation of the thrust gain before any flight [-]; a third more mass is -0.25."""
+    """Regression: prior standard deviation of the thrust gain [-]; one third more mass is a gain of -0.25."""
     fit_every: Seconds = 3.0
     """Time between residual fits [s]."""
     fit_steps: Count = 100
-    """Optimiser steps of one fit."""
+    """Number of optimiser steps of one fit."""
     fit_learning_rate: LearningRate = 1e-2
-    """Adam's rate of the fit."""
+    """Learning rate of Adam for the fit."""
     spectral_weight: float = Field(default=1e-3, ge=0, le=1e6, allow_inf_nan=False, strict=True)
-    """Weight of the spectral penalty; the paper gives none."""
+    """Weight of the spectral penalty; the paper does not state it."""
     update_every: Seconds = 5.0
     """Time between policy updates [s]."""
     num_updates: Count = 30
-    """Optimiser steps of one update."""
+    """Number of optimiser steps of one update."""
     num_envs: Count = 10
-    """Starts per step."""
+    """Number of starts per step."""
     learning_rate: LearningRate = 1e-3
-    """Adam's rate at the start of an update; it falls to zero along a cosine."""
+    """Initial learning rate of Adam in an update, with a cosine schedule to zero."""
     low_rank_learning_rate: LearningRate | None = None
-    """The same of LoRA; that of all weights by default. A few directions have to do what all weights do."""
+    """Learning rate for LoRA; by default that of all weights. A few directions must have the effect of all weights."""
     max_grad_norm: Positive | None = None
-    """Largest norm of a gradient; none is clipped by default."""
+    """Largest gradient norm; no clipping by default."""
     optimiser: Literal["fresh", "carried"] = "fresh"
-    """fresh: each update starts a new Adam, its rate falls to zero; carried: one Adam of constant rate."""
+    """Optimiser of updates. fresh: a new Adam for each update, whose rate falls to zero; carried: one Adam with a
+    constant rate."""
     task_starts: int | None = Field(default=None, ge=0, le=100_000, strict=True)
-    """Starts of a step that the task draws; the others lie where the vehicle has just been. By default all of them."""
+    """Number of starts per step drawn from the task, by default all. The others are recent states of the vehicle."""
     start_noise: float = Field(default=0.1, ge=0, le=10.0, strict=True)
-    """Standard deviation that is added to flown starts, position [m] and velocity [m/s]."""
+    """Standard deviation of the noise on starts from the flight, position [m] and velocity [m/s]."""
     frame: Literal["world", "gravity"] = "world"
-    """gravity: fly and train in the frame of the gravity that is felt. A disturbance observer feels it, beside what the
-    residual predicts; for a policy that sees occluded keypoints, the pose filter does, which needs no state."""
+    """Frame of flight and training. gravity: frame of effective gravity, from the prediction of the residual and a
+    disturbance observer. If the policy sees occluded keypoints, it comes from the pose filter, which does not need the
+    state."""
     trim: Literal["free", "rest"] = "free"
-    """rest: after an update the policy is shifted so that at rest at home it commands hover."""
+    """Correction after an update. rest: the policy is shifted so that it commands hover at rest at home; free: no
+    correction."""
     fit_latency: Seconds = 0.2
     """Flight time until a fitted residual is used [s]."""
     update_latency: Seconds = 1.0
-    """Flight time until an updated policy flies [s]."""
+    """Flight time until an updated policy is used [s]."""
 
 
 @dataclass(frozen=True, config=STRICT)
 class Track:
-    """What only tracking has."""
+    """Parameters of tracking."""
 
     reference: Printable = "circle"
-    """Reference of training: circle, figure8, star, a CSV file, module:name, or several of these joined by +."""
+    """Training reference: circle, figure8, star, a CSV file, module:name, or several of these joined by +."""
     observation: Literal["blind", "relative", "both", "preview", "flat"] = "both"
-    """blind: o = [p, R, v], without the reference; relative: o = [p - p_ref, R, v - v_ref]; both: o = [p, R, v,
-    p - p_ref, v - v_ref]; preview: the reference relative to the vehicle, now and up to 0.4 s ahead; flat: preview with
-    acceleration and jerk."""
+    """Observation. blind: o = [p, R, v], without the reference; relative: o = [p - p_ref, R, v - v_ref]; both: o = [p,
+    R, v, p - p_ref, v - v_ref]; preview: the reference relative to the vehicle, now and up to 0.4 s ahead; flat:
+    preview with acceleration and jerk."""
     start_spread: Positive = 1.0
-    """Starts lie within this of the reference, per axis [m]."""
+    """Largest distance of starts from the reference, per axis [m]."""
     felt_copies: int = Field(default=0, ge=0, le=100, strict=True)
-    """Training also follows so many copies of each reference as they are where a constant push is gravity."""
+    """Number of extra training copies of each reference, each in the effective gravity of a constant push."""
     felt_push: Positive = 4.0
-    """Largest such push [m/s^2]."""
+    """Largest push of these copies [m/s^2]."""
 
     @property
     def looks_ahead(self) -> bool:
@@ -120,27 +123,27 @@ class Track:
 
 @dataclass(frozen=True, config=STRICT)
 class Vision:
-    """What only hover from keypoints has."""
+    """Parameters of hover from keypoints."""
 
     occlusion: bool = Field(default=False, strict=True)
-    """In flight, points outside the image are not observed; else every point is, as in the paper."""
+    """In flight, points outside the image are not observed; otherwise all points are, as in the paper."""
     pixel_noise: float = Field(default=0.0, ge=0, le=1000.0, strict=True)
     """Standard deviation of a pixel coordinate, in training and flight [px]."""
     dropout: float = Field(default=0.0, ge=0, lt=1, strict=True)
-    """With occlusion: probability that a visible point is missed in a frame."""
+    """Probability that a visible point is missed in a frame; with occlusion only."""
     whiten_pixels: bool = Field(default=False, strict=True)
-    """Pixels are whitened over random short motions; else fed as they are."""
+    """Whether pixels are whitened over random short motions; otherwise raw pixels are used."""
     encoder_steps: int = Field(default=0, ge=0, le=1_000_000, strict=True)
-    """Optimiser steps of encoder pretraining, before the policy is trained."""
+    """Number of optimiser steps of encoder pretraining, before policy training."""
     encoder_motions: Literal["near", "wild"] = "near"
-    """The encoder sees synthetic motions: those of a vehicle that hovers, or about as wide as those of a random policy.
-    Pixels are whitened over the first."""
+    """Synthetic motions for encoder pretraining. near: those of a hovering vehicle; wild: about as large as those of a
+    random policy. Pixels are whitened over the near ones."""
 
 
 @dataclass(frozen=True, config=STRICT)
 class Family:
-    """The vehicles that one policy is trained for, by their command paths. The policy observes what is known of its
-    vehicle: a vehicle file, and the identification in flight."""
+    """Family of vehicles that one policy is trained for, as ranges of command paths. The policy observes the belief
+    about its vehicle, which comes from a vehicle file and from identification in flight."""
 
     delay: tuple[NotNegative, Positive] = (0.0, 0.1)
     """Shortest and longest delay of commands [s]."""
@@ -151,52 +154,52 @@ class Family:
     thrust_lag: tuple[Positive, Positive] = (0.01, 0.15)
     """Smallest and largest time constant of the thrust [s]."""
     least_frequency: Positive = 4.0
-    """Smallest natural frequency omega_n of a rate loop [rad/s]; a slower one rings less."""
+    """Smallest natural frequency omega_n of a rate loop [rad/s]; slower rate loops have more damping."""
 
 
 @dataclass(frozen=True, config=STRICT)
 class Preset:
-    """An experiment."""
+    """All parameters of an experiment."""
 
     name: Plain = "hover/paper"
     task: TaskName = "hover"
-    """hover, track, vision, or module:name."""
+    """Task: hover, track, vision, or module:name."""
     reward: Literal["paper", "l2", "stiff", "sharp", "view"] = "paper"
-    """paper: as printed; l2: ours, with a tip at the goal in hover; stiff: in hover, with cheap commands and a steep
-    tip; sharp: l2 with a tip at the reference, too; view: l2 that keeps keypoints in the image."""
+    """Reward. paper: as printed; l2: ours, with a tip at the goal in hover; stiff: for hover, with cheap commands and a
+    steep tip; sharp: l2 with a tip at the reference, too; view: l2 that keeps keypoints in the image."""
     vehicle: Printable | VehicleSpec = "small"
-    """Vehicle of training: small, large, kingfisher, module:name, or a vehicle file."""
+    """Training vehicle: small, large, kingfisher, module:name, or a vehicle file."""
     dt: float = Field(default=0.02, ge=0.002, le=0.1, strict=True)
     """Control period [s]: 50 Hz in the paper (Sec. III-E). A whole number of milliseconds."""
     goal: tuple[Coordinate, Coordinate, Coordinate] = (0.0, 0.0, 1.0)
-    """Where to hover, world [m]."""
+    """Goal of hover, world frame [m]."""
     termination_box: Positive = 5.0
-    """A vehicle farther than this from the goal or reference along an axis is terminated [m]."""
+    """Largest distance from the goal or reference along an axis [m]; farther vehicles are terminated."""
     axes: Literal["world", "heading"] = "world"
-    """Axes of the observed state. heading: they turn with the vehicle, so that a hover policy flies alike at every
+    """Axes of the observed state. heading: they turn with the vehicle, so that a hover policy behaves the same at every
     heading."""
     command_history: int = Field(default=0, ge=0, le=50, strict=True)
-    """Past commands in the observation."""
+    """Number of past commands in the observation."""
     delay_ticks: int = Field(default=0, ge=0, le=20, strict=True)
     """Command delay of the model [ticks]."""
     plant_delay_ticks: int = Field(default=1, ge=0, le=20, strict=True)
-    """Declared command delay of the plant [ticks], to pair accelerations with commands."""
+    """Declared command delay of the plant [ticks], used to pair accelerations with commands."""
     actuator_tau: Positive | None = None
-    """Time constant of the model's actuators [s]; none by default."""
+    """Time constant of the actuators in the model [s]; by default without lag."""
     jump_cost: float = Field(default=0.0, ge=0.0, le=1e6, allow_inf_nan=False, strict=True)
-    """Cost of the squared change of the command from tick to tick, c in m/s^2 and rates in rad/s."""
+    """Weight of the cost of squared command changes between ticks, with c in m/s^2 and rates in rad/s."""
     track: Track | None = None
     vision: Vision | None = None
     family: Family | None = None
-    """Vehicles of training; None: the vehicle alone."""
+    """Family of training vehicles; None: only ``vehicle``."""
     options: dict[str, Any] = Field(default_factory=dict)
-    """Free table for a task of one's own."""
+    """Free table for a custom task."""
     pretrain: Pretrain = Field(default_factory=Pretrain)
     adapt: Adapt = Field(default_factory=Adapt)
 
     @model_validator(mode="after")
     def _consistent(self) -> "Preset":
-        """A table belongs to its task; times fit the control period."""
+        """Check that tables belong to the task, and that times fit the control period."""
         for name in ("track", "vision"):
             if getattr(self, name) is not None and self.task != name:
                 raise ValueError(f"a table [{name}] needs task = {name!r}, not {self.task!r}")

@@ -1,4 +1,4 @@
-"""References by name: built-in shapes, CSV files, functions of one's own, and families of them."""
+"""Registry of references: built-in shapes, CSV files, custom functions, and families of these."""
 
 import functools
 import math
@@ -27,20 +27,20 @@ for _name, _make in BUILT_IN.items():
 register_reference = REFERENCES.register
 
 FELT_SEED = 0
-"""Of the pushes under which references are felt in training; the same for every seed of a policy."""
+"""Seed of the pushes whose effective gravity transforms training references; the same for every policy seed."""
 
 LAPS = {"": None, "laps": True, "once": False}
-"""What may stand behind a CSV file and a colon: whether it repeats."""
+"""Suffixes of a CSV file after a colon: whether the trajectory repeats."""
 
 
 def make_reference(names: str) -> Reference:
     """Return a reference by name.
 
     Args:
-        names: A registered name, ``module:name`` of a function that makes one, or a CSV file. A closed file repeats as
-            laps, and any other is flown once; ``my.csv:laps`` insists on laps, ``my.csv:once`` flies it once. A
-            built-in shape may have a top speed [m/s], as ``circle=8``. Several of them, joined by ``+``, become a
-            family.
+        names: A registered name, ``module:name`` of a function that returns a reference, or a CSV file. A closed
+            trajectory of a file repeats as laps, any other ends after one pass; ``my.csv:laps`` requires laps,
+            ``my.csv:once`` requires one pass. A built-in shape may have a top speed [m/s], as ``circle=8``. Several
+            names, joined by ``+``, give a family.
 
     Raises:
         ConfigError: There is no such reference, or its file cannot be used.
@@ -49,16 +49,16 @@ def make_reference(names: str) -> Reference:
 
 
 def make_training_reference(table: Track) -> Reference:
-    """Return the reference that a policy is trained on: as named, and as felt under constant pushes.
+    """Return the training reference: the named one, and copies in the effective gravity of constant pushes.
 
     Raises:
-        ConfigError: As :func:`make_reference`.
+        ConfigError: As for :func:`make_reference`.
     """
     return _made(table.reference, table.felt_copies, table.felt_push)
 
 
 def _made(names: str, copies: int, push: float) -> Reference:
-    """A reference or a family; each member also as felt under so many pushes of up to ``push`` [m/s^2]."""
+    """Return a reference or a family, with ``copies`` of each member under random pushes of up to ``push`` [m/s^2]."""
     if all(name.partition("=")[0] in BUILT_IN for name in names.split("+")):
         return _built_in(names, copies, push, jax.config.values["jax_enable_x64"])
     return _family([_one_reference(name) for name in names.split("+")], copies, push)
@@ -66,7 +66,7 @@ def _made(names: str, copies: int, push: float) -> Reference:
 
 @functools.cache
 def _built_in(names: str, copies: int, push: float, x64: bool) -> Reference:
-    """References that never change are sampled once per process and precision; files are read again each time."""
+    """Return built-in references, sampled once per process and precision; CSV files are read on every call instead."""
     return _family([_one_reference(name) for name in names.split("+")], copies, push)
 
 
@@ -75,7 +75,7 @@ def _family(plain: Sequence[Reference], copies: int, push: float) -> Reference:
         return plain[0]
     draw = np.random.default_rng(FELT_SEED)
     directions = draw.normal(size=(len(plain), copies, 3))
-    sizes = push * draw.uniform(size=(len(plain), copies, 1)) ** (1.0 / 3.0)  # evenly in a ball
+    sizes = push * draw.uniform(size=(len(plain), copies, 1)) ** (1.0 / 3.0)  # uniform in a ball
     pushes = sizes * directions / np.linalg.norm(directions, axis=2, keepdims=True)
     felt = [r.in_frame(FeltFrame.of(jnp.asarray(d))) for r, many in zip(plain, pushes, strict=True) for d in many]
     return joined([*plain, *felt])

@@ -1,7 +1,7 @@
-"""Names: one registry for each kind of thing that an experiment is made of.
+"""Registries: one for each kind of component of an experiment.
 
-A name is looked up among what was registered, then among the entry points of installed packages; ``module:name`` is
-imported from the Python path or the current folder. Names of files and messages pass :mod:`.trust` before.
+A name is looked up among the registered objects, then among the entry points of installed packages. ``module:name`` is
+imported from the Python path or the current folder. :mod:`.trust` checks names from files and messages before.
 """
 
 import importlib
@@ -20,22 +20,22 @@ T = TypeVar("T")
 
 
 class Registry(Mapping[str, T], Generic[T]):
-    """Things of one kind by name."""
+    """Objects of one kind by name."""
 
     def __init__(self, kind: str, *, example: str) -> None:
-        """Start an empty registry.
+        """Build an empty registry.
 
         Args:
-            kind: What it holds, in the singular; entry points of the group ``retrim.<kind>s`` belong to it.
-            example: How a thing of one's own is named, for messages of errors.
+            kind: Kind of its objects, in the singular; its entry points have the group ``retrim.<kind>s``.
+            example: Example name of a custom object, for error messages.
         """
         self._kind, self._example, self._known = kind, example, dict[str, T]()
 
     def register(self, name: str, thing: T) -> T:
-        """Add a thing under a new name.
+        """Add an object under a new name.
 
         Raises:
-            ConfigError: The name is taken, or cannot be a name.
+            ConfigError: The name is already registered, or has forbidden characters.
         """
         if not name or any(sign in name for sign in ":+= \t\n"):
             raise ConfigError(f"{self._kind} name {name!r} must not be empty nor contain ':', '+', '=' or spaces")
@@ -45,10 +45,10 @@ class Registry(Mapping[str, T], Generic[T]):
         return thing
 
     def find(self, name: str) -> T:
-        """Return the thing of that name.
+        """Return the object of that name.
 
         Raises:
-            ConfigError: There is none, with the nearest names; or ``module:name`` cannot be imported.
+            ConfigError: The name is unknown (the message suggests known names), or ``module:name`` cannot be imported.
         """
         if name in self._known:
             return self._known[name]
@@ -69,12 +69,12 @@ class Registry(Mapping[str, T], Generic[T]):
             sys.path.append(here)
         try:
             found: T = getattr(importlib.import_module(module), attribute)
-        except Exception as error:  # whatever the module of a user raises
+        except Exception as error:  # the module of a user can raise any exception
             raise ConfigError(f"{self._kind} {name!r} cannot be imported: {type(error).__name__}: {error}") from error
         return found
 
     def __getitem__(self, name: str) -> T:
-        """Return what was registered under ``name``."""
+        """Return the object that is registered under ``name``."""
         return self._known[name]
 
     def __iter__(self) -> Iterator[str]:
@@ -87,13 +87,13 @@ class Registry(Mapping[str, T], Generic[T]):
 
 
 def told_of_own_module(error: Exception, words: Sequence[str]) -> str | None:
-    """Return one line on an error in which a module of the user's own takes part, and None on another.
+    """Return a one-line message for an error that involves a module of the user, or None for other errors.
 
-    Its mistakes are its author's to read, not a stack of ours.
+    The author of the module needs the mistake, not a stack trace of retrim.
 
     Args:
-        error: What was raised.
-        words: Those of the command line; one with ``module:name`` in it names such a module.
+        error: Exception that was raised.
+        words: Words of the command line; a word with ``module:name`` names such a module.
     """
     here = str(Path.cwd())
     frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename.startswith(here)]
@@ -105,5 +105,5 @@ def told_of_own_module(error: Exception, words: Sequence[str]) -> str | None:
 
 
 def _names_a_module(word: str) -> bool:
-    """Whether a word has a module:name in it; file.csv:once is none."""
+    """Return whether a word contains ``module:name``; ``file.csv:once`` does not count."""
     return re.search(r"(^|[=+])[A-Za-z_][\w.]*(?<!\.csv):[A-Za-z_]\w*", word) is not None

@@ -1,4 +1,4 @@
-"""Residual models by name."""
+"""Registry of residual models."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from .registry import Registry
 
 @dataclass(frozen=True)
 class ResidualRequest:
-    """What a preset asks of a residual model."""
+    """Inputs from which a residual model is built."""
 
     preset: Preset
     vehicle: Vehicle
@@ -30,10 +30,10 @@ register_residual = RESIDUALS.register
 
 
 def make_residual(request: ResidualRequest) -> ResidualModel:
-    """Build the preset's residual model.
+    """Build the residual model of a preset.
 
     Raises:
-        ConfigError: There is none of that name, or it is no residual model.
+        ConfigError: The name does not exist, or the object is not a residual model.
     """
     name = request.preset.adapt.residual
     found = RESIDUALS.find(name)
@@ -43,7 +43,7 @@ def make_residual(request: ResidualRequest) -> ResidualModel:
     return model
 
 
-SMALL = (32, 32)  # of an ensemble that only learns what a closed form leaves, and is flown in every burst
+SMALL = (32, 32)  # widths of an ensemble that learns only the error of a closed form, and runs in every burst
 
 
 def _ensemble(request: ResidualRequest, hidden: tuple[int, ...] = (128, 128)) -> EnsembleModel:

@@ -1,4 +1,4 @@
-"""Where a flight takes place."""
+"""Scenario of a flight: plant, vehicle, sensors and disturbances."""
 
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -14,31 +14,30 @@ from .sensors import SENSORS
 from .vehicle_file import VehicleSpec
 from .vehicles import make_vehicle, name_of, vehicle_from
 
-THRUST_ERROR = 0.035  # of the plants by default
+THRUST_ERROR = 0.035  # default relative thrust error of the plants
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """Plant, vehicle, sensors and disturbance of a flight, by name; checked when it is made."""
+    """Plant, vehicle, sensors and disturbance of a flight, by name; validated on construction."""
 
     disturbance: str = "none"
-    """A name, a name with a size, or a sum, as ``wind=6+payload``."""
+    """Name, name with a size, or sum, as ``wind=6+payload``."""
     plant: str = "bem"
     vehicle: str | VehicleSpec | None = None
-    """None: that which the policy was trained for, or the plant's own."""
+    """Vehicle of the flight; None: the training vehicle of the policy, or the built-in vehicle of the plant."""
     sensors: str = "ideal"
     thrust_error: float = THRUST_ERROR
-    """By how much more than commanded the rotors give, as a share; simulations of retrim only."""
+    """Relative thrust error; 0.1 means 10 % more thrust than commanded. Simulations of retrim only."""
     reference: str | None = None
-    """What a tracking policy follows; None: what it was trained on."""
+    """Reference of a tracking policy; None: the training reference."""
     delay: float = DELAY
-    """Command delay of the plant [s]; simulations of retrim only. The policy does not know of it."""
+    """Command delay of the plant [s]; simulations of retrim only. The policy does not receive it."""
     fault: str = NO_FAULT
-    """Fault of the measurements: a name, or a name with a size, as ``velocity-spikes=3``; simulations of retrim only.
-    """
+    """Fault of the measurements: name, or name with a size, as ``velocity-spikes=3``; simulations of retrim only."""
 
     def __post_init__(self) -> None:
-        """Raise :class:`ConfigError` for an unknown name, and for a choice that the plant does not have."""
+        """Raise :class:`ConfigError` for an unknown name, and for an option that the plant does not support."""
         entry = self.entry
         SENSORS.find(self.sensors)
         disturbance(self.disturbance)
@@ -81,7 +80,7 @@ class Scenario:
 
     @property
     def entry(self) -> PlantEntry:
-        """The plant's entry in the registry."""
+        """Registry entry of the plant."""
         entry: Any = find_plant(self.plant)[0]
         if isinstance(entry, PlantEntry):
             return entry
@@ -97,10 +96,10 @@ class Scenario:
         )
 
     def without_numbers(self) -> tuple["Scenario", tuple[str, ...]]:
-        """Return what decides which program flies: everything but the numbers of vehicle, delay and thrust error.
+        """Return the scenario without the numbers of vehicle, delay and thrust error, which do not change the program.
 
         Returns:
-            The scenario without these numbers, and the names of the numbers that the vehicle states.
+            The scenario without these numbers, and the names of the values that the vehicle file states.
         """
         stated = tuple[str, ...]()
         vehicle = self.vehicle
@@ -110,14 +109,14 @@ class Scenario:
         return replace(self, vehicle=vehicle, delay=DELAY, thrust_error=THRUST_ERROR), stated
 
     def vehicle_name(self, trained_for: str | VehicleSpec) -> str:
-        """Return the name of the vehicle that flies a policy trained for ``trained_for``."""
+        """Return the name of the vehicle in the flight of a policy that was trained for ``trained_for``."""
         return self.entry.own_vehicle or name_of(self.vehicle or trained_for)
 
     def make_vehicle(self, trained_for: str | VehicleSpec) -> Vehicle:
-        """Build the vehicle that flies a policy trained for ``trained_for``.
+        """Build the vehicle for the flight of a policy that was trained for ``trained_for``.
 
-        A plant with a vehicle of its own does not tell its limits: there it is the vehicle of training, to whose limits
-        the policy keeps.
+        A plant with a built-in vehicle does not report its limits. For such a plant, this is the training vehicle,
+        whose limits the policy respects.
         """
         return make_vehicle(self.vehicle or trained_for)
 
@@ -125,13 +124,13 @@ class Scenario:
         """Build the plant.
 
         Args:
-            trained_for: Vehicle of the policy; it flies unless the scenario has another.
+            trained_for: Training vehicle of the policy, used unless the scenario has a vehicle.
             dt: Control period [s].
-            seed: Disturbance and sensors follow from it.
+            seed: Seed of disturbance and sensors.
 
         Raises:
             PlantError: A package that the plant needs is not installed.
-            ConfigError: The plant, or its sensors, cannot divide the control period.
+            ConfigError: The plant or its sensors do not support the control period.
         """
         entry = self.entry
         request = PlantRequest(

@@ -1,4 +1,4 @@
-"""Sensor models by name."""
+"""Registry of sensor models."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""From a preset's numbers to objects, built once."""
+"""Objects built from the values of a preset."""
 
 import dataclasses
 import math
@@ -47,24 +47,24 @@ from .tasks import TaskRequest, find_task, make_task
 from .vehicles import make_vehicle
 
 Latency = Literal["fixed", "measured"]
-"""What learning costs in flight time: the preset's fixed figures, or the time that the clock shows."""
+"""Flight time that learning takes: fixed values of the preset, or the measured computing time."""
 
 
 @dataclass(frozen=True)
 class Setup:
-    """Everything that a preset describes, as objects. Make it with :meth:`of`."""
+    """All objects that a preset describes. Build it with :meth:`of`."""
 
     preset: Preset
     vehicle: Vehicle
     """Vehicle of training."""
     env: Env
-    """Environment of training: nominal model, task, delay."""
+    """Training environment: nominal model, task, delay."""
     flown: AbstractTask
-    """Task of flight: that of training, but for another reference."""
+    """Task of the flight: the training task, with the reference of the flight."""
     learner: OnlineLearner
-    """The learner beside the flight; it re-trains on ``flown``."""
+    """In-flight learner; it re-trains on ``flown``."""
     optimiser: optax.GradientTransformation
-    """Of pretraining: Adam under a cosine, behind a clip."""
+    """Pretraining optimiser: gradient clipping, then Adam with a cosine schedule."""
 
     @classmethod
     def of(
@@ -77,12 +77,12 @@ class Setup:
         """Build a set-up.
 
         Args:
-            preset: The numbers.
-            reference: What a tracking flight follows, by name or as an object; None for what training follows.
-            residual_model: Residual model of the learner; by default the one that the preset names.
+            preset: Preset of the experiment.
+            reference: Reference of a tracking flight, by name or as an object; by default that of training.
+            residual_model: Residual model of the learner; by default the model that the preset names.
 
         Raises:
-            ConfigError: A name does not exist, the task tracks no reference, or values do not fit together.
+            ConfigError: A name does not exist, the task does not track a reference, or values are inconsistent.
         """
         preset, entry = delayed(preset), find_task(preset.task)
         if reference is not None and not entry.has_reference:
@@ -118,10 +118,10 @@ class Setup:
         return cls(preset, vehicle, env, flown, learner, pretraining_optimiser(preset.pretrain))
 
     def on(self, reference: AbstractReference) -> "Setup":
-        """Return the same set-up whose flight, and the learner beside it, follow another reference.
+        """Return the same set-up with another reference for the flight and its learner.
 
         Args:
-            reference: Of the sizes of the one that is followed, or programs are compiled again.
+            reference: New reference. Programs are compiled again if its array sizes differ from the present ones.
         """
 
         def other(part: Any) -> Any:
@@ -135,7 +135,7 @@ class Setup:
 
     @property
     def followed(self) -> Reference | None:
-        """What the flight follows; None if the task has no reference, or one that is no table."""
+        """Reference of the flight; None if the task has no tabulated reference."""
         followed = getattr(self.flown, "reference", None)
         return followed if isinstance(followed, Reference) else None
 
@@ -152,8 +152,8 @@ class Setup:
             seed: Seed of the weights and of the starts.
 
         Yields:
-            The policy after every few steps, and the losses of those steps. A preset with encoder steps trains the
-            encoder before the first value.
+            The policy after every few steps, and the losses of those steps. If the preset has encoder steps, the
+            encoder is trained before the first value.
         """
         k_init, k_train = random.split(random.key(seed))
         fresh, p = self.new_policy(k_init), self.preset.pretrain
@@ -173,7 +173,7 @@ class Setup:
         return ((state.policy.merged(), losses) for state, losses in chunks)
 
     def pretrained(self, seed: int = 0) -> Policy:
-        """Return a policy trained from scratch, without a word; :meth:`pretraining` shows progress."""
+        """Return a policy trained from scratch, without progress reports; :meth:`pretraining` shows progress."""
         ((last, _),) = deque(self.pretraining(seed), maxlen=1)
         return last
 
@@ -189,27 +189,28 @@ class Setup:
         """Return a pilot for ``policy``.
 
         Args:
-            policy: A policy of this preset; for a method with a network of its own, that network.
-            method: ``base`` flies it as it is, ``full`` and ``lora`` re-train it in flight; or another registered name.
-            key: Seed of the learners; consumed. A method that does not learn needs none.
-            latency: What learning costs in flight time.
-            state: What an earlier flight learnt, to go on from.
+            policy: Policy of this preset, or the network of a method that has its own.
+            method: Method: ``base`` flies the policy unchanged, ``full`` and ``lora`` re-train it in flight; or another
+                registered name.
+            key: Seed of the learners; consumed. Methods that do not learn do not need it.
+            latency: Flight time that learning takes.
+            state: Learner state of an earlier flight, from which to continue.
 
         Raises:
             ConfigError: There is no such method, or it does not suit the task.
             ValueError: The method needs a key.
         """
-        from .methods import MethodRequest, find_method  # they are made of a set-up, too
+        from .methods import MethodRequest, find_method  # here: methods import set-ups
 
         pilot = find_method(method).make(MethodRequest(self, policy, key, latency, state))
-        if pilot.dt is None:  # what a controller was made for, it does not know
+        if pilot.dt is None:  # a controller does not store its control period
             pilot.dt = self.preset.dt
         return pilot
 
     def controller(self, state: LearnerState) -> AbstractController[Any]:
-        """Return the controller of a policy that adapts: behind its observation, in the preset's frame.
+        """Return the controller of an adapting policy, with its observation and in the frame of the preset.
 
-        In the frame of effective gravity a monitor steps back from what was learned if that makes the flight worse.
+        In the frame of effective gravity, a monitor steps back from learned parameters if they make the flight worse.
         """
         plain = policy_controller(self.preset, self.flown, state.policy.policy.merged())
         if self.preset.adapt.frame == "world":
@@ -225,11 +226,11 @@ class Setup:
         """Return ``policy`` with a fresh low-rank delta (ranks 4, 10, 1 and scale 4, as in the paper).
 
         Raises:
-            ConfigError: The policy has other than three layers, or one too narrow for its rank.
+            ConfigError: The policy does not have three layers, or a layer is too narrow for its rank.
         """
         try:
             return low_rank(policy, key)
-        except ValueError as error:  # whose traced message goes on for several lines
+        except ValueError as error:  # its traced message has several lines
             raise ConfigError(f"preset {self.preset.name!r}: {str(error).splitlines()[0]}") from error
 
     def adaptive_pilot(
@@ -239,7 +240,7 @@ class Setup:
         latency: Latency = "fixed",
         state: LearnerState | None = None,
     ) -> AdaptivePilot:
-        """Return a pilot that flies ``policy`` and re-trains it; the key is consumed. See :meth:`pilot`."""
+        """Return a pilot that flies and re-trains ``policy``; the key is consumed. See :meth:`pilot`."""
         k_residual, k_learn = random.split(key)
         state = state or self.learner.init(policy, k_residual)
         a, dt, fixed = self.preset.adapt, self.preset.dt, latency == "fixed"
@@ -251,14 +252,14 @@ class Setup:
     def flight_starts(self, n: int, seed: int = 0) -> list[State]:
         """Return ``n`` starts: +- 1 m per axis from the task's home, 18 degrees about each axis, 0.1 m/s.
 
-        They follow from the seed and the home alone, so that all presets of a task fly from the same ones.
+        They depend only on the seed and the home, so that all presets of a task use the same starts.
         """
         return flight_starts(self.flown.home(), n, seed)
 
     def limits_exceeded(self, vehicle: Vehicle | None = None) -> str | None:
-        """Return what a vehicle cannot fly of the flown reference, in words; None if it can fly all of it.
+        """Return the limits of a vehicle that the reference of the flight exceeds, as text; None if there are none.
 
         Args:
-            vehicle: Vehicle that flies; by default that of training.
+            vehicle: Vehicle of the flight; by default that of training.
         """
         return None if self.followed is None else self.followed.infeasibility(vehicle or self.vehicle)

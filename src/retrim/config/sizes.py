@@ -1,4 +1,4 @@
-"""Names with a size, as ``wind=6``."""
+"""Parse names with a size, as ``wind=6``."""
 
 from ..errors import ConfigError, excerpt
 
@@ -7,11 +7,11 @@ def name_and_size(text: str, kind: str) -> tuple[str, float | None]:
     """Split a name with an optional size.
 
     Args:
-        text: As ``wind`` or ``wind=6``.
-        kind: Kind of the named thing, for an error.
+        text: Name, as ``wind`` or ``wind=6``.
+        kind: Kind of the named object, for error messages.
 
     Returns:
-        The name and the size; None for no size.
+        The name, and the size or None.
 
     Raises:
         ConfigError: The size is not a number.

@@ -1,4 +1,4 @@
-"""Tasks by name."""
+"""Registry of tasks."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ from .presets import Track as TrackTable
 from .presets import Vision as VisionTable
 from .registry import Registry
 
-LEAD = 0.04  # [s]: about as late as commands act, behind a delay and motors
+LEAD = 0.04  # [s]: approximate time until commands act, from delay and motor lag
 HOVER_REWARDS: dict[str, type[AbstractHover]] = {"paper": Hover, "l2": L2Hover, "stiff": StiffHover}
 VISION_REWARDS: dict[str, type[AbstractHover]] = {"paper": Hover, "l2": L2Hover, "view": ViewHover}
 TRACK_OBSERVATIONS: dict[str, Callable[["TaskRequest", Reference], AbstractObservation[Any]]] = {
@@ -57,7 +57,7 @@ class TaskRequest:
         return self.preset.options
 
     def state_observation(self) -> StateObs:
-        """Return the paper's observation, o = [p, R, v], with the preset's past commands."""
+        """Return the observation of the paper, o = [p, R, v], with the past commands of the preset."""
         return StateObs(jnp.array(self.preset.goal), *self.observed_commands())
 
     def in_axes(self, observation: AbstractObservation[Any]) -> AbstractObservation[Any]:
@@ -67,7 +67,7 @@ class TaskRequest:
         return HeadingObs(observation, jnp.array(self.preset.goal))
 
     def of_vehicle(self, observation: AbstractObservation[Any]) -> AbstractObservation[Any]:
-        """Return an observation that shows the vehicle, too, if the preset is for a family of vehicles."""
+        """Return an observation that also includes the vehicle, if the preset is for a family of vehicles."""
         if self.preset.family is None:
             return observation
         return VehicleObs.of(observation, self.vehicle.omega_max, PathBelief.unknown())
@@ -96,7 +96,7 @@ def find_task(name: str) -> TaskEntry:
     """Return the entry of a task by name; ``module:name`` may be a function of a :class:`TaskRequest`.
 
     Raises:
-        ConfigError: There is no such task, or ``module:name`` is no entry.
+        ConfigError: The task does not exist, or ``module:name`` is neither an entry nor a function.
     """
     entry: Any = TASKS.find(name)
     if isinstance(entry, TaskEntry):
@@ -107,7 +107,7 @@ def find_task(name: str) -> TaskEntry:
 
 
 def make_task(request: TaskRequest) -> AbstractTask:
-    """Build the preset's task.
+    """Build the task of a preset.
 
     Raises:
         ConfigError: The task does not exist, or its entry does not return an ``AbstractTask``.

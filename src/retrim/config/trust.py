@@ -16,13 +16,13 @@ from typing import Any
 from ..errors import ConfigError, excerpt
 
 CSV_FILE = re.compile(r"[^:]*\.csv(:(laps|once))?", re.IGNORECASE)
-"""A trajectory, which is no Python name: its colon says how it is flown."""
+"""Name of a trajectory file. A colon in it does not mark a Python name, but a choice between laps and one pass."""
 FREE = "options"
-"""The table of a user's own task, in which this package looks up no name."""
+"""Table of a custom task, in which this package does not look up names."""
 
 
 def python_names(values: Any) -> tuple[str, ...]:
-    """Return the Python names that building of ``values`` would import.
+    """Return the Python names that would be imported to build ``values``.
 
     Args:
         values: A preset, a scenario, a name, or tables and lists of them.
@@ -39,7 +39,7 @@ def check_trust(values: Any, trust: Collection[str], *, source: str) -> None:
         source: Where it comes from; the message begins with it.
 
     Raises:
-        ConfigError: There is a name that the user did not name.
+        ConfigError: The values contain a name that the user does not trust.
     """
     for name in python_names(values):
         if name not in trust:

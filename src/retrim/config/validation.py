@@ -1,4 +1,4 @@
-"""TOML files, and tables checked against dataclasses; every mistake is one clear line."""
+"""Read TOML files, and validate tables against dataclasses. Error messages have one line."""
 
 import dataclasses
 import difflib
@@ -15,7 +15,7 @@ from ..errors import ConfigError, excerpt
 T = TypeVar("T")
 
 CHECKED, TOLD = 100, 8
-"""Mistakes of one file that are looked at, and that are named."""
+"""Largest numbers of mistakes in one file that are examined, and that are listed."""
 UNKNOWN = "unknown key"
 NO_NAME = "Input should be a valid string"
 MAX_TOML_BYTES = 1_000_000
@@ -25,7 +25,7 @@ def read_toml(path: Path) -> dict[str, Any]:
     """Return the tables of a TOML file.
 
     Raises:
-        ConfigError: It is not a regular file, too large, or not TOML.
+        ConfigError: The path is not a regular file, the file is too large or cannot be read, or is not TOML.
     """
     try:
         if not path.is_file():
@@ -40,15 +40,15 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def validated(kind: type[T], tables: dict[str, Any] | str | bytes, *, source: str) -> T:
-    """Return a dataclass made of tables, or of JSON.
+    """Build a dataclass from tables or JSON.
 
     Args:
-        kind: The dataclass.
-        tables: Its values, as dictionaries or as JSON.
-        source: Where they come from; messages begin with it.
+        kind: Type of the dataclass.
+        tables: Values, as dictionaries or as JSON.
+        source: Source of the values; error messages begin with it.
 
     Raises:
-        ConfigError: A value is missing, unknown or impossible; every mistake is named with its path.
+        ConfigError: A value is missing, unknown or impossible. The message lists the mistakes with their paths.
     """
     adapter = TypeAdapter(kind)
     try:
@@ -58,13 +58,13 @@ def validated(kind: type[T], tables: dict[str, Any] | str | bytes, *, source: st
 
 
 def suggestion(name: str, known: Iterable[str]) -> str:
-    """Return the nearest known name, and all of them."""
+    """Return a text with the closest known name and all known names."""
     near = difflib.get_close_matches(name[:100], known := list(known), n=1)
     return (f"did you mean {near[0]!r}? " if near else "") + f"there are {', '.join(known)}"
 
 
 def _explained(kind: type[Any], error: ValidationError) -> str:
-    """The first mistakes, each with its path and, for an unknown key, the keys that there are."""
+    """Return the first mistakes, each with its path and, for an unknown key, the valid keys."""
     found, mistakes = dict[str, str](), error.errors(include_url=False, include_context=False, include_input=False)
     for each in mistakes[:CHECKED]:
         path = [excerpt(str(part), quotes=False) for part in each["loc"] if not str(part).startswith("function-")]
@@ -74,16 +74,16 @@ def _explained(kind: type[Any], error: ValidationError) -> str:
             message = f"{UNKNOWN}; {suggestion(path[-1], _keys(kind, path[:-1]))}"
         elif each["type"] in ("missing", "missing_argument"):
             message = "is missing"
-        if found.get(where) in (None, NO_NAME):  # a table where a name may be, too: what is wrong with it
+        if found.get(where) in (None, NO_NAME):  # a table or a name is valid here: prefer the mistake in the table
             found[where] = message
-    ordered = sorted(found.items(), key=lambda each: not each[1].startswith(UNKNOWN))  # a slip explains what is missing
+    ordered = sorted(found.items(), key=lambda each: not each[1].startswith(UNKNOWN))  # typos explain missing keys
     told = [f"{where}: {message}" if where else message for where, message in ordered][:TOLD]
     more = len(found) - len(told) + max(len(mistakes) - CHECKED, 0)
     return "; ".join(told) + (f"; and {more} more" if more else "")
 
 
 def _keys(kind: type[Any], path: Sequence[str]) -> list[str]:
-    """The keys of the table at a path; a part that names no key, as the member of a union, is passed over."""
+    """Return the keys of the table at a path. Parts that are not keys, as members of a union, are skipped."""
     for part in path:
         annotation = typing.get_type_hints(kind).get(part)
         nested = [each for each in (annotation, *typing.get_args(annotation)) if dataclasses.is_dataclass(each)]

@@ -1,4 +1,4 @@
-"""Vehicles from TOML files: what a builder can measure or look up; the rest follows by stated rules."""
+"""Vehicles from TOML files, with values that can be measured or looked up; fixed rules give all other values."""
 
 import dataclasses
 import math
@@ -25,10 +25,10 @@ Lag = Annotated[Positive, AfterValidator(at_most(2.0, "s", *MILLI))]
 
 
 OVERSHOOT, SLOWEST = 0.6, (0.25, 0.25, 1.5)
-"""Of a step of the rates: largest overshoot, and longest time to 63 % about each axis [s]."""
+"""Limits of a step response of the rates: largest overshoot, and longest time to 63 % for each axis [s]."""
 LONGEST_ARM = 2.0  # [m]
 ENOUGH = (1.6, 20.0)
-"""Thrust of all rotors over weight, at least and at most."""
+"""Smallest and largest ratio of the total rotor thrust to the weight."""
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -49,21 +49,21 @@ class VehicleSpec:
     motor_tau: Annotated[float, Field(gt=0, strict=True), AfterValidator(at_most(0.5, "s", *MILLI))]
     """Time constant of the motors [s]."""
     rate_lag: tuple[Lag, Lag, Lag] | None = None
-    """Time constants of the body rates behind their commands: roll, pitch, yaw [s]; those of the simulated rate loop
-    by default, which follow from the motors. Policies are trained for them, and for a thrust that follows as the motors
-    do."""
+    """Time constants of the body rates after commands: roll, pitch, yaw [s]; by default those of the simulated rate
+    loop, which depend on the motors. Policies are trained for them, and for a thrust with the time constant of the
+    motors."""
     rate_damping: tuple[Damping, Damping, Damping] | None = None
-    """Damping ratios of the rate loops: roll, pitch, yaw; loops of first order by default. With them, ``rate_lag`` is
-    2 zeta / omega_n."""
+    """Damping ratios of the rate loops: roll, pitch, yaw; by default the loops are of first order. With damping ratios,
+    ``rate_lag`` is 2 zeta / omega_n."""
     command_delay: Annotated[float, Field(ge=0, strict=True), AfterValidator(at_most(0.2, "s", *MILLI))] | None = None
-    """Between a command and its effect [s]; that of the preset by default. Policies are trained for it, in whole ticks,
-    and learners pair accelerations with the commands that caused them."""
+    """Time between a command and its effect [s]; by default that of the preset. Policies are trained for it, in whole
+    ticks, and learners use it to pair accelerations with the commands that caused them."""
     propeller: Literal["3 inch", "5 inch"] | None = None
-    """Blade geometry that is scaled to the vehicle; the nearer one by default."""
+    """Blade geometry that is scaled to the vehicle; by default the one with the closer diameter."""
     propeller_diameter: Positive | None = None
-    """[inch]; by default 0.9 times the distance of neighbouring rotors, and 0.3 to 1.3 times it."""
+    """Propeller diameter [inch]: 0.3 to 1.3 times the distance between adjacent rotors; by default 0.9 times."""
     drag_area: Three | None = None
-    """c A of the body along its axes [m^2]; by default the kingfisher's, by arm squared."""
+    """Drag area c A of the body along its axes [m^2]; by default that of the kingfisher, scaled by arm squared."""
 
     @model_validator(mode="after")
     def _possible(self) -> "VehicleSpec":
@@ -120,7 +120,7 @@ class VehicleSpec:
         return self
 
     def _thrust_units(self) -> tuple[tuple[str, float], ...]:
-        """What ``thrust_max`` and ``mass`` may be instead, and the ratio of thrust and weight that follows."""
+        """Return questions about the unit of ``thrust_max`` and ``mass``, each with its ratio of thrust to weight."""
         ratio = self.thrust_max / (self.mass * STANDARD_GRAVITY)
         gram = STANDARD_GRAVITY / 1000.0
         return (
@@ -133,9 +133,9 @@ class VehicleSpec:
     def build(self) -> Vehicle:
         """Return the vehicle.
 
-        The propeller is a published one, scaled: chord and radius by the diameter; rotor speeds so that a quarter of
-        ``thrust_max`` is reached at 90 % of the largest speed. Drag torque over thrust and rotor inertia follow the
-        diameter (to the powers 1 and 5).
+        The propeller is a scaled published one. Chord and radius scale with the diameter. Rotor speeds are such that a
+        rotor reaches a quarter of ``thrust_max`` at 90 % of its largest speed. The ratio of drag torque to thrust
+        scales with the diameter, and the rotor inertia with its fifth power.
         """
         reach = math.hypot(*self.arm)
         inches = self.propeller_diameter or 0.9 * 2.0 * min(self.arm) / INCH
@@ -178,7 +178,7 @@ def check_flyable(vehicle: Vehicle) -> None:
     """Raise if a simulated rate loop cannot fly a vehicle.
 
     Raises:
-        ValueError: A step of the rates overshoots too much or rises too slowly; its numbers are in the message.
+        ValueError: A step response of the rates overshoots too much or rises too slowly; the message has its values.
     """
     for axis, found, slowest in zip(("roll", "pitch", "yaw"), step_responses(vehicle), SLOWEST, strict=True):
         if found.overshoot > OVERSHOOT or found.rise > slowest:
@@ -194,8 +194,8 @@ def read_vehicle(path: Path) -> VehicleSpec:
     """Read a vehicle file.
 
     Raises:
-        ConfigError: The file cannot be read, a value is missing, unknown or impossible, or no rate loop can fly the
-            vehicle.
+        ConfigError: The file cannot be read, a value is missing, unknown or impossible, or the rate loop cannot fly
+            the vehicle.
     """
     tables = read_toml(path)
     tables.setdefault("name", plain_from(path.stem))

@@ -1,4 +1,4 @@
-"""Vehicles by name or file."""
+"""Registry of vehicles, and vehicles from files."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -19,12 +19,12 @@ register_vehicle = VEHICLES.register
 
 
 def is_published(vehicle: str | VehicleSpec) -> bool:
-    """Return whether others have flown a vehicle, with a rate loop of its own."""
+    """Return whether a vehicle is a published one, with a rate loop that others have used in flight."""
     return isinstance(vehicle, str) and vehicle in PUBLISHED
 
 
 def vehicle_from(name: str | VehicleSpec) -> str | VehicleSpec:
-    """Return what a preset or scenario keeps of a vehicle: a name that exists, or the content of its file.
+    """Return the form of a vehicle that presets and scenarios store: a valid name, or the content of its file.
 
     Raises:
         ConfigError: There is no such vehicle, or its file cannot be used.
@@ -38,10 +38,10 @@ def vehicle_from(name: str | VehicleSpec) -> str | VehicleSpec:
 
 
 def make_vehicle(vehicle: str | VehicleSpec | Vehicle) -> Vehicle:
-    """Build a vehicle; one that is built already is returned.
+    """Build a vehicle; a :class:`Vehicle` is returned unchanged.
 
     Raises:
-        ConfigError: There is no such vehicle, or it cannot exist, or no rate loop can fly it.
+        ConfigError: The vehicle does not exist, is physically impossible, or cannot be controlled by a rate loop.
     """
     if isinstance(vehicle, Vehicle):
         return vehicle
@@ -60,5 +60,5 @@ def make_vehicle(vehicle: str | VehicleSpec | Vehicle) -> Vehicle:
 
 
 def name_of(vehicle: str | VehicleSpec) -> str:
-    """Return the vehicle's name, for results."""
+    """Return the name of the vehicle, for results."""
     return vehicle.name if isinstance(vehicle, VehicleSpec) else vehicle
