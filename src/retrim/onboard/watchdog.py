@@ -129,7 +129,7 @@ class Watchdog:
 
 
 def watch(plan: WatchdogPlan) -> None:
-    """Watch until the flight is over: the main function of the process."""
+    """Watch until the flight is over; main function of the process."""
     refused = be_punctual(plan.priority, set(plan.cores))
     bus = SharedMemoryBus(plan.folder)
     watchdog, control, parent = Watchdog(plan, bus), Lifeline(plan.control), Lifeline(plan.parent)
