@@ -50,7 +50,7 @@ class Stalls:
 
 
 def lost_in(stalls: Sequence[Sequence[Any]], gaps: Sequence[Sequence[Any]], dt: float) -> int:
-    """Return the number of ticks that were missed during a stall or within one tick after it, while the plant caught up.
+    """Return the number of ticks that were missed during a stall or while the plant caught up within a tick after it.
 
     Args:
         stalls: Start and end of each stall [s].
