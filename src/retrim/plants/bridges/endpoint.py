@@ -23,11 +23,11 @@ class Endpoint(Protocol):
         ...
 
     def receive(self) -> tuple[bytes, Any] | None:
-        """Return received data and their sender; None if there is no new data."""
+        """Return received data and its sender; None if there is no new data."""
         ...
 
     def send(self, data: bytes, to: Any) -> None:
-        """Send data to a sender of received data; data that cannot be sent are lost, as on any link."""
+        """Send data to a sender of received data; data that cannot be sent is lost, as on any link."""
         ...
 
     def close(self) -> None:
@@ -170,9 +170,9 @@ def pump(endpoint: Endpoint, until: float, chores: Callable[[float], None], take
 
     Args:
         endpoint: Source of the data.
-        until: Time of the end; data that have already arrived are read even if it has passed.
+        until: Time of the end; data that has already arrived is read even if this time has passed.
         chores: Periodic work; called with the time.
-        take: Called with the data of one read, and their sender.
+        take: Called with the data of one read, and its sender.
     """
     while True:
         chores(time.monotonic())
