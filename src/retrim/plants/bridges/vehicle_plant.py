@@ -87,7 +87,7 @@ class VehiclePlant(Plant, abc.ABC):
         """Send a command [c, omega] within the limits immediately; return the command that the vehicle accepts."""
 
     def send(self, u: np.ndarray) -> np.ndarray:
-        """Clip a command [c, omega] to the limits and send it immediately; return the command that it accepts."""
+        """Clip a command [c, omega], send it immediately, and return the command that the vehicle accepts."""
         taken = self.transmit(np.clip(u, self.low, self.high))
         self._thrust = float(taken[0])
         return taken

@@ -43,7 +43,7 @@ class VehicleState(NamedTuple):
         Args:
             c: Thrust per mass that was commanded last [m/s^2].
         """
-        from scipy.spatial.transform import Rotation  # here: it takes as long to import as all of retrim
+        from scipy.spatial.transform import Rotation  # local, because it takes as long to import as all of retrim
 
         h = min(self.age, LONGEST_S)
         a = c * self.R[:, 2] - np.array([0.0, 0.0, STANDARD_GRAVITY])
