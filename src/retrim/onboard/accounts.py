@@ -25,7 +25,7 @@ def summary(seconds: np.ndarray) -> dict[str, Any]:
 
 
 def accounted(rows: np.ndarray) -> np.ndarray:
-    """Return which ticks the control process reported: their step has a duration; the watchdog reports no durations.
+    """Return which ticks the control process reported; only these have a step duration, unlike those of the watchdog.
 
     Args:
         rows: Columns as in :data:`retrim.onboard.messages.COLUMNS`.

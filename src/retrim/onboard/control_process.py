@@ -35,7 +35,7 @@ class Schedule:
         if sample is not None:
             drift = sample.sent - sample.tick * self._dt - self._epoch
             self._behind = self._behind + 1 if drift > PHASE * self._dt else 0
-            if self._behind >= 3:  # a single late sample does not count; if several are late, the plant had stopped
+            if self._behind >= 3:  # one late sample does not count; several in a row mean that the plant had stopped
                 self._epoch, answered, self._behind = self._epoch + drift, sample.tick, 0
             elif drift <= PHASE * self._dt:
                 self._epoch += 0.1 * drift

@@ -1,8 +1,8 @@
 """Heartbeats: each process of a flight reports many times per second that its main loop is running.
 
 The messages that plant and control publish each tick serve as their heartbeats. A loop that computes for seconds has a
-thread that sends its heartbeats. The thread stops after the time that the loop announced beforehand, so that a loop
-that hangs becomes silent even if its threads continue.
+thread that sends its heartbeats, but only for the time that the loop announced beforehand. A loop that hangs therefore
+becomes silent even if its threads continue.
 """
 
 import contextlib
@@ -26,7 +26,7 @@ class Heart:
     """Sends heartbeats when the main loop calls it."""
 
     def __init__(self, bus: Bus, role: str, clock: Callable[[], float] = time.monotonic) -> None:
-        """Build it for a process.
+        """Build a sender of heartbeats for a process.
 
         Args:
             bus: Bus of the flight; if it has no topic for the heartbeats of the role, they are not published.
@@ -50,7 +50,7 @@ class Pacemaker:
     """Sends heartbeats from its own thread while the main loop is within its announced time."""
 
     def __init__(self, bus: Bus, role: str, clock: Callable[[], float] = time.monotonic) -> None:
-        """Build it for a process; the thread runs while the context is open."""
+        """Build a pacemaker for a process; its thread runs while the context is open."""
         self._heart, self._clock = Heart(bus, role, clock), clock
         self._until, self._over = float("-inf"), threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)

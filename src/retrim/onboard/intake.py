@@ -1,7 +1,7 @@
 """Intake of parameters from the learners.
 
-Valid parameters are passed to the pilot. Invalid ones are refused and counted by reason. A policy that flies clearly
-worse than its predecessor is rolled back.
+Valid parameters are passed to the pilot. Invalid ones are refused and counted by reason. Policies that fly clearly
+worse than the last proven one are rolled back.
 """
 
 from collections import deque

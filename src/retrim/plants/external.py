@@ -103,7 +103,7 @@ def thrust_limits(least: float, most: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def whole_steps(dt: float, step: float) -> int:
-    """Return the number of simulator steps in a tick; raise ``ValueError`` if a tick is not a multiple of a step [s]."""
+    """Return the number of simulator steps in a tick; raise ``ValueError`` if it is not a whole number (times in s)."""
     steps = round(dt / step)
     if steps < 1 or abs(dt / step - steps) > 1e-6:
         raise ValueError(f"a tick of {dt} s is no multiple of the simulator's step, {step} s")

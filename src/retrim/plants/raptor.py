@@ -25,7 +25,7 @@ from .extras import import_extra
 
 PERIOD = 10  # [ms]
 FARTHEST, FASTEST = 0.5, 1.0  # [m], [m/s]: largest differences in its observation
-ORDER = (0, 2, 1, 3)  # indices of our rotors in its order: front-right, back-right, back-left, front-left
+ORDER = (0, 2, 1, 3)  # its rotor for each of ours; its order is front-right, back-right, back-left, front-left
 
 
 class RaptorNet(eqx.Module):

@@ -20,7 +20,7 @@ class SensorModel(eqx.Module):
     attitude: Float[Array, ""]
     """Standard deviation of a rotation about each body axis [rad]."""
     dropout: Float[Array, ""]
-    """Probability that a sample is lost; the last sample then stays valid."""
+    """Probability that a sample is lost; the previous sample is then used again."""
     latency: int = eqx.field(static=True)
     """Age of a sample at its arrival [ms]; :attr:`age` is its age at the end of a tick."""
     period: int = eqx.field(static=True, default=10)

@@ -21,7 +21,7 @@ from .measurement_faults import AbstractMeasurementFault
 from .plant import Measurement, Plant, as_numpy, check_command, limited
 from .sensors import SensorModel
 
-FIRST_SAMPLE, INERTIAL, FAULT = 2**31 - 1, 2**31 - 2, 2**31 - 3  # folded into keys; larger than the number of any tick
+FIRST_SAMPLE, INERTIAL, FAULT = 2**31 - 1, 2**31 - 2, 2**31 - 3  # folded into keys; no tick has these numbers
 
 
 class Reports(eqx.Module):

@@ -27,9 +27,9 @@ ON = 0.8 * IDLE  # smallest motor command of an armed board
 class BetaflightPlant(VehiclePlant):
     """A vehicle whose motors Betaflight commands. The firmware runs in its own process; the world is simulated.
 
-    An autopilot for take-off and landing does not exist: the vehicle stands on a stand with turning motors until the
-    first command releases it, and is removed when the flight is over. A real board holds the companion's last command
-    for ever; here the world ends with the process that flies the vehicle.
+    There is no autopilot for take-off and landing: the vehicle stands on a stand with turning motors until the first
+    command releases it, and is removed when the flight is over. A real board holds the companion's last command for
+    ever; here the world ends with the process that flies the vehicle.
     """
 
     def __init__(self, model: BemQuadrotor, disturbance: Disturbance, low: np.ndarray, high: np.ndarray) -> None:

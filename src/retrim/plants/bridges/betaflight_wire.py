@@ -20,7 +20,7 @@ _STATE, _STICKS, _MOTORS = struct.Struct("<18d"), struct.Struct("<d16H"), struct
 def state_packet(omega: np.ndarray) -> bytes:
     """Return a packet with body rates; a board in rate mode ignores all other values.
 
-    Its time stamp is constant. The board then uses its own clock; the jitter of varying stamps would disturb that clock.
+    Its time stamp is constant. The board then uses its own clock, which the jitter of varying stamps would disturb.
 
     Args:
         omega: Body rates, forward-left-up [rad/s].

@@ -20,7 +20,7 @@ STATES, STATUSES = 1, 2  # numbers of our blocks of the log
 STATE_S, STATUS_S = 0.01, 0.05  # [s] between two states and between two statuses
 ECHO_S = 0.1  # [s] between two measurements of the round-trip time
 AGAIN_S = 0.2  # [s] after which an unanswered request is repeated
-WRAP_MS = 1 << 24  # at which its time wraps around
+WRAP_MS = 1 << 24  # [ms], period after which its time wraps around
 LATE_S, EARLY_S = 0.5, 1.0  # [s] by which its time may go back and ahead of ours, from one message to the next
 # [m], largest plausible jump between two states; [s] for which the last state is used for this check; [m/s]
 LEAP, LEAPS_S, FASTEST = 1.0, 0.5, 20.0

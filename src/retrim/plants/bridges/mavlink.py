@@ -24,7 +24,7 @@ UNUSED = ("HIGHRES_IMU", "ATTITUDE", "ALTITUDE", "VFR_HUD", "SERVO_OUTPUT_RAW", 
 HEARD_S, READY_S, UNREADY_S = 10.0, 40.0, 12.0
 SWITCH_S, ARM_S, GO_S, LANDING_S = 5.0, 8.0, 40.0, 40.0  # [s]
 ASK_AGAIN_S = 1.0  # [s]
-LOST_S = 2.0  # [s] of silence, after which the failsafe of the autopilot has certainly taken over
+LOST_S = 2.0  # [s] of silence, after which the failsafe of the autopilot has long taken over
 THRUST_S = 2.0  # [s] over which the thrust at hover is identified
 TELL_EVERY_S = 0.05  # [s] between two position setpoints
 

@@ -27,7 +27,7 @@ WORLDS, BODIES = (LOCAL_NED, LOCAL_FRD), (BODY_FRD, BODY_NED)
 VISION, INT32, REAL32 = 2, 6, 9  # MAV_ESTIMATOR_TYPE, MAV_PARAM_TYPE
 RATES_ONLY = 128  # SET_ATTITUDE_TARGET: use thrust and body rates, ignore the attitude
 PLACE_AND_YAW = 0x9F8  # SET_POSITION_TARGET_LOCAL_NED: ignore velocity, acceleration and yaw rate
-PAIRED_S = 0.025  # [s], largest time between a position and an attitude that are combined to a state
+PAIRED_S = 0.025  # [s], largest time between a position and an attitude that are combined into a state
 MOST_NOTES = 5
 SETTLED_S = 1.0  # [s] without ODOMETRY, after which other messages are used instead
 
@@ -232,7 +232,7 @@ class MavlinkLink:
         self._attitude = message
 
     def _local_position(self, message: Any, now: float) -> None:
-        """Combine position and attitude messages to a state if the autopilot does not send ODOMETRY."""
+        """Combine position and attitude messages into a state if the autopilot does not send ODOMETRY."""
         attitude = self._attitude
         if now - self._odometry_at < SETTLED_S or attitude is None:
             return

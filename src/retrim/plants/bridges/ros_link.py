@@ -103,7 +103,7 @@ class RosLink:
         self._publisher.publish(target)
 
     def close(self) -> None:
-        """Unsubscribe; the node stays registered until the process ends."""
+        """Unregister from the topics; the node stays until the process ends."""
         for end in self._ends:
             end.unregister()
 
@@ -117,7 +117,7 @@ class RosLink:
         return taken
 
     def _odometry(self, message: Any) -> None:
-        """Process nav_msgs/Odometry: pose in its frame; twist in its child frame, the body, unless the two are equal."""
+        """Process nav_msgs/Odometry: pose in its frame, twist in its child frame (the body, unless both are equal)."""
         twist, pose = message.twist.twist, message.pose.pose
         v, omega = (np.array([a.x, a.y, a.z]) for a in (twist.linear, twist.angular))
         found = _pose(pose)
