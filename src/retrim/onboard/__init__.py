@@ -1,1 +1,1 @@
-"""What flies a vehicle in real time: NumPy and the standard library, no JAX, nothing that compiles or waits."""
+"""Real-time control of a vehicle. It uses NumPy and the standard library, and neither JAX nor compilation."""

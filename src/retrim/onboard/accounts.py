@@ -1,4 +1,4 @@
-"""Deadline accounts: how late each step began, how long it took, and what was missed."""
+"""Deadline accounts: lateness and duration of each step, and missed ticks."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ EDGES_MS = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
 
 
 def summary(seconds: np.ndarray) -> dict[str, Any]:
-    """Return p50, p99 and maximum [ms], and how many lie below each of ``EDGES_MS`` and above the last.
+    """Return p50, p99 and maximum [ms], and the counts between successive ``EDGES_MS`` and outside the first and last.
 
     Args:
         seconds: Durations [s].
@@ -25,7 +25,7 @@ def summary(seconds: np.ndarray) -> dict[str, Any]:
 
 
 def accounted(rows: np.ndarray) -> np.ndarray:
-    """Return which ticks the process that flies has reported: a step takes time, and the watchdog accounts for none.
+    """Return which ticks the control process reported; only these have a step duration, unlike those of the watchdog.
 
     Args:
         rows: Columns as in :data:`retrim.onboard.messages.COLUMNS`.
@@ -37,16 +37,16 @@ def accounted(rows: np.ndarray) -> np.ndarray:
 def blind_row(
     sample: Sample, stamp: Stamp, now: float, start: float, dt: float, u: np.ndarray, mode: Mode
 ) -> np.ndarray:
-    """Return the row of a command that answers no measurement: its state is the last one that is known, and its age.
+    """Return the row of a command without a new measurement; it contains the last known state and its age.
 
     Args:
         sample: The last measurement.
-        stamp: That of the last message of the plant, whose state may have been refused.
+        stamp: Stamp of the last message of the plant; the state of that message may have been refused.
         now: Monotonic clock [s].
         start: Time of the first measurement by the plant's clock [s].
         dt: Control tick [s].
         u: The command.
-        mode: Who flies.
+        mode: Active mode of the guard.
     """
     after = max(stamp.tick - sample.tick, int((now - sample.sent) / dt), 1)
     age = sample.age + now - sample.sent
@@ -55,7 +55,7 @@ def blind_row(
 
 
 def measured(rows: np.ndarray) -> np.ndarray:
-    """Return which ticks answered a measurement; the state of others is an old one.
+    """Return which ticks answered a measurement; the other ticks contain an old state.
 
     Args:
         rows: Columns as in :data:`retrim.onboard.messages.COLUMNS`.

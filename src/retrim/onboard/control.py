@@ -1,4 +1,4 @@
-"""What the process that flies does each tick, and what is not urgent in the time that is left."""
+"""The control loop: the urgent work of each tick, and other work in the remaining time of the tick."""
 
 import contextlib
 import time
@@ -18,14 +18,14 @@ from .plan import ControlPlan
 from .shares import PHASE, ROOM
 
 REPORT_EVERY = 5  # ticks
-GAPS = 100  # newest ones
+GAPS = 100  # the newest gaps are kept
 LANDING = "landing"
-BRIEF = PHASE / 4  # of a tick: what a decision takes at most that is rehearsed
-FELT = 0.1  # share of a tick in the mean of what is felt
+BRIEF = PHASE / 4  # of a tick: longest duration of a decision that is rehearsed
+FELT = 0.1  # weight of a tick in the running mean of the disturbance
 
 
 class ControlLoop:
-    """One flight. :meth:`tick` is the whole of it, so that a test needs no clock."""
+    """One flight. :meth:`tick` contains the whole control step, so that a test does not need a clock."""
 
     def __init__(self, plan: ControlPlan, bus: Bus) -> None:
         self.plan, self.bus = plan, bus
@@ -34,18 +34,19 @@ class ControlLoop:
         self.mode, self.reason = Mode.POLICY, ""
         self.rows: deque[np.ndarray] = deque(maxlen=plan.window)
         self.sample: Sample | None = None
-        """The newest measurement."""
+        """Newest measurement."""
         self.stamp: Stamp | None = None
-        """Of the newest measurement, even if its state was refused: the plant waits for an answer all the same."""
+        """Stamp of the newest measurement, even if its state was refused, because the plant still waits for an
+        answer."""
         self.over = False
-        """The flight has ended, and all its ticks are reported."""
+        """Whether the flight has ended and all its ticks are reported."""
         self.error = 0.0
         self.missed, self.late_samples = 0, 0  # before the landing
         self.gaps: deque[tuple[float, float, int]] = deque(maxlen=GAPS)
-        """From when to when ticks were missed [s, monotonic], and how many."""
+        """Gaps in the ticks: start and end [s, monotonic], and number of missed ticks."""
         self.felt, self.estimate = np.zeros(3), np.zeros(3)
-        """Acceleration that the simple model misses, over the last tenths of a second, and what the residual model says
-        of it, world [m/s^2]."""
+        """Acceleration error of the simple model over the last tenths of a second, and its estimate by the residual
+        model, world [m/s^2]."""
         self.stages: deque[tuple[float, int, int]] = deque(maxlen=GAPS)
         """Changes of the controller's stage: time since the start [s], stage, cause."""
         self._fallback = Fallback(GeometricHover(plan.limits, plan.dt))
@@ -55,14 +56,14 @@ class ControlLoop:
         self._known = {"sample": 0, "order": 0, "learning": 0}
         self._landing, self._gap, self._ticks = "", "", 0
         self._ended: tuple[Sample, Sample] | None = None
-        self._usual = float("inf")  # [s] for a decision
+        self._usual = float("inf")  # usual duration of a decision [s]
 
     def new_sample(self) -> bool:
-        """Return whether there is a measurement that has not been answered."""
+        """Return whether there is an unanswered measurement."""
         return self.bus.latest("sample", self._known["sample"]) is not None
 
     def warm_up(self) -> None:
-        """Touch every program, before it is urgent.
+        """Run every program once before the flight, so that its first call in flight is not slow.
 
         Raises:
             PlantError: The controller is too slow for its tick.
@@ -86,7 +87,7 @@ class ControlLoop:
             )
 
     def tick(self, now: float, lateness: float = 0.0) -> Setpoint | None:
-        """Take the newest sample, decide, and return what was published; None before the first sample."""
+        """Read the newest sample, compute and publish the command, and return it; None before the first sample."""
         began, new = time.monotonic(), self._receive()
         sample, stamp = self.sample, self.stamp
         if sample is None or stamp is None:
@@ -108,20 +109,20 @@ class ControlLoop:
         elif self.mode in (Mode.BLIND, Mode.DROP):
             self._finish_row(None)
             self.rows.append(blind_row(sample, stamp, now, self._start, self.plan.dt, self._issued, self.mode))
-        if setpoint.landed:  # the plant ends the flight at this command, and the recorder the log: the ticks go first
+        if setpoint.landed:  # publish the ticks first: plant and recorder end flight and log at this command
             self._finish_row(None)
             self._publish_rows()
             self.bus.publish("setpoint", setpoint.pack())
         return setpoint
 
     def rehearse(self) -> None:
-        """Do for nobody what the next measurement will need, so that the caches of the processor hold it by then."""
+        """Run the computation of the next measurement and discard its result, to fill the caches of the processor."""
         if (sample := self.sample) is not None and self.mode == Mode.POLICY and self._usual < BRIEF * self.plan.dt:
             self.pilot.rehearse(sample.t - self._start, sample.age, sample.state)
             self.plan.limits.broken(Sample.unpack(sample.pack()).state)
 
     def idle(self) -> None:
-        """Do what is not urgent: orders, new parameters, reports."""
+        """Do the work that is not urgent: orders, new parameters, reports."""
         began = time.monotonic()
         t = 0.0 if self.sample is None else self.sample.t - self._start
         if (order := self._new("order")) is not None and order.get("order") == "land":
@@ -136,9 +137,9 @@ class ControlLoop:
         self._ticks += 1
         ended = self.bus.latest("ended") is not None and not self.new_sample()
         self.over = self.mode in OVER or ended
-        if self.over:  # no measurement will come that says what the plant took
+        if self.over:  # no later measurement will report the command that the plant accepted
             self._finish_row(None)
-        self._publish_rows()  # each tick, so that the log has the last one, whenever this process dies
+        self._publish_rows()  # each tick, so that the log contains the last one whenever this process dies
         if self._ticks % REPORT_EVERY == 1 or self.over:
             self.report()
         if self._row is not None:
@@ -156,11 +157,11 @@ class ControlLoop:
         ))  # fmt: skip
 
     def land(self, reason: str) -> None:
-        """Land from now on."""
+        """Start the landing."""
         self._landing = self._landing or reason
 
     def _policy(self, sample: Sample, t: float, age: float, new: bool) -> np.ndarray | None:
-        """Return the policy's command, or None, with the reason noted, if it must not fly any more."""
+        """Return the policy's command; record the reason and return None if the policy must not fly any more."""
         limits = self.plan.limits
         wrong = self._landing or self._gap
         if age > limits.state_age:
@@ -186,7 +187,7 @@ class ControlLoop:
         return None
 
     def _aim(self, t: float) -> bool:
-        """Take note of where the vehicle should be, and return whether that is a place; if not, the last one stays."""
+        """Update the target position and return whether the new one is finite; if not, keep the last one."""
         target = self.pilot.target(t)
         if finite := bool(np.isfinite(target).all()):
             self._target = target
@@ -219,7 +220,7 @@ class ControlLoop:
         return True
 
     def _follow(self, before: Sample, sample: Sample) -> None:
-        """Take note of what the plant says of the tick that has ended."""
+        """Process the plant's report about the past tick: accepted command and missed ticks."""
         accepted, lost = np.asarray(sample.accepted), sample.tick - before.tick - 1
         if lost and not self._landing:
             self.missed += lost
@@ -233,7 +234,7 @@ class ControlLoop:
         self._ended = None if lost else (before, sample)
 
     def _watch(self) -> None:
-        """Judge the tick that has ended by what its measurement says."""
+        """Evaluate the past tick with its measurement: model errors and distance from the target."""
         if self._ended is None:
             return
         (before, sample), self._ended = self._ended, None
@@ -249,7 +250,7 @@ class ControlLoop:
             self.intake.watch(float(np.linalg.norm(sample.state[:3] - target)), missed)
 
     def _finish_row(self, accepted: np.ndarray | None) -> None:
-        """Add the last tick to the report, with the command that the plant took where it is known."""
+        """Add the last tick to the report, with the command that the plant accepted if it is known."""
         if self._row is None:
             return
         if accepted is not None:

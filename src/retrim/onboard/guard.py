@@ -1,4 +1,4 @@
-"""The guard: limits of a flight, and what flies when one is broken. It needs no learning and no policy."""
+"""The guard: limits of a flight, and the fallback controller. It needs neither learning nor a policy."""
 
 from dataclasses import dataclass, field
 from enum import IntEnum
@@ -9,60 +9,60 @@ G = 9.81  # [m/s^2]
 HOVER = np.array([G, 0.0, 0.0, 0.0])
 UP = np.array([0.0, 0.0, 1.0])
 FELT_TAU = 0.2  # [s]
-BLIND_S = 2.0  # [s], after which a vehicle whose state nobody knows is stopped
+BLIND_S = 2.0  # [s], after which a vehicle with an unknown state is stopped
 
 
 class Mode(IntEnum):
-    """Who flies."""
+    """Active controller or state of the flight."""
 
     POLICY = 0
     HOLD = 1
-    """The geometric controller, at the place of the reference."""
+    """Geometric controller, at the position of the reference."""
     DESCEND = 2
-    """The geometric controller, sinking."""
+    """Geometric controller, sinking."""
     BLIND = 3
-    """Nobody knows the state: level by what was known last, sinking."""
+    """The state is unknown: level by the last known attitude, sinking."""
     LANDED = 4
     WATCHDOG = 5
-    """The watchdog's fallback: the process that flew is dead."""
+    """Fallback of the watchdog, because the control process is dead."""
     DROP = 6
-    """The motors stop wherever the vehicle is: nobody has known its state for too long."""
+    """The motors stop wherever the vehicle is, because its state has been unknown for too long."""
 
 
 OVER = Mode.LANDED, Mode.DROP
-"""After these nothing is commanded any more."""
+"""Modes that end the flight; commands are not sent after them."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What a flight must keep to."""
+    """Limits of a flight."""
 
     low: np.ndarray
-    """Corner of the geofence, world [m]."""
+    """Lower corner of the geofence, world [m]."""
     high: np.ndarray
-    """The other one."""
+    """Upper corner of the geofence, world [m]."""
     u_min: np.ndarray
-    """Smallest command [c, omega] that the vehicle takes."""
+    """Smallest command [c, omega] that the vehicle accepts."""
     u_max: np.ndarray
-    """Largest one."""
+    """Largest command [c, omega] that the vehicle accepts."""
     floor: float = 0.1
-    """Height at which the vehicle has landed [m]."""
+    """Height at which the vehicle counts as landed [m]."""
     tilt: float = 1.4
-    """Angle between thrust and vertical [rad]."""
+    """Largest angle between thrust and vertical [rad]."""
     speed: float = 15.0
-    """[m/s]"""
+    """Largest speed [m/s]."""
     state_age: float = 0.1
-    """Age of the newest measurement [s]."""
+    """Largest age of the newest measurement [s]."""
     policy_age: float = float("inf")
-    """Flight time since the newest measurement that the policy was learnt from [s]."""
+    """Largest flight time since the newest measurement in the training data of the policy [s]."""
 
     def within(self, u: np.ndarray) -> np.ndarray:
-        """Return a command [c, omega] as the vehicle takes it."""
+        """Return a command [c, omega], clipped to the limits of the vehicle."""
         taken: np.ndarray = np.clip(u, self.u_min, self.u_max)
         return taken
 
     def broken(self, x: np.ndarray) -> str | None:
-        """Return which limit a state breaks, in words; None if it keeps them all.
+        """Return a description of the limit that a state breaks; None if it is within all limits.
 
         Args:
             x: p, R by rows, v.
@@ -80,21 +80,24 @@ class Limits:
 
 @dataclass
 class GeometricHover:
-    """Holds a place by thrust and body rates, with integral action (Lee et al. 2010, attitude as a rotation vector)."""
+    """Holds a position by thrust and body rates, with integral action.
+
+    The controller is that of Lee et al. 2010, with the attitude as a rotation vector.
+    """
 
     limits: Limits
     dt: float
     integral: np.ndarray = field(default_factory=lambda: np.zeros(3))
     felt: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    """What pushes the vehicle, low-passed, world [m/s^2]."""
+    """Low-pass filtered acceleration by external disturbances, world [m/s^2]."""
 
     def feel(self, before: np.ndarray, after: np.ndarray, u: np.ndarray) -> None:
-        """Take note of one tick: by how much the vehicle was accelerated beyond thrust and gravity.
+        """Update the disturbance estimate with one tick: the acceleration beyond thrust and gravity.
 
         Args:
-            before: State at its start: p, R by rows, v.
-            after: State at its end.
-            u: Command that acted.
+            before: State at the start of the tick: p, R by rows, v.
+            after: State at the end of the tick.
+            u: Command that acted during the tick.
         """
         a = (after[12:15] - before[12:15]) / self.dt - u[0] * before[3:12].reshape(3, 3)[:, 2] + G * UP
         if np.isfinite(a).all():
@@ -105,8 +108,8 @@ class GeometricHover:
 
         Args:
             x: p, R by rows, v.
-            target: Where to be, world [m].
-            velocity: How the target moves, world [m/s]; None: not at all.
+            target: Target position, world [m].
+            velocity: Velocity of the target, world [m/s]; None if the target does not move.
         """
         p, R, v = x[:3], x[3:12].reshape(3, 3), x[12:15]
         error = np.clip(target - p, -1.0, 1.0)
@@ -123,7 +126,7 @@ def turn(R: np.ndarray, along: np.ndarray) -> np.ndarray:
     d = R.T @ along
     sine = np.hypot(d[0], d[1])
     angle = np.arctan2(sine, d[2])
-    if sine < 1e-9:  # upright, or upside down, where any way round is as short
+    if sine < 1e-9:  # upright, or upside down, where all directions of rotation are equally short
         return np.zeros(3) if d[2] > 0 else np.array([angle, 0.0, 0.0])
     rotation: np.ndarray = angle / sine * np.array([-d[1], d[0], 0.0])
     return rotation
@@ -131,33 +134,33 @@ def turn(R: np.ndarray, along: np.ndarray) -> np.ndarray:
 
 @dataclass
 class Fallback:
-    """What flies when the policy must not: hold, then sink, then stop. A plain sequence, by the clock."""
+    """Fallback controller if the policy must not fly: hold, then sink, then stop. A simple timed sequence."""
 
     hover: GeometricHover
     hold_s: float = 2.0
     sink: float = 0.5
-    """[m/s]"""
+    """Sink rate [m/s]."""
     still_s: float = 0.0
-    """Time for which it has sunk without moving [s]: it stands on something."""
+    """Time for which the vehicle has not moved during the descent [s], because it stands on something."""
     sinking_s: float = 0.0
     since: float = 0.0
-    """Time for which it has flown [s]."""
+    """Time for which the fallback has been active [s]."""
     blind_s: float = 0.0
     place: np.ndarray | None = None
-    """Where it holds, and from where it sinks."""
+    """Position that it holds, and start of the descent."""
 
     def rest(self) -> None:
-        """Take note that somebody else flies: the next step is the first one of a new sequence."""
+        """Reset, because another controller is active: the next step is the first one of a new sequence."""
         self.since, self.blind_s, self.sinking_s, self.still_s, self.place = 0.0, 0.0, 0.0, 0.0, None
         self.hover.integral[:] = 0.0
 
     def step(self, x: np.ndarray, fresh: bool, target: np.ndarray, *, land: bool) -> tuple[np.ndarray, Mode]:
-        """Return the command of one more tick.
+        """Return the command of the next tick.
 
         Args:
             x: Last known state: p, R by rows, v.
-            fresh: Whether it is known now.
-            target: Where the vehicle should be now, world [m]; where it should have been at the first call is held.
+            fresh: Whether the state is recent.
+            target: Current target position, world [m]; the target of the first call is held.
             land: Whether to sink at once.
         """
         if self.place is None:
@@ -169,7 +172,7 @@ class Fallback:
         if self._down(x, fresh):
             return np.zeros(4), Mode.LANDED
         if not fresh:
-            # Turned level within a quarter of a second of what was known; after that, straight on and gently down.
+            # Level for a quarter of a second by the last known attitude; after that zero rates and a slow descent.
             rates = 4.0 * turn(x[3:12].reshape(3, 3), UP) if self.blind_s <= 0.25 else np.zeros(3)
             return self.hover.limits.within(np.concatenate([[0.95 * G], rates])), Mode.BLIND
         if land or self.since > self.hold_s:
@@ -179,7 +182,7 @@ class Fallback:
         return self.hover.command(x, self.place), Mode.HOLD
 
     def _down(self, x: np.ndarray, fresh: bool) -> bool:
-        """Whether a vehicle that has been sinking is at the floor, or stands on something."""
+        """Return whether a sinking vehicle has reached the floor or stands on something."""
         if not fresh or self.sinking_s < 0.2:
             return False
         moving = float(np.abs(x[12:15]).max()) > 0.1

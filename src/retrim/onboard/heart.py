@@ -1,7 +1,8 @@
-"""Heartbeats: each process of a flight says many times in a second that its main loop goes on.
+"""Heartbeats: each process of a flight reports many times per second that its main loop is running.
 
-Plant and control need none beside what they publish each tick. A loop that computes for seconds has a thread that beats
-for it, for as long as the loop said beforehand: a loop that hangs is silent, even where its threads go on.
+The messages that plant and control publish each tick serve as their heartbeats. A loop that computes for seconds has a
+thread that sends its heartbeats, but only for the time that the loop announced beforehand. A loop that hangs therefore
+becomes silent even if its threads continue.
 """
 
 import contextlib
@@ -13,30 +14,30 @@ from ..errors import MessageError
 from ..transport.bus import Bus
 from .messages import pack_note
 
-EVERY = 0.1  # [s] between two beats
+EVERY = 0.1  # [s] between two heartbeats
 
 
 def beat_topic(role: str) -> str:
-    """Return the topic that says that a process goes on."""
+    """Return the topic of the heartbeats of a process."""
     return {"plant": "sample", "control": "setpoint"}.get(role, f"beat.{role}")
 
 
 class Heart:
-    """Beats when a main loop comes by."""
+    """Sends heartbeats when the main loop calls it."""
 
     def __init__(self, bus: Bus, role: str, clock: Callable[[], float] = time.monotonic) -> None:
-        """Build it for a process.
+        """Build a sender of heartbeats for a process.
 
         Args:
-            bus: Of the flight; without a topic for the beats of the role nothing is said.
-            role: Of the process.
-            clock: The time [s].
+            bus: Bus of the flight; if it has no topic for the heartbeats of the role, they are not published.
+            role: Role of the process.
+            clock: Function that returns the time [s].
         """
         self._bus, self._topic, self._clock = bus, beat_topic(role), clock
         self._count, self._next = 0, float("-inf")
 
     def beat(self) -> None:
-        """Say that the loop goes on, unless that was said a moment ago."""
+        """Publish a heartbeat unless the last one is recent."""
         now = self._clock()
         if now < self._next:
             return
@@ -46,16 +47,16 @@ class Heart:
 
 
 class Pacemaker:
-    """Beats in a thread of its own while a main loop is within the time that it gave itself."""
+    """Sends heartbeats from its own thread while the main loop is within its announced time."""
 
     def __init__(self, bus: Bus, role: str, clock: Callable[[], float] = time.monotonic) -> None:
-        """Build it for a process; the thread runs while this is a context."""
+        """Build a pacemaker for a process; its thread runs while the context is open."""
         self._heart, self._clock = Heart(bus, role, clock), clock
         self._until, self._over = float("-inf"), threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
 
     def __enter__(self) -> "Pacemaker":
-        """Begin to beat."""
+        """Start the thread."""
         self._thread.start()
         return self
 
@@ -65,11 +66,11 @@ class Pacemaker:
         self._thread.join()
 
     def touch(self, allowance: float) -> None:
-        """Take note that the main loop goes on, and comes by again within ``allowance`` [s]."""
+        """Record that the main loop is running and will call again within ``allowance`` [s]."""
         self._until = self._clock() + allowance
 
     def beat(self) -> None:
-        """Beat if the main loop is not late."""
+        """Send a heartbeat if the main loop is not late."""
         if self._clock() <= self._until:
             self._heart.beat()
 

@@ -1,4 +1,8 @@
-"""What comes from the learners: taken if it may be flown, refused, counted and named if not, taken back if it harms."""
+"""Intake of parameters from the learners.
+
+Valid parameters are passed to the pilot. Invalid ones are refused and counted by reason. Policies that fly clearly
+worse than the last proven one are rolled back.
+"""
 
 from collections import deque
 from typing import Any
@@ -10,20 +14,20 @@ from .pilot import LivePilot
 from .rollback import FlownError
 from .topics import REFERENCE, UNLEARNED, VEHICLE
 
-AHEAD = 1.0  # [s] that parameters may seem to come from the time to come
-IN_TIME = 0.7  # [s] in which a reference must be taken, before it leaves the one that is followed
-REMEMBERED = 50  # swaps in a report, which comes ten times a second
+AHEAD = 1.0  # [s] by which the time stamp of parameters may lie in the future
+IN_TIME = 0.7  # [s] in which a reference must be taken, before it departs from the current one
+REMEMBERED = 50  # swaps in a report, which is published ten times a second
 
 
 class Intake:
-    """New parameters of the controller that flies."""
+    """New parameters of the active controller."""
 
     def __init__(self, pilot: LivePilot, bus: Bus, base: str, dt: float) -> None:
         """Build an intake.
 
         Args:
-            pilot: What flies.
-            bus: Where parameters come from.
+            pilot: Pilot that receives the parameters.
+            bus: Bus that the parameters are published on.
             base: Hash of the controller.
             dt: Control tick [s].
         """
@@ -39,12 +43,12 @@ class Intake:
 
     @property
     def learnt(self) -> float:
-        """Flight time of the newest measurement that the policy that flies was learnt from [s]."""
+        """Flight time of the newest measurement in the training data of the active policy [s]."""
         return self._computed_from.get(self.pilot.versions.get("policy", 0), 0.0)
 
     @property
     def open(self) -> bool:
-        """Whether what was learnt is flown; if not, what flies is what took off."""
+        """Whether the learned parameters are in use; if not, the controller uses those of take-off."""
         return self._open
 
     @open.setter
@@ -58,7 +62,7 @@ class Intake:
             self.pilot.restart()
 
     def poll(self, t: float) -> None:
-        """Take what has come by time ``t`` of the flight [s], if it may be flown."""
+        """Read the parameters that have arrived by flight time ``t`` [s], and take them if they are valid."""
         for half in self._known:
             if half not in UNLEARNED and not self._open:
                 continue
@@ -83,11 +87,11 @@ class Intake:
                     self._take(found, t)
 
     def watch(self, error: float, missed: float) -> None:
-        """Take what a tick of the policy says, and take back what flies clearly worse.
+        """Process the result of one tick of the policy, and roll back policies that fly clearly worse.
 
         Args:
             error: Distance from the target [m].
-            missed: By how much the corrected model misses the acceleration [m/s^2].
+            missed: Acceleration error of the corrected model [m/s^2].
         """
         found = self._flown.take(error, missed)
         if found.proven is not None:
@@ -107,7 +111,7 @@ class Intake:
             return
         self.pilot.swap(found)
         if found.half == REFERENCE:
-            self._flown = FlownError(self._dt)  # an error on another reference says nothing of the policies before it
+            self._flown = FlownError(self._dt)  # errors on different references are not comparable
             return
         if found.half == VEHICLE:
             return

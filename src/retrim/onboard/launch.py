@@ -1,4 +1,4 @@
-"""Processes of a live flight: started with a plan, deaf to Ctrl-C, which is the supervisor's to answer."""
+"""Start of the processes of a live flight. They receive a plan and ignore Ctrl-C, which the supervisor handles."""
 
 import contextlib
 import importlib
@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 PYTHON = (sys.executable, "-P", "-m")
-"""Runs a module of this package: what lies in the current folder has no part in it."""
+"""Command that runs a module of this package; files of the current folder cannot shadow its modules."""
 
 
 def module_path() -> str:
-    """Return where a process of this one finds modules: as this one does, but the current folder comes last.
+    """Return the module path of a child process: the path of this process, with the current folder moved to the end.
 
-    A module of the user's own may lie there. A ``numpy.py`` beside it is not taken for NumPy.
+    The current folder may contain a module of the user. A ``numpy.py`` in the same folder does not replace NumPy.
     """
     here, places = os.path.realpath(os.curdir), [place for place in sys.path if place]
     last = [place for place in places if os.path.realpath(place) == here]
@@ -24,13 +24,13 @@ def module_path() -> str:
 
 
 def launch(main: str, plan: Any, complaints: Path, cores: set[int] | None = None) -> "subprocess.Popen[bytes]":
-    """Start a process of this machine.
+    """Start a process on this machine.
 
     Args:
         main: ``module:function`` that takes the plan.
-        plan: What it is started with; it travels from this process to its own child and to nobody else.
-        complaints: File for what it writes to its standard outputs.
-        cores: Where it may run, from the start: importing is work, too. None for anywhere.
+        plan: Argument of the function; this process sends it only to its own child.
+        complaints: File for the standard output and standard error of the process.
+        cores: Cores that it may use from the start, since imports also take computing time. None for all cores.
 
     Returns:
         The process.
@@ -50,13 +50,13 @@ def launch(main: str, plan: Any, complaints: Path, cores: set[int] | None = None
         with contextlib.suppress(OSError):
             os.sched_setaffinity(process.pid, cores)
     assert process.stdin is not None
-    with contextlib.suppress(BrokenPipeError), process.stdin as pipe:  # it has died already; whoever waits will see
+    with contextlib.suppress(BrokenPipeError), process.stdin as pipe:  # if it has died, those who wait for it notice
         pickle.dump(plan, pipe)
     return process
 
 
 def _opened(complaints: Path) -> BinaryIO:
-    """Open a file to append to it; where its folder cannot be written any more, what is said is lost."""
+    """Open a file to append to it; if its folder is not writable, open the null device instead."""
     try:
         complaints.parent.mkdir(parents=True, exist_ok=True)
         return complaints.open("ab")

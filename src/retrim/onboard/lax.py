@@ -1,4 +1,4 @@
-"""What NumPy has no function for, of the operations that controllers are made of; semantics of :mod:`jax.lax`."""
+"""Operations of controllers for which NumPy has no function, with the semantics of :mod:`jax.lax`."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -15,7 +15,8 @@ def logistic(x: Any) -> Any:
 
 def erf_inv(x: Any) -> Any:
     """Return the inverse of the error function."""
-    from scipy import special  # here: it takes as long to import as all of retrim; programs are run before they fly
+    # Local, because it takes as long to import as all of retrim. Every program is run once before the flight.
+    from scipy import special
 
     return special.erfinv(x)
 
@@ -26,7 +27,7 @@ def integer_div(a: Any, b: Any) -> Any:
 
 
 def to_integer(x: Any, dtype: str) -> Any:
-    """Return floats as integers, rounded towards zero: beyond the range its end, and 0 for what is no number."""
+    """Return floats as integers, rounded towards zero and clamped to the range; NaN becomes 0."""
     x, range_ = np.asarray(x, dtype=float), np.iinfo(dtype)
     inside = np.where((x > range_.min) & (x < range_.max), x, 0.0).astype(dtype)
     low, high = np.array(range_.min, dtype), np.array(range_.max, dtype)
@@ -34,7 +35,7 @@ def to_integer(x: Any, dtype: str) -> Any:
 
 
 def pad(x: Any, value: Any, config: Sequence[tuple[int, int, int]]) -> Any:
-    """Pad with (low, high, interior) per axis; negative values cut."""
+    """Pad with (low, high, interior) per axis; negative values crop."""
     x = np.asarray(x)
     shape = [
         max(0, low + high + n + max(0, n - 1) * inside) for n, (low, high, inside) in zip(x.shape, config, strict=True)
@@ -75,17 +76,17 @@ def gather(
     fill: bool,
     value: float | int | None = None,
 ) -> Any:
-    """Return slices of ``x`` at ``indices``, whose last axis is one index vector each.
+    """Return slices of ``x`` at ``indices``, whose last axis holds one index vector.
 
     Args:
-        x: What is gathered from.
+        x: Source array.
         indices: Start of each slice.
         offset: Axes of the result that are axes of a slice.
         collapsed: Axes of a slice that are dropped.
-        start_map: Which axis of ``x`` each number of an index vector is for.
+        start_map: Axis of ``x`` for each number of an index vector.
         sizes: Size of a slice.
-        fill: A slice that does not lie inside is full of ``value``; else it is moved in.
-        value: By default not a number, or the smallest signed or largest unsigned integer, or true.
+        fill: Whether a slice that exceeds the array is filled with ``value``; otherwise it is moved inside.
+        value: Fill value; by default NaN, the smallest signed or largest unsigned integer, or true.
     """
     x, indices = np.asarray(x), np.asarray(indices)
     batch = indices.shape[:-1]
@@ -108,7 +109,7 @@ def gather(
 
 
 def scatter(x: Any, indices: Any, updates: Any, window: Index, inserted: Index, dims: Index) -> Any:
-    """Return a copy of ``x`` with ``updates`` written at ``indices``; what does not lie inside is dropped."""
+    """Return a copy of ``x`` with ``updates`` written at ``indices``; updates that exceed the array are dropped."""
     out, indices, updates = np.array(x), np.asarray(indices), np.asarray(updates)
     batch_axes = [axis for axis in range(updates.ndim) if axis not in window]
     updates = updates.transpose([*batch_axes, *window])

@@ -1,4 +1,4 @@
-"""The file of a log: whole lines only, and noticed when somebody takes it away."""
+"""The file of a log: it contains whole lines only, and its removal is detected."""
 
 import contextlib
 import os
@@ -8,14 +8,14 @@ from pathlib import Path
 from .messages import COLUMNS
 
 HEADER = (",".join(COLUMNS) + "\n").encode()
-TAIL = 2**22  # bytes: as much as reports may repeat
+TAIL = 2**22  # bytes; at least the amount that reports may repeat
 
 
 def log_path(path: Path, spare: Sequence[Path]) -> Path:
-    """Return where a log is: in its place, or in the last temporary folder that it went to.
+    """Return the path of a log: the given path, or the last temporary folder that contains it.
 
     Args:
-        path: Its place.
+        path: Regular path of the log.
         spare: Temporary folders, in the order in which they are tried.
     """
     found = [folder / path.name for folder in spare if (folder / path.name).exists()]
@@ -23,17 +23,17 @@ def log_path(path: Path, spare: Sequence[Path]) -> Path:
 
 
 class LogFile:
-    """A file that stays open, so that what is written can be read even after it was removed."""
+    """A file that stays open, so that its content can be read even after its removal."""
 
     def __init__(self, path: Path, *, new: bool = False) -> None:
-        """Open a log, without a torn last line, or begin it with its header.
+        """Open a log and remove an incomplete last line, or create a log with its header.
 
         Args:
             path: The file.
-            new: Begin it without the header, and only if there is none.
+            new: Create the file without the header, and fail if it exists.
 
         Raises:
-            OSError: It cannot be written.
+            OSError: The file cannot be written.
         """
         flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | (os.O_EXCL if new else 0)
         self.path, self._file = path, os.open(path, flags, 0o666)
@@ -48,10 +48,10 @@ class LogFile:
             raise
 
     def append(self, lines: bytes) -> None:
-        """Write lines, all of them or none.
+        """Write lines; if that fails, remove those that were partly written.
 
         Raises:
-            OSError: They cannot be written, or the file is not in its place any more.
+            OSError: The lines cannot be written, or the file is not at its path any more.
         """
         there, mine = os.stat(self.path), os.fstat(self._file)
         if (there.st_ino, there.st_dev) != (mine.st_ino, mine.st_dev):
@@ -65,11 +65,11 @@ class LogFile:
             raise
 
     def all(self) -> bytes:
-        """Return all that is written."""
+        """Return the whole content."""
         return os.pread(self._file, os.fstat(self._file).st_size, 0)
 
     def tail(self) -> bytes:
-        """Return the end of what is written, from the beginning of a line."""
+        """Return the end of the content, from the beginning of a line."""
         size = os.fstat(self._file).st_size
         data = os.pread(self._file, TAIL, max(0, size - TAIL))
         return data if size <= TAIL else data[data.find(b"\n") + 1 :]

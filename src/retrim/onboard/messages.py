@@ -1,4 +1,4 @@
-"""What the processes of a live flight tell each other: frozen values that turn into bytes and back."""
+"""Messages between the processes of a live flight: frozen values that are converted to bytes and back."""
 
 import json
 from collections.abc import Mapping
@@ -14,28 +14,28 @@ from .note_fields import plain, read_fields
 
 STATE = 15  # p, R by rows, v
 STOPPED = "stopped without measurements"
-"""How the reason begins why a flight ended whose vehicle was dropped."""
+"""Beginning of the reason for the end of a flight if the motors were stopped in the air."""
 
 
 class StaleError(MessageError):
-    """A whole message that is not newer than what is known."""
+    """An intact message that is not newer than the last one that was read."""
 
 
 @dataclass(frozen=True)
 class Stamp:
-    """What an answer to a sample needs to know of it, whether or not its state is finite."""
+    """Tick and send time of a sample; an answer needs both, even if the state of the sample is not finite."""
 
     tick: int
     """Ticks since the start of the flight."""
     sent: float
-    """When it was sent, by the monotonic clock of the machine [s]."""
+    """Send time, monotonic clock of the machine [s]."""
 
     @classmethod
     def unpack(cls, data: bytes) -> "Stamp":
-        """Read the stamp of a sample, whose other numbers may be anything.
+        """Read the stamp of a sample and ignore its other numbers, which may not be finite.
 
         Raises:
-            MessageError: The bytes are no sample, or the stamp is not finite.
+            MessageError: The bytes are not a sample, or the stamp is not finite.
         """
         row = _numbers(data)
         if not np.isfinite(row[[0, 2]]).all():
@@ -45,27 +45,27 @@ class Stamp:
 
 @dataclass(frozen=True)
 class Sample:
-    """What the plant measured at the end of a tick."""
+    """Measurement of the plant at the end of a tick."""
 
     tick: int
     """Ticks since the start of the flight."""
     t: float
     """Time by the plant's clock [s]."""
     sent: float
-    """When it was sent, by the monotonic clock of the machine [s]."""
+    """Send time, monotonic clock of the machine [s]."""
     age: float
     """Time since the state was valid [s]."""
     state: np.ndarray
     """p [m], R by rows, v [m/s], world."""
     truth: np.ndarray
-    """The same, true where the plant knows it; for scores, never for pilots."""
+    """The same, but the true state if the plant has it; used for scores, never by pilots."""
     accepted: np.ndarray
-    """Command [c, omega] that was taken for the tick that has ended; a delay of the plant lets it act later."""
+    """Command [c, omega] that the plant accepted for the past tick; with a command delay it acts later."""
 
     def pack(self) -> bytes:
         """Return the bytes; the inverse of :meth:`unpack`."""
         row = np.concatenate([[self.tick, self.t, self.sent, self.age], self.state, self.truth, self.accepted])
-        # as bits, so that the checksum proves the stamp of a sample whose state is not finite, too
+        # as bits, so that the checksum also covers the stamp of a sample whose state is not finite
         return pack_arrays({"row": row.view(np.int64)}, kind="sample", about={})
 
     @classmethod
@@ -73,7 +73,7 @@ class Sample:
         """Read a sample.
 
         Raises:
-            MessageError: The bytes are not one, or a number is not finite.
+            MessageError: The bytes are not a sample, or a number is not finite.
         """
         row = _numbers(data)
         if not (finite := np.isfinite(row)).all():
@@ -83,27 +83,27 @@ class Sample:
 
 
 def _numbers(data: bytes) -> np.ndarray:
-    """Return the numbers of a whole sample, which may not be finite."""
+    """Return the numbers of an intact sample; they may not be finite."""
     expected = {"row": np.empty(8 + 2 * STATE, dtype=np.int64)}
     return unpack_arrays(data, expected, kind="sample", source="sample")["row"].view(float)
 
 
 @dataclass(frozen=True)
 class Setpoint:
-    """A command on its way to the plant."""
+    """A command to the plant."""
 
     tick: int
-    """Sample that it answers."""
+    """Tick of the sample that it answers."""
     sent: float
-    """Monotonic clock [s]."""
+    """Send time, monotonic clock [s]."""
     u: np.ndarray
     """c [m/s^2], omega [rad/s]."""
     target: np.ndarray
-    """Where the vehicle should be now, world [m]; who takes over holds it there."""
+    """Current target position, world [m]; a controller that takes over holds the vehicle there."""
     landed: bool = False
-    """The vehicle has landed, or shall fall: the plant stops."""
+    """The vehicle has landed, or must be dropped: the plant stops."""
     blind: bool = False
-    """It shall fall, since nobody knows its state."""
+    """The vehicle must be dropped because its state is unknown."""
 
     def pack(self) -> bytes:
         """Return the bytes; the inverse of :meth:`unpack`."""
@@ -115,16 +115,16 @@ class Setpoint:
         """Read a command.
 
         Raises:
-            MessageError: The bytes are not one, or a number is not finite.
+            MessageError: The bytes are not a command, or a number is not finite.
         """
         row = unpack_arrays(data, {"row": np.empty(11)}, kind="setpoint", source="setpoint")["row"]
         return cls(int(row[0]), float(row[1]), row[3:7], row[7:10], bool(row[2]), bool(row[10]))
 
     def ending(self, height: float) -> str:
-        """Return why the flight is over, for its last command.
+        """Return the reason for the end of the flight; this is its last command.
 
         Args:
-            height: Last one that is known [m].
+            height: Last known height [m].
         """
         return f"{STOPPED} at {height:.2f} m" if self.blind else "landed"
 
@@ -136,16 +136,17 @@ COLUMNS = (
     *("c", "omega0", "omega1", "omega2"),
     *("lateness", "step", "idle", "state_age", "policy_age", "mode"),
 )
-"""Of a tick in a report and in the log: idle is how long the work took that is not urgent; times are in seconds."""
+"""Columns of a tick in a report and in the log. ``idle`` is the duration of work that is not urgent. Times are in
+seconds."""
 MEASURED, TRUE = slice(3, 3 + STATE), slice(3 + STATE, 3 + 2 * STATE)
 COMMAND = slice(3 + 2 * STATE, 7 + 2 * STATE)
 ACCOUNTS = {name: COLUMNS.index(name) for name in ("lateness", "step", "idle", "state_age", "policy_age")}
-MOST_TICKS = 10_000  # in a report
+MOST_TICKS = 10_000  # largest number of ticks in a report
 
 
 @dataclass(frozen=True)
 class FlightRows:
-    """The last ticks of a flight, oldest first; each has the command that followed its measurement."""
+    """The last ticks of a flight, oldest first; each row contains the command that followed its measurement."""
 
     rows: np.ndarray
     """One row per tick, columns as in ``COLUMNS``."""
@@ -159,7 +160,7 @@ class FlightRows:
         """Read rows.
 
         Raises:
-            MessageError: The bytes are none.
+            MessageError: The bytes are not rows of a flight.
         """
         ticks = describe(data, kind="flight", source="flight").get("ticks", "")
         if not ticks.isdecimal() or len(ticks) > 6 or int(ticks) > MOST_TICKS:
@@ -170,18 +171,18 @@ class FlightRows:
 
 @dataclass(frozen=True)
 class Parameters:
-    """New parameters of one half of a controller: ``policy`` or ``residual``."""
+    """New parameters of one part (``half``) of a controller, for example ``policy`` or ``residual``."""
 
     half: str
     version: int
-    """It rises; what is not newer is stale."""
+    """Increasing number; a message with a version that is not newer is stale."""
     base: str
-    """Hash of what the receiver was started with: parameters for another controller are foreign."""
+    """Hash of the controller that the receiver was started with; parameters for another controller are refused."""
     computed_from: float
-    """Flight time of the newest measurement that they were learnt from [s]."""
+    """Flight time of the newest measurement in their training data [s]."""
     arrays: Mapping[str, Any] = field(repr=False)
     parent: int = 0
-    """Version that they were trained from; 0 for that of take-off."""
+    """Version that their training started from; 0 for the version at take-off."""
 
     def pack(self) -> bytes:
         """Return the bytes; the inverse of :meth:`unpack`."""
@@ -198,13 +199,13 @@ class Parameters:
         Args:
             data: Bytes of a message.
             expected: Shape and type of each array.
-            half: Which half they should be for.
-            base: Hash that they should name.
-            after: Newest version that was looked at.
+            half: Part of the controller that they should be for.
+            base: Hash that they should contain.
+            after: Newest version that was read.
 
         Raises:
-            MessageError: They are truncated, damaged, foreign or not finite.
-            StaleError: They are not newer than ``after``.
+            MessageError: The parameters are truncated, damaged, for another controller or not finite.
+            StaleError: The parameters are not newer than ``after``.
         """
         kind = f"parameters of {half}"
         header = describe(data, kind=kind, source=half)
@@ -222,7 +223,7 @@ class Parameters:
 
 
 def pack_note(kind: str, **fields: Any) -> bytes:
-    """Return the bytes of a small message of plain values: an order, a report; the inverse of :func:`unpack_note`."""
+    """Return the bytes of a small message of plain values, as an order or a report; inverse of :func:`unpack_note`."""
     return pack_arrays({}, kind=kind, about={"fields": json.dumps(fields)})
 
 
@@ -230,7 +231,7 @@ def unpack_note(data: bytes, kind: str) -> dict[str, Any]:
     """Read a small message.
 
     Raises:
-        MessageError: It is none, of another kind, or a field is not of its type or range.
+        MessageError: The bytes are not such a message, its kind differs, or a field has the wrong type or range.
     """
     header = describe(data, kind=kind, source=kind)
     unpack_arrays(data, {}, kind=kind, source=kind)
@@ -242,12 +243,12 @@ def unpack_note(data: bytes, kind: str) -> dict[str, Any]:
 
 
 def last_note(bus: Bus, topic: str, kind: str | None = None) -> dict[str, Any]:
-    """Return the fields of the last small message of a topic; none if there is none, or if it is damaged.
+    """Return the fields of the last small message of a topic; empty if there is no message or it is damaged.
 
     Args:
-        bus: Where it was published.
-        topic: Name.
-        kind: What it should be; by default what the topic is called.
+        bus: Bus that it was published on.
+        topic: Name of the topic.
+        kind: Expected kind of the message; by default the name of the topic.
     """
     message = bus.latest(topic)
     try:
@@ -257,10 +258,10 @@ def last_note(bus: Bus, topic: str, kind: str | None = None) -> dict[str, Any]:
 
 
 def last_sent(bus: Bus, topic: str) -> float:
-    """Return when the newest command of a topic was sent, monotonic clock [s]; minus infinity if there is none.
+    """Return the send time of the newest command of a topic, monotonic clock [s]; minus infinity without a command.
 
     Args:
-        bus: Where it was published.
+        bus: Bus that it was published on.
         topic: ``setpoint`` or ``fallback``.
     """
     message = bus.latest(topic)
@@ -271,10 +272,10 @@ def last_sent(bus: Bus, topic: str) -> float:
 
 
 def ticks_of(bus: Bus) -> int:
-    """Return how many ticks the plant has sent so far.
+    """Return the number of ticks that the plant has sent so far.
 
     Args:
-        bus: Where it was published.
+        bus: Bus that they were published on.
     """
     message = bus.latest("sample")
     try:
@@ -284,10 +285,10 @@ def ticks_of(bus: Bus) -> int:
 
 
 def last_height(bus: Bus) -> float:
-    """Return the height that the plant said last [m]; NaN if it has said none.
+    """Return the height that the plant reported last [m]; NaN if it has not reported a height.
 
     Args:
-        bus: Where it was published.
+        bus: Bus that it was published on.
     """
     message = bus.latest("sample")
     try:

@@ -7,25 +7,25 @@ from typing import Any
 from ..errors import MessageError
 
 Read = Callable[[Any], Any]
-"""From a value of JSON to the same value, or ``ValueError`` with the requirement."""
+"""Function that returns a valid JSON value unchanged, or raises ``ValueError`` with the requirement."""
 MANY, MOST, LONG = 2**53, 1e300, 1000
-"""The largest whole number and the largest number that every reader takes, and the longest text."""
+"""Largest whole number and largest number that every reader accepts, and length of the longest text."""
 
 
 def shown(value: Any) -> str:
-    """Return a value as a message of an error may quote it: short, and without control characters."""
+    """Return a short text of a value, without control characters, for use in an error message."""
     text = ascii(value) if isinstance(value, str | int | float | bool | type(None)) else type(value).__name__
     return text if len(text) <= 80 else f"{text[:77]}..."
 
 
 def plain(text: str) -> str:
-    """Return a text of limited length, with control characters written out."""
+    """Return a text of limited length with escaped control characters."""
     written = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text[: LONG + 1])
     return written if len(written) <= LONG else f"{written[: LONG - 3]}..."
 
 
 def number(low: float = -math.inf, high: float = math.inf, *, finite: bool = True) -> Read:
-    """Return a reader of numbers of a range; ``finite=False`` accepts NaN and infinity, which a flight may report."""
+    """Return a reader of numbers in a range; ``finite=False`` accepts NaN and infinity, which a flight may report."""
 
     def read(value: Any) -> float:
         if not isinstance(value, int | float) or isinstance(value, bool):
@@ -40,7 +40,7 @@ def number(low: float = -math.inf, high: float = math.inf, *, finite: bool = Tru
 
 
 def whole(low: int = 0, high: int = MANY) -> Read:
-    """Return a reader of whole numbers of a range."""
+    """Return a reader of whole numbers in a range."""
 
     def read(value: Any) -> int:
         if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
@@ -58,19 +58,19 @@ def flag(value: Any) -> bool:
 
 
 def text(value: Any) -> str:
-    """Read a text; control characters are escaped, and a long text is shortened."""
+    """Read a text; escape control characters and shorten a long text."""
     if not isinstance(value, str):
         raise ValueError("a text")
     return plain(value)
 
 
 def maybe(read: Read) -> Read:
-    """Return a reader that accepts null, too."""
+    """Return a reader that also accepts null."""
     return lambda value: None if value is None else read(value)
 
 
 def list_of(*reads: Read, length: int | None = None) -> Read:
-    """Return a reader of lists: of one kind with any length or a given one, or of several kinds in their order."""
+    """Return a reader of lists: one kind of item with any or a given length, or several kinds in the given order."""
     exact = length if len(reads) == 1 else len(reads)
 
     def read(value: Any) -> list[Any]:
@@ -83,7 +83,7 @@ def list_of(*reads: Read, length: int | None = None) -> Read:
 
 
 def map_of(read: Read) -> Read:
-    """Return a reader of tables with names and values of one kind."""
+    """Return a reader of tables that map names to values of one kind."""
 
     def read_all(value: Any) -> dict[str, Any]:
         if not isinstance(value, dict):
@@ -135,18 +135,18 @@ FIELDS: Mapping[str, Mapping[str, Read]] = {
         "notes": list_of(text),
     },
 }
-"""Fields of each kind of note, by the first part of its name; every field may be absent."""
+"""Fields of each kind of note, by the first part of its name; every field is optional."""
 
 
 def read_fields(kind: str, fields: Any) -> dict[str, Any]:
-    """Return the fields of a note, each of its type and in its range.
+    """Return the fields of a note after a check of their types and ranges.
 
     Args:
-        kind: Of the note, as ``wish`` or ``learner.policy``.
-        fields: What was said; a field that is not known is left as it is.
+        kind: Kind of the note, for example ``wish`` or ``learner.policy``.
+        fields: Fields as received; unknown fields are returned unchanged.
 
     Raises:
-        MessageError: They are no table, or a field is not what it must be.
+        MessageError: The fields are not a table, or a field has the wrong type or range.
     """
     if not isinstance(fields, dict):
         raise MessageError(f"{kind}: no fields")

@@ -7,7 +7,10 @@ from .realtime import Lifeline
 
 
 def wait_for_take_off(bus: Bus, parent: Lifeline) -> float | None:
-    """Return when the first tick is, by the monotonic clock [s]; None if the supervisor ended before it said so."""
+    """Wait for the order to take off, and return the time of the first tick, monotonic clock [s].
+
+    Returns None if the supervisor ends before it gives the order.
+    """
     while not parent.gone(0.01):
         message = bus.latest("order")
         try:

@@ -1,4 +1,4 @@
-"""The pilot of the process that flies: a controller as NumPy programs, whose parameters are swapped in flight."""
+"""The pilot of the control process: a controller as NumPy programs, whose parameters are swapped in flight."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,34 +10,34 @@ from .messages import STATE, Parameters
 from .program import Arrays, NumpyProgram, ProgramSource
 from .topics import UNLEARNED, VEHICLE
 
-BLEND = 5  # ticks over which a jump of the command at a swap dies away
+BLEND = 5  # ticks over which a jump of the command at a swap is faded out
 
 
 @dataclass(frozen=True)
 class ControllerSource:
-    """A controller, and what its parameters look like. All of it was made before take-off."""
+    """A controller and the structure of its parameters, prepared before take-off."""
 
     init: ProgramSource
     """(parameters, state) -> memory"""
     decide: ProgramSource
     """(parameters, [memory, time, age, state]) -> command, stage of the controller and its cause, memory"""
     accepted: ProgramSource
-    """(parameters, [memory, command]) -> memory, after the plant took another command than was issued"""
+    """(parameters, [memory, command]) -> memory, if the plant accepted a different command than was issued"""
     target: ProgramSource
-    """(parameters, time) -> where the vehicle should be"""
+    """(parameters, time) -> target position of the vehicle"""
     predicted: ProgramSource
     """(parameters, [state, command]) -> acceleration by the corrected model"""
     parameters: Mapping[str, Mapping[str, Any]]
-    """Parameters at the start, by half (``policy``, ``residual``, ``reference``, ``vehicle``) and name, in the order
-    of the programs."""
+    """Initial parameters, by part (``policy``, ``residual``, ``reference``, ``vehicle``) and name, in the order of the
+    programs."""
     base: str
     """Hash of the programs and of the shapes of their parameters."""
     dtype: np.dtype[Any]
-    """Of the numbers that it computes with."""
+    """Floating-point type of the computation."""
 
 
 class LivePilot:
-    """Flies one controller, tick by tick."""
+    """Runs one controller, tick by tick."""
 
     def __init__(self, source: ControllerSource) -> None:
         self._source = source
@@ -46,11 +46,11 @@ class LivePilot:
         self._predicted = NumpyProgram(source.predicted)
         self._parameters = {half: list(arrays.values()) for half, arrays in source.parameters.items()}
         self.versions = dict.fromkeys(source.parameters, 0)
-        self._policies: dict[int, Arrays] = {0: self._parameters["policy"]}  # the last proven one, and all after it
+        self._policies: dict[int, Arrays] = {0: self._parameters["policy"]}  # the last proven policy and all later ones
         self._parked: tuple[dict[str, Arrays], dict[str, int], dict[int, Arrays]] | None = None
         self._memory: Arrays = []
         self.condition = 0, 0
-        """How far the controller has stepped back, and the cause; see :mod:`retrim.control.condition`."""
+        """Stage of the controller's degradation, and its cause; see :mod:`retrim.control.condition`."""
         self._prepared = self._prepare()
         self._old = self._prepared[1]
         self._jump, self._left, self._swapped = np.zeros(4), 0, False
@@ -62,7 +62,7 @@ class LivePilot:
         self.condition = 0, 0
 
     def target(self, t: float) -> np.ndarray:
-        """Return where the vehicle should be at time ``t`` of the flight [s], world [m]."""
+        """Return the target position of the vehicle at flight time ``t`` [s], world [m]."""
         return np.asarray(self._target.step(self._prepared[4], [self._scalar(t)])[0], dtype=float)
 
     def act(self, t: float, age: float, x: np.ndarray) -> np.ndarray:
@@ -70,7 +70,7 @@ class LivePilot:
 
         Args:
             t: Time since the start of the flight [s].
-            age: How old the measurement is [s].
+            age: Age of the measurement [s].
             x: p, R by rows, v.
         """
         inputs = [self._scalar(t), self._scalar(age), *self._state(x)]
@@ -89,11 +89,11 @@ class LivePilot:
         return u
 
     def rehearse(self, t: float, age: float, x: np.ndarray) -> None:
-        """Decide for nobody; what :meth:`act` takes and returns stays as it is."""
+        """Compute a command and discard it; the result of :meth:`act` does not change."""
         self._decide.step(self._prepared[1], [*self._memory, self._scalar(t), self._scalar(age), *self._state(x)])
 
     def accepted(self, u: np.ndarray) -> None:
-        """Correct the memory: the plant took ``u`` instead of the command that was issued last."""
+        """Correct the memory: the plant accepted ``u`` instead of the command that was issued last."""
         command = [self._scalar(u[0]), u[1:].astype(self._source.dtype)]
         self._memory = self._accepted.step(self._prepared[2], [*self._memory, *command])
 
@@ -103,9 +103,10 @@ class LivePilot:
         return np.asarray(self._predicted.step(self._prepared[3], [*self._state(x), *command])[0], dtype=float)
 
     def swap(self, parameters: Parameters) -> None:
-        """Fly with new parameters from the next tick on.
+        """Use new parameters from the next tick on.
 
-        The command goes over to theirs within a few ticks; the controller itself follows an identified vehicle slowly.
+        The command is blended to the new controller's within a few ticks. For new parameters of the vehicle there is no
+        blending, because the controller itself follows them slowly.
         """
         half = parameters.half
         self._parameters[half] = list(parameters.arrays.values())
@@ -118,7 +119,7 @@ class LivePilot:
             self._change()
 
     def restart(self) -> None:
-        """Fly with what had been learnt at take-off from the next tick on."""
+        """Use the learned parameters of take-off again from the next tick on."""
         self._parked = self._parameters, self.versions, self._policies
         followed = {half: leaves for half, leaves in self._parameters.items() if half in UNLEARNED}
         first = {half: list(arrays.values()) for half, arrays in self._source.parameters.items()}
@@ -128,7 +129,7 @@ class LivePilot:
         self._change()
 
     def resume(self) -> None:
-        """Fly again with what had been learnt before :meth:`restart`."""
+        """Use the learned parameters from before :meth:`restart` again."""
         if self._parked is not None:
             (parameters, versions, self._policies), self._parked = self._parked, None
             self._parameters |= {half: leaves for half, leaves in parameters.items() if half not in UNLEARNED}
@@ -136,15 +137,15 @@ class LivePilot:
             self._change()
 
     def expected(self, half: str) -> Mapping[str, Any]:
-        """Return what parameters of a half look like."""
+        """Return parameters of a part as examples of their shapes and types."""
         return self._source.parameters[half]
 
     def proven(self, version: int) -> None:
-        """Take note that a policy has flown long enough without harm: there is no way back to an earlier one."""
+        """Record that a policy has flown long enough without harm, and discard the earlier ones."""
         self._policies = {v: leaves for v, leaves in self._policies.items() if v >= version}
 
     def back(self) -> list[int]:
-        """Fly the last proven policy again; return the versions that are given up."""
+        """Return to the last proven policy; return the versions that are given up."""
         version = min(self._policies)
         given_up = sorted(v for v in self._policies if v > version)
         self._policies = {version: self._policies[version]}

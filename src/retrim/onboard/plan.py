@@ -1,4 +1,4 @@
-"""What the process that flies is started with."""
+"""Start parameters of the control process."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,20 +9,20 @@ from .pilot import ControllerSource
 
 @dataclass(frozen=True)
 class ControlPlan:
-    """Everything that the process is started with."""
+    """Start parameters of the process."""
 
     folder: Path
-    """Of the bus."""
+    """Folder of the bus."""
     controller: ControllerSource
     limits: Limits
     dt: float
     delay_ticks: int
     """Declared command delay of the plant."""
     window: int
-    """Ticks that are published for those who learn and for the log."""
+    """Number of ticks that are published for the learners and for the log."""
     seconds: float
-    """After which it lands by itself [s]."""
+    """Flight time after which the vehicle lands by itself [s]."""
     cores: frozenset[int]
     priority: int
     parent: int
-    """Process whose end lands the vehicle."""
+    """Id of the process whose end triggers the landing."""

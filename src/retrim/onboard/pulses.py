@@ -1,4 +1,4 @@
-"""Which processes of a flight hang: alive, and silent."""
+"""Detection of processes of a flight that hang: they are alive but do not send heartbeats."""
 
 import time
 from collections.abc import Callable, Iterable
@@ -7,39 +7,39 @@ from ..transport.bus import Bus
 from .heart import beat_topic
 
 SILENCE = 2.0  # [s] without a heartbeat, after which a process hangs
-LOOK = 0.25  # [s] that one look counts at most: a machine that stood still is no silence
+LOOK = 0.25  # [s] that one check counts at most, because a stall of the machine is not a silence of the process
 
 
 class Pulses:
-    """Counts for how long each process has been silent, look by look."""
+    """Measures the silence of each process; it is updated at each check."""
 
     def __init__(self, bus: Bus, clock: Callable[[], float] = time.monotonic, silence: float = SILENCE) -> None:
-        """Begin with no process.
+        """Begin without processes.
 
         Args:
-            bus: Of the flight.
-            clock: The time [s].
+            bus: Bus of the flight.
+            clock: Function that returns the time [s].
             silence: Time without a heartbeat, after which a process hangs [s].
         """
         self._bus, self._clock, self._last, self._silence = bus, clock, clock(), silence
         self._versions, self._silent, self._allowed = dict[str, int](), dict[str, float](), dict[str, float]()
 
     def expect(self, role: str, within: float | None = None) -> None:
-        """Count from now on.
+        """Expect heartbeats of a process from now on.
 
         Args:
-            role: Of the process.
-            within: Time for the first heartbeat [s], since a process that starts compiles before it; None: as long as
-                for any other.
+            role: Role of the process.
+            within: Time limit for the first heartbeat [s], since a process compiles at its start; None: the same as for
+                later heartbeats.
         """
         self._versions[role], self._silent[role] = self._version(role), 0.0
         self._allowed[role] = self._silence if within is None else within
 
     def hanging(self, roles: Iterable[str]) -> list[str]:
-        """Return who has been silent for too long.
+        """Return the processes that have been silent for too long.
 
         Args:
-            roles: Processes that are alive; others are not looked at, nor are those that nothing is expected of.
+            roles: Processes that are alive. Other processes and those without expected heartbeats are not checked.
         """
         now = self._clock()
         passed, self._last = min(now - self._last, LOOK), now

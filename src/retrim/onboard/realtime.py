@@ -1,4 +1,4 @@
-"""What the operating system can do for a process that must be on time; each step is tried, and said where it fails."""
+"""Operating system settings for a process with deadlines; failed settings are reported."""
 
 import contextlib
 import ctypes
@@ -12,20 +12,20 @@ LATER = 2e-5  # [s]
 
 
 def be_punctual(priority: int, cores: set[int]) -> list[str]:
-    """Ask for real-time scheduling, locked memory and cores of one's own, and stop collecting garbage.
+    """Request real-time scheduling, locked memory and specific cores, and switch garbage collection off.
 
     Args:
-        priority: Of SCHED_FIFO, 1 to 99.
-        cores: Where the process may run.
+        priority: Priority under SCHED_FIFO, 1 to 99.
+        cores: Cores that the process may use.
 
     Returns:
-        What was refused, in words; empty if nothing was.
+        Descriptions of the refused requests; empty if all were granted.
     """
     refused = []
     gc.collect()
     gc.freeze()
     gc.disable()
-    # Touching all its memory takes a while: before the process is more important than others.
+    # Locking touches all the memory and takes a while, so it precedes the real-time priority.
     try:
         if ctypes.CDLL(None, use_errno=True).mlockall(LOCK_NOW_AND_LATER) != 0:
             refused.append(f"locked memory: {os.strerror(ctypes.get_errno())}")
@@ -37,7 +37,7 @@ def be_punctual(priority: int, cores: set[int]) -> list[str]:
     except (OSError, AttributeError) as error:
         refused.append(f"cores {sorted(cores)}: {error}")
     try:
-        for thread in _threads():  # a pool that computes for this process is as urgent as it
+        for thread in _threads():  # the threads of a pool that computes for this process are as urgent as the process
             os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(priority))
     except (OSError, AttributeError) as error:
         refused.append(f"SCHED_FIFO: {error}")
@@ -45,18 +45,18 @@ def be_punctual(priority: int, cores: set[int]) -> list[str]:
 
 
 def _threads() -> list[int]:
-    """Threads of this process; the calling one last."""
+    """Return the threads of this process, with the calling one last."""
     with contextlib.suppress(OSError):
         return [int(name) for name in os.listdir("/proc/self/task") if int(name) != os.getpid()] + [0]
     return [0]
 
 
 def cores_of(role: str, allowed: set[int] | None = None) -> set[int]:
-    """Return the cores of a role: the first one flies, the others learn; with a single core all share it.
+    """Return the cores of a role: the first core for control, the others for learning; a single core is shared.
 
     Args:
         role: ``fly`` or ``learn``.
-        allowed: Cores to share out; by default those of this process.
+        allowed: Cores to distribute; by default those of this process.
     """
     mine = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else {0}
     cores = sorted(allowed or mine)
@@ -70,10 +70,10 @@ def sleep_until(instant: float) -> None:
 
 
 def wait_until(instant: float) -> float:
-    """Return at ``instant`` of the monotonic clock [s] without sleeping, so that nobody has to wake the process.
+    """Wait until ``instant`` of the monotonic clock [s] without sleeping, so that no wake-up delay occurs.
 
     Returns:
-        When it is, which is later if the instant has passed [s].
+        The current time [s], which is later if the instant has passed.
     """
     while (now := time.monotonic()) < instant:
         pass
@@ -81,7 +81,7 @@ def wait_until(instant: float) -> float:
 
 
 class Lifeline:
-    """Tells whether another process lives, at once and without asking it."""
+    """Detects the end of another process, immediately and without its cooperation."""
 
     def __init__(self, pid: int) -> None:
         """Watch a process of this machine."""
@@ -92,7 +92,7 @@ class Lifeline:
             self._poll.register(self._descriptor, select.POLLIN)
 
     def gone(self, wait: float = 0.0) -> bool:
-        """Return whether the process has ended, after waiting for that at most ``wait`` [s]."""
+        """Wait at most ``wait`` [s] for the end of the process, and return whether it has ended."""
         if self._descriptor is not None:
             return bool(self._poll.poll(max(0.0, 1e3 * wait)))
         time.sleep(max(0.0, wait))

@@ -1,7 +1,7 @@
-"""The process that writes the flight down as it goes. What it has written is readable whatever happens to it.
+"""The recorder process: it writes the log during the flight. The log stays readable if the process ends early.
 
-Two processes report ticks: the one that flies, and the watchdog when it takes over. What one of them says late is
-written late, and a tick that both of them have flown is written twice; :func:`read_log` puts it in order.
+Two processes report ticks: the control process, and the watchdog when it takes over. Late reports are written late,
+and a tick that both processes have commanded is written twice; :func:`read_log` sorts the ticks.
 """
 
 import contextlib
@@ -24,41 +24,41 @@ from .realtime import Lifeline
 
 SILENCE = 2.0  # [s] without a tick, after which a flight without a supervisor is over
 ENDS = tuple(mode.name.lower() for mode in OVER)
-LINGER = 5  # ticks after the end of a flight, in which those who flew may still report their last ones
+LINGER = 5  # ticks after the end of a flight, in which control and watchdog may still report their last ticks
 
 
 @dataclass(frozen=True)
 class RecorderPlan:
-    """Everything that the process is started with."""
+    """Start parameters of the process."""
 
     folder: Path
-    """Of the bus."""
+    """Folder of the bus."""
     path: Path
-    """Of the log, a CSV file with a line per tick."""
+    """Path of the log, a CSV file with a line per tick."""
     dt: float
     parent: int
-    """Who takes the bus away; if it is gone, the recorder does."""
+    """Id of the process that removes the bus; if it has ended, the recorder removes the bus."""
     spare: tuple[Path, ...] = ()
-    """Folders for a log that cannot be written there."""
+    """Folders for the log if it cannot be written to ``path``."""
 
 
 class Recorder:
-    """Appends the ticks that are new. A gap is filled from the last seconds of flight, which every report holds."""
+    """Appends new ticks to the log. It fills gaps from the last seconds of flight, which every report contains."""
 
     def __init__(self, path: Path, bus: Bus, spare: Sequence[Path] = ()) -> None:
-        """Go on with a log, or begin one.
+        """Continue a log, or create one.
 
         Args:
-            path: Of the log.
-            bus: Of the flight.
-            spare: Folders for a log that cannot be written there; see :func:`log_path`.
+            path: Path of the log.
+            bus: Bus of the flight.
+            spare: Folders for the log if it cannot be written to ``path``; see :func:`log_path`.
         """
         self._bus, self._paths = bus, (path, *(folder / path.name for folder in spare))
         self._versions = {"flight": 0, "fallback.flight": 0}
         self.failed: str | None = None
-        """Why the log has ended; None while it has not."""
+        """Reason for the end of the log; None while it continues."""
         self.moved = ""
-        """Why the log is another file, and which; empty while it is not."""
+        """Reason for a change of the file, and the new file; empty if there was no change."""
         self._written: set[tuple[int, bool, bool]] = set()
         self._file: LogFile | None = None
         try:
@@ -68,11 +68,11 @@ class Recorder:
             self._move(error)
 
     def step(self) -> int:
-        """Write what is new; return how many ticks that were. A full disk ends the log and not the flight."""
+        """Write new ticks and return their number. A full disk ends the log but not the flight."""
         return self._take("flight") + self._take("fallback.flight")
 
     def tell(self) -> None:
-        """Say that the log is ready, and how it stands."""
+        """Publish that the log is ready, and its state."""
         self._bus.publish("ready.recorder", pack_note("ready", failed=self.failed, moved=self.moved))
 
     def close(self) -> None:
@@ -104,7 +104,7 @@ class Recorder:
         return 0
 
     def _move(self, why: OSError) -> None:
-        """Go on elsewhere with all that is written; if that cannot be, the log has failed."""
+        """Continue the log in another file with its whole content; if that is impossible, the log has failed."""
         reason = f"{self._paths[0]}: {why.strerror or why}"
         for path in self._paths:
             with contextlib.suppress(OSError):
@@ -125,16 +125,16 @@ class Recorder:
         self.tell()
 
     def _note(self, rows: np.ndarray) -> None:
-        """Take note of what is written; after any row of a tick nobody needs what the watchdog has only seen of it."""
+        """Record the written rows; after any row of a tick, the row of a merely observing watchdog is redundant."""
         for tick, has, flew in _authors(rows):
             self._written |= {(tick, has, flew), (tick, False, False)}
 
 
 def read_log(path: Path) -> np.ndarray:
-    """Return the ticks of a log in their order, in the columns of :data:`retrim.onboard.messages.COLUMNS`.
+    """Return the ticks of a log in order, in the columns of :data:`retrim.onboard.messages.COLUMNS`.
 
-    A tick that the watchdog flew has its row, with the accounts of the process that was late if there are any. A torn
-    last line is left out.
+    For a tick that the watchdog commanded, the row of the watchdog is returned, with the accounts of the late control
+    process if they exist. An incomplete last line is left out.
 
     Raises:
         OSError: There is no such file.
@@ -161,13 +161,13 @@ def _rows(data: bytes) -> np.ndarray:
 
 
 def _authors(rows: np.ndarray) -> list[tuple[int, bool, bool]]:
-    """Return of each row its tick, whether the process that flies reported it, and whether the watchdog flew it."""
+    """Return for each row the tick, whether the control process reported it, and whether the watchdog commanded it."""
     flew = rows[:, -1] == Mode.WATCHDOG
     return list(zip(rows[:, 0].astype(int).tolist(), accounted(rows).tolist(), flew.tolist(), strict=True))
 
 
 def record(plan: RecorderPlan) -> None:
-    """Write until the flight is over: the main function of the process."""
+    """Write until the flight is over; main function of the process."""
     bus = SharedMemoryBus(plan.folder)
     recorder = Recorder(plan.path, bus, plan.spare)
     recorder.tell()

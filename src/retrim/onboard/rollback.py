@@ -1,4 +1,4 @@
-"""Whether new policies fly clearly worse than the last one that has proven itself, in a world that has not changed."""
+"""Detection of new policies that fly clearly worse than the last proven one in an unchanged world."""
 
 from collections import deque
 from dataclasses import dataclass, field
@@ -8,56 +8,60 @@ import numpy as np
 
 
 class Judgement(NamedTuple):
-    """What a tick has shown."""
+    """Result of a tick."""
 
     proven: int | None = None
     """Version that has flown long enough without harm."""
     worse: bool = False
-    """All versions after the last proven one are to be taken back."""
+    """Whether all versions after the last proven one must be rolled back."""
 
 
 class Watched(NamedTuple):
-    """A policy that has not proven itself yet."""
+    """A policy that is not proven yet."""
 
     version: int
     since: int
     """Tick of its swap."""
     error: float
-    """Mean error before it [m]."""
+    """Mean error before the swap [m]."""
     missed: float
-    """What the model missed before it [m/s^2]."""
+    """Mean acceleration error of the model before the swap [m/s^2]."""
 
 
 @dataclass
 class FlownError:
-    """Watches the distance from the target before and after swaps, which may come faster than a verdict."""
+    """Compares the distance from the target before and after swaps; swaps may come faster than the verdict.
+
+    Policies are clearly worse if the mean error of the last half second exceeds both ``factor`` times the error before
+    the first of them and ``least``. This is checked from ``settle_s`` after the first swap.
+    """
 
     dt: float
     factor: float = 3.0
-    """Policies are clearly worse if the error is so many times that before the first of them, ..."""
+    """Largest ratio of the error to the error before the first unproven policy."""
     least: float = 0.1
-    """... and larger than this [m] ..."""
+    """Error below which policies do not count as worse [m]."""
     settle_s: float = 0.5
-    """... in the half second that ends so long or longer after its swap."""
+    """Time after the swap from which the error is checked [s]."""
     watch_s: float = 2.0
-    """A policy that has flown so long has proven itself."""
+    """Flight time after which a policy is proven [s]."""
     surprise: float = 1.0
-    """If the corrected model misses so much more than before the swap [m/s^2], the world is to blame."""
+    """Increase of the model's acceleration error since the swap [m/s^2] above which the world has changed."""
     _seen: deque[tuple[float, float]] = field(default_factory=deque)
     _watched: deque[Watched] = field(default_factory=deque)
     _tick: int = 0
 
     def swapped(self, version: int) -> None:
-        """A new policy flies from now on."""
+        """Record that a new policy is active from now on."""
         if self._seen:
             self._watched.append(Watched(version, self._tick, *self._means()))
 
     def take(self, error: float, missed: float) -> Judgement:
-        """Take what one tick says.
+        """Process one tick.
 
         Args:
             error: Distance from the target [m].
-            missed: By how much the corrected model misses the acceleration [m/s^2].
+            missed: Acceleration error of the corrected model [m/s^2].
         """
         self._tick += 1
         self._seen.append((error, missed))
@@ -68,7 +72,7 @@ class FlownError:
         error, missed = self._means()
         first = self._watched[0]
         flown_s = (self._tick - first.since) * self.dt
-        if missed > first.missed + self.surprise:  # nobody can tell; what flies now is as good as any
+        if missed > first.missed + self.surprise:  # the world has changed: a comparison is not possible, keep the last
             last = self._watched[-1].version
             self._watched.clear()
             return Judgement(proven=last)

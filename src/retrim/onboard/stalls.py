@@ -1,8 +1,8 @@
-"""Stalls of the machine: times in which not even the process that comes before all others ran.
+"""Stalls of the machine: intervals in which even the process with the highest priority did not run.
 
-The watchdog does next to nothing, every two milliseconds, with the highest priority. Where it was kept from that for
-longer, so was everyone on its core: by the kernel, or by the host of a virtual machine. A tick that was missed
-meanwhile is not one that control or plant were too slow for.
+The watchdog wakes up every two milliseconds with the highest priority and does very little work. If its wake-up is
+delayed, every process on its core was delayed, by the kernel or by the host of a virtual machine. Ticks that are missed
+in such an interval are not caused by a slow control or plant process.
 """
 
 from collections import deque
@@ -12,26 +12,26 @@ from typing import Any
 from .messages import pack_note
 
 STALL = 0.003  # [s]
-KEPT = 100  # newest ones
+KEPT = 100  # the newest stalls are kept
 
 
 class Stalls:
-    """Those that were seen."""
+    """The stalls that were detected."""
 
     def __init__(self, every: float) -> None:
-        """Begin with none.
+        """Begin without stalls.
 
         Args:
             every: Time between wake-ups [s].
         """
         self.count, self.longest = 0, 0.0
         self.newest: deque[tuple[float, float]] = deque(maxlen=KEPT)
-        """From when to when [s]."""
+        """Start and end of each stall [s]."""
         self._every = every
         self._woke: float | None = None
 
     def woke(self, now: float) -> bool:
-        """Take note of a wake-up; return whether the machine stood still before it.
+        """Record a wake-up; return whether the machine stalled before it.
 
         Args:
             now: Monotonic clock [s].
@@ -44,17 +44,17 @@ class Stalls:
         return True
 
     def pack(self) -> bytes:
-        """Return them as a note."""
+        """Return the stalls as the bytes of a note."""
         newest = [list(each) for each in self.newest]
         return pack_note("stalls", count=self.count, longest=self.longest, newest=newest)
 
 
 def lost_in(stalls: Sequence[Sequence[Any]], gaps: Sequence[Sequence[Any]], dt: float) -> int:
-    """Return how many ticks were missed while the machine stood still, or while a plant caught up within a tick after.
+    """Return the number of ticks that were missed during a stall or while the plant caught up within a tick after it.
 
     Args:
-        stalls: From when to when it did [s].
-        gaps: From the measurement before missed ticks to the one after them [s], and how many these were.
+        stalls: Start and end of each stall [s].
+        gaps: Times of the measurements before and after missed ticks [s], and number of missed ticks.
         dt: Control tick [s].
     """
     return sum(int(n) for a, b, n in gaps if any(begin < b and end + dt > a for begin, end in stalls))

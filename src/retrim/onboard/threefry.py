@@ -1,7 +1,7 @@
-"""JAX's random numbers in NumPy: Threefry-2x32 with 20 rounds (Salmon et al. 2011), counters as JAX lays them out.
+"""JAX's random numbers in NumPy: Threefry-2x32 with 20 rounds (Salmon et al. 2011), with the counter layout of JAX.
 
-A key is two 32-bit words, on the last axis. Controllers that draw, as those that simulate a camera, fly the same
-numbers live.
+A key is two 32-bit words, on the last axis. Controllers that draw random numbers, for example to simulate a camera,
+draw the same numbers in a live flight.
 """
 
 from typing import Any
@@ -26,13 +26,13 @@ def threefry(key: Any, high: Any, low: Any) -> tuple[Any, Any]:
 
 
 def seed(value: Any) -> np.ndarray:
-    """Return the key of an integer."""
+    """Return a key made from an integer."""
     whole = int(value) & (0xFFFFFFFF if np.asarray(value).dtype.itemsize <= 4 else 0xFFFFFFFFFFFFFFFF)
     return np.array([whole >> 32, whole & 0xFFFFFFFF], dtype=np.uint32)
 
 
 def fold_in(key: Any, value: Any) -> np.ndarray:
-    """Return the key of a key and an integer."""
+    """Return a new key made from a key and an integer."""
     high, low = seed(value)
     return np.stack(threefry(key, high, low))
 

@@ -1,8 +1,8 @@
-"""Names of topics that travel between machines."""
+"""Names of topics that are transmitted between machines."""
 
 LAYERS = ("residual", "policy")
 SLOTS = 2
-"""Whole updates of each layer that stay on the bus."""
+"""Number of complete updates of each layer that stay on the bus."""
 
 
 def slot(layer: str, version: int) -> str:
@@ -11,11 +11,11 @@ def slot(layer: str, version: int) -> str:
 
 
 REFERENCE = "reference"
-"""Half of the parameters of a controller that says what it follows; no learner changes it."""
+"""Parameters of a controller that define its reference; learners do not change them."""
 VEHICLE = "vehicle"
-"""Half of the parameters of a controller that says which vehicle it flies; it is identified beside the flight."""
+"""Parameters of a controller that describe the vehicle; they are identified during the flight."""
 UNLEARNED = (REFERENCE, VEHICLE)
-"""Halves that stay when what was learnt is not flown."""
+"""Parameters that stay in use when the learned parameters are not used."""
 OUT = ("mission", "flight", "status", "ended", "learning", f"parameters.{REFERENCE}")
 """Topics from the flight to the learners."""
 INTO = (
@@ -25,6 +25,6 @@ INTO = (
 )
 """Topics from the learners to the flight."""
 SLOWLY = ("flight",)
-"""Topics that come with each tick, though a few times a second are enough for those who learn."""
+"""Topics that are published each tick, although the learners need them only a few times per second."""
 MOST = 64 * 2**20
-"""Longest message between machines [bytes]."""
+"""Size of the longest message between machines [bytes]."""

@@ -1,4 +1,4 @@
-"""The process that goes on commanding when the one that flies has died or hangs: nothing but the fallback."""
+"""The watchdog process: it runs only the fallback, and sends its commands when the control process died or hangs."""
 
 import time
 from collections import deque
@@ -19,28 +19,28 @@ from .stalls import Stalls
 
 PATIENCE = 1.6  # ticks without a command
 CHECK_EVERY = 0.002  # [s]
-ROWS = 50  # of a report: what it saw before it took over, too
+ROWS = 50  # of a report, with the ticks from before the takeover
 
 
 @dataclass(frozen=True)
 class WatchdogPlan:
-    """Everything that the process is started with."""
+    """Start parameters of the process."""
 
     folder: Path
     limits: Limits
     dt: float
     home: np.ndarray
-    """Where to hold if control never said, world [m]."""
+    """Position to hold if control never sent a target, world [m]."""
     cores: frozenset[int]
     priority: int
     control: int
-    """The process that is watched."""
+    """Process id of the control process, which the watchdog watches."""
     parent: int
-    """Without it the watchdog ends once the flight has."""
+    """Process id of the supervisor; if it has ended, the watchdog ends with the flight."""
 
 
 class Watchdog:
-    """Decides, tick by tick, whether to command, and what."""
+    """Decides on each tick whether to send a command, and computes it."""
 
     def __init__(self, plan: WatchdogPlan, bus: Bus) -> None:
         self.plan, self.bus = plan, bus
@@ -57,24 +57,24 @@ class Watchdog:
         self._start = 0.0
 
     def check(self, now: float, gone: bool) -> Setpoint | None:
-        """Return the command that was published, if one was due.
+        """Publish and return a command if one is due.
 
         Args:
             now: Monotonic clock [s].
-            gone: The process that flies has ended.
+            gone: Whether the control process has ended.
         """
         if (message := self.bus.latest("setpoint", self._version)) is not None:
             self._version = message.version
             self._hear(message.data, now)
         new = self._look()
         if self.heard is None and self._sample is not None:
-            self.heard = now  # from the first measurement on, somebody has to answer
+            self.heard = now  # the first measurement already needs an answer
         silent = self.heard is not None and (gone or now - self.heard > PATIENCE * self.plan.dt)
         if not silent or self.done or not (new or now >= self._next):
             return None
         if self._sample is None or self._stamp is None:
             return None
-        self._next = now + 1.5 * self.plan.dt  # at the latest, should no sample come
+        self._next = now + 1.5 * self.plan.dt  # latest time, in case no sample arrives
         fresh = self._sample.age + now - self._sample.sent <= self.plan.limits.state_age
         u, mode = self._fallback.step(self._sample.state, fresh, self._target, land=False)
         self.done = mode in OVER
@@ -83,23 +83,23 @@ class Watchdog:
         if mode in (Mode.BLIND, Mode.DROP) and not new:
             row = blind_row(self._sample, self._stamp, now, self._start, self.plan.dt, u, mode)
             self._rows.append(row)
-        elif self._sample.tick == self._stamp.tick:  # a tick whose state was refused has no row
+        elif self._sample.tick == self._stamp.tick:  # a tick with a refused state does not have a row
             self._rows[-1][COMMAND], self._rows[-1][-1] = u, Mode.WATCHDOG
         self.bus.publish("fallback.flight", FlightRows(np.stack(self._rows)).pack())
         return setpoint
 
     def _hear(self, data: bytes, now: float) -> None:
-        """Take note that somebody flies, where the vehicle should be, and whether it has landed."""
+        """Record a command of the control process: its time, the target, and whether the vehicle has landed."""
         try:
             said = Setpoint.unpack(data)
         except MessageError:
             return
-        self.heard = now  # what nobody can fly by is silence
+        self.heard = now  # only here: an unreadable command counts as silence
         self._fallback.rest()
         self._target, self.done = said.target, self.done or said.landed
 
     def _look(self) -> bool:
-        """Take a new sample, if there is one; return whether there is one to answer."""
+        """Read a new sample, if there is one; return whether there is one to answer."""
         message = self.bus.latest("sample", self._seen)
         if message is None:
             return False
@@ -120,7 +120,7 @@ class Watchdog:
         return True
 
     def _look_at_stamp(self, data: bytes) -> bool:
-        """Take what can be taken of a sample whose state is refused."""
+        """Read the stamp of a sample with a refused state; return whether it is readable."""
         try:
             self._stamp = Stamp.unpack(data)
         except MessageError:
@@ -129,12 +129,13 @@ class Watchdog:
 
 
 def watch(plan: WatchdogPlan) -> None:
-    """Watch until the flight is over: the main function of the process."""
+    """Watch until the flight is over; main function of the process."""
     refused = be_punctual(plan.priority, set(plan.cores))
     bus = SharedMemoryBus(plan.folder)
     watchdog, control, parent = Watchdog(plan, bus), Lifeline(plan.control), Lifeline(plan.parent)
     bus.publish("ready.watchdog", pack_note("ready", refused=refused))
-    stalls = None if refused else Stalls(CHECK_EVERY)  # who comes behind others waits for them, not for the machine
+    # Without real-time priority the process also waits for other processes, which is not a stall of the machine.
+    stalls = None if refused else Stalls(CHECK_EVERY)
     if stalls is not None:
         bus.publish("stalls", stalls.pack())
     heart = Heart(bus, "watchdog")

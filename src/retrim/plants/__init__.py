@@ -1,4 +1,4 @@
-"""Plants, one file each. Packages that only one of them needs are imported when such a plant is made."""
+"""Plants, one file each. Packages that only one plant needs are imported when that plant is created."""
 
 from .crazyflow import CrazyflowPlant as CrazyflowPlant
 from .mujoco import MujocoPlant as MujocoPlant

@@ -25,7 +25,7 @@ _building = threading.Lock()
 
 @contextlib.contextmanager
 def _its_jax() -> Iterator[None]:
-    """crazyflow counts on JAX's defaults: single precision, free promotion. The rest of the process keeps its own."""
+    """Set JAX's defaults, which crazyflow needs: single precision, free promotion. Settings outside do not change."""
     with jax.enable_x64(False), jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         yield
 
@@ -33,12 +33,12 @@ def _its_jax() -> Iterator[None]:
 class CrazyflowPlant(ExternalPlant):
     """crazyflow's Crazyflie 2.1 Brushless (43 g, lifts 38 g more) by first principles, in single precision.
 
-    Its stages are used without its scene: no floor, and no MuJoCo model to build. crazyflow's rate loop is the
-    firmware's Mellinger controller, which also levels the vehicle; as crazyflow itself advises for tracking body rates,
-    its attitude gains are zero here.
+    The plant uses its stages without its scene, so that there is neither a floor nor a MuJoCo model. crazyflow's rate
+    loop is the firmware's Mellinger controller, which also levels the vehicle. Its attitude gains are zero here, as
+    crazyflow itself recommends for tracking body rates.
 
-    crazyflow has no wind. Its body drag is linear in the velocity, so that wind is exactly the drag of -wind, as a
-    force at each of its steps. Conditions hold for a tick.
+    crazyflow does not model wind. Its body drag is linear in the velocity, so that wind is exactly the drag of -wind,
+    applied as a force at each of its steps. Conditions are constant during a tick.
     """
 
     def __init__(self, disturbance: Disturbance, *, dt: float = 0.02) -> None:
@@ -50,9 +50,9 @@ class CrazyflowPlant(ExternalPlant):
         self._rotation = import_extra("scipy.spatial.transform", "crazyflow").Rotation
 
     def _launch(self, x: Pose) -> None:
-        q = self._rotation.from_matrix(x.R).as_quat()  # scalar last, as crazyflow's
+        q = self._rotation.from_matrix(x.R).as_quat()  # scalar last, as in crazyflow
         with _its_jax():
-            # to its device: a single array that is not bound to one would make a second program
+            # to its device: a single array that is not bound to a device would cause a second compilation
             p, q, v = jax.device_put([a[None, None].astype(np.float32) for a in (x.p, q, x.v)], _device())
             self._data = self._hovering.replace(states=self._hovering.states.replace(pos=p, quat=q, vel=v))
 
@@ -68,13 +68,13 @@ class CrazyflowPlant(ExternalPlant):
 
 
 def _device() -> jax.Device:
-    """One world is too small for anything else."""
+    """Return the CPU, since one world is too small for other devices."""
     return jax.devices("cpu")[0]
 
 
 @functools.cache
 def _simulator(steps: int) -> tuple[Any, Callable[[Any, np.ndarray, ExternalEffects], Any], np.ndarray]:
-    """Hovering Crazyflie, the compiled function that flies it ``steps`` steps, and a rotor's least and most thrust [N].
+    """Return a hovering Crazyflie, the compiled function for ``steps`` steps, and a rotor's thrust limits [N].
 
     They are the same for all plants.
     """

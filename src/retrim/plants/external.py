@@ -30,10 +30,10 @@ class Pose(NamedTuple):
 
 
 class ExternalPlant(Plant, abc.ABC):
-    """A simulator that steps on its own, one command late: the command of a tick acts in the next one.
+    """A simulator with its own steps and a delay of one tick: the command of a tick acts in the next one.
 
-    A simulator gives :meth:`_launch` and :meth:`_advance`. The disturbance is evaluated at ``instants`` evenly spaced
-    times of each tick, in the state at its beginning. Commands beyond the ``limits`` of [c, omega] are clipped.
+    A subclass implements :meth:`_launch` and :meth:`_advance`. The disturbance is evaluated at ``instants`` evenly
+    spaced times of each tick, in the state at its beginning. Commands beyond the ``limits`` of [c, omega] are clipped.
     """
 
     def __init__(
@@ -50,17 +50,18 @@ class ExternalPlant(Plant, abc.ABC):
 
     @abc.abstractmethod
     def _launch(self, x: Pose) -> None:
-        """Hovering at ``x``, as if it had done so for long; without rotation."""
+        """Start a steady hover at ``x``, without rotation."""
 
     @abc.abstractmethod
     def _advance(self, u: np.ndarray, effects: ExternalEffects) -> Pose:
-        """One tick under ``u`` = [c [m/s^2], body rates [rad/s]]; leaves of ``around`` are NumPy, instants in front.
+        """Advance one tick under ``u`` = [c [m/s^2], body rates [rad/s]].
 
-        Raises ``PlantError``, before anything moves, for conditions that the simulator does not know.
+        Leaves of ``effects`` are NumPy arrays with the instants on the leading axis. Raises ``PlantError`` before the
+        first step for conditions that the simulator does not support.
         """
 
     def reset(self, x0: State | None) -> Measurement:
-        """Hover at ``x0``; without one, 1 m above the ground."""
+        """Hover at ``x0``; if it is None, 1 m above the ground."""
         start = State.at(jnp.array([0.0, 0.0, 1.0])) if x0 is None else x0
         at_rest = jnp.zeros_like(start.p)
         pose = Pose(*(np.asarray(a, dtype=np.float64) for a in (start.p, start.R, start.v, at_rest)))
@@ -78,7 +79,7 @@ class ExternalPlant(Plant, abc.ABC):
         effects = jax.tree.map(np.asarray, effects_at(times, self._x, self._disturbance))
         after = self._advance(self._held, effects)
         dtype = self._x.p.dtype
-        acceleration = (after.v - self._v) / self.dt  # in double precision: single leaves few digits of a difference
+        acceleration = (after.v - self._v) / self.dt  # in double precision: a difference in single has few digits
         *state, omega, a = (jnp.asarray(value, dtype=dtype) for value in (*after, acceleration))
         self._x, self._v = State(*state), after.v
         accepted = limited(u, wanted, *self._limits)
@@ -87,22 +88,22 @@ class ExternalPlant(Plant, abc.ABC):
         return Measurement(self._ticks * self.dt, self._x, omega, a, truth=self._x), accepted
 
     def disturb(self, disturbance: Disturbance) -> None:
-        """Fly on under another disturbance; one of the same kind with other numbers compiles nothing."""
+        """Change the disturbance in flight; new numbers for the same kind do not cause recompilation."""
         self._disturbance = disturbance
 
     def stop(self) -> None:
-        """Forget the flight."""
+        """Discard the state of the flight."""
         self._x = None
 
 
 def thrust_limits(least: float, most: float) -> tuple[np.ndarray, np.ndarray]:
-    """Limits of [c, omega] of a vehicle that is known by its thrust alone, mass-normalised [m/s^2]."""
+    """Return limits of [c, omega] for a vehicle with known thrust limits only, mass-normalised [m/s^2]."""
     free = np.full(3, np.inf)
     return np.append(least, -free), np.append(most, free)
 
 
 def whole_steps(dt: float, step: float) -> int:
-    """Steps of the simulator in a tick; raises ``ValueError`` if they do not fill it [s]."""
+    """Return the number of simulator steps in a tick; raise ``ValueError`` if it is not a whole number (times in s)."""
     steps = round(dt / step)
     if steps < 1 or abs(dt / step - steps) > 1e-6:
         raise ValueError(f"a tick of {dt} s is no multiple of the simulator's step, {step} s")

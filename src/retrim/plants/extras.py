@@ -1,4 +1,4 @@
-"""Packages that only one plant or method needs: imported when such a one is made, never with ``retrim``."""
+"""Packages that only one plant or method needs. They are imported when it is created, never with ``retrim``."""
 
 import contextlib
 import importlib
@@ -13,14 +13,14 @@ def import_extra(module: str, name: str, *, package: str | None = None, kind: st
     """Import ``module``, which the extra ``name`` installs.
 
     Args:
-        module: What is imported.
-        name: The extra.
-        package: Its name in the registry of packages; that of the extra by default.
-        kind: What has the extra's name, for the message.
+        module: Name of the module.
+        name: Name of the extra.
+        package: Name in the package registry; by default that of the extra.
+        kind: Kind of component that has the name of the extra, for the error message.
 
     Raises:
-        PlantError: The extra is not installed, with the command that installs it; or SciPy was imported before
-            SCIPY_ARRAY_API=1 was set, which crazyflow needs.
+        PlantError: The extra is not installed; the message contains the command that installs it. Or SciPy was imported
+            before SCIPY_ARRAY_API=1 was set, which crazyflow needs.
     """
     try:
         with contextlib.redirect_stdout(io.StringIO()):  # mujoco.mjx prints which accelerators it did not find
@@ -32,15 +32,15 @@ def import_extra(module: str, name: str, *, package: str | None = None, kind: st
 
 
 def check_extra(module: str, name: str, *, package: str | None = None) -> None:
-    """Check that a plant's package is there, without the time that an import takes.
+    """Check that a plant's package is installed, without the time of an import.
 
     Args:
-        module: Its module.
-        name: The extra, which is the plant's name, too.
-        package: Its name in the registry of packages; that of the extra by default.
+        module: Module of the package.
+        name: Name of the extra, which is also the name of the plant.
+        package: Name in the package registry; by default that of the extra.
 
     Raises:
-        PlantError: It is not, with the command that installs it.
+        PlantError: The package is not installed; the message contains the command that installs it.
     """
     if importlib.util.find_spec(module) is None:
         raise _missing(name, package, "plant", f"No module named {module!r}")

@@ -1,7 +1,7 @@
 """Faults of a measurement system: measured states that are wrong, late, repeated or missing.
 
-A fault is a pure function of the last measurements and of the number of the newest one, so that a flight repeats. No
-fault announces itself: the age and the validity of a measurement stay as the sensor model has them.
+A fault is a pure function of the last measurements and of the number of the newest one, so that a flight is
+reproducible. Faults are not announced: the age and the validity of a measurement stay as in the sensor model.
 """
 
 import abc
@@ -18,10 +18,10 @@ from ..physics.state import State, where
 
 
 class AbstractMeasurementFault(eqx.Module):
-    """What a measurement system reports instead of what it should report."""
+    """Mapping from correct measurements to the reports of a faulty measurement system."""
 
     interrupts: ClassVar[bool] = False
-    """Whether measurements are missing or have wrong times. Flights with such a fault are flown one by one."""
+    """Whether measurements are missing or have wrong times. Flights with such a fault are simulated one by one."""
 
     @property
     def memory(self) -> int:
@@ -39,23 +39,23 @@ class AbstractMeasurementFault(eqx.Module):
         """
 
     def is_missing(self, tick: int) -> bool:
-        """Return whether no measurement arrives at a tick."""
+        """Return whether the measurement of a tick is missing."""
         del tick
         return False
 
     def clock_error(self, tick: int) -> float:
-        """Return by how much the time of a measurement is wrong [s]."""
+        """Return the error of the time of a measurement [s]."""
         del tick
         return 0.0
 
 
 class VelocitySpikes(AbstractMeasurementFault):
-    """One velocity in every so many is wrong, as after two markers of a motion-capture system were swapped."""
+    """Periodically one velocity is wrong, as after a swap of two markers of a motion-capture system."""
 
     v: Float[Array, "3"]
     """Error, world [m/s]."""
     every: Int[Array, ""]
-    """[ticks]"""
+    """Period [ticks]."""
 
     def __call__(self, past: State, tick: Int[Array, ""], key: Key[Array, ""]) -> State:
         """Add the error to the last of every ``every`` velocities."""
@@ -64,17 +64,17 @@ class VelocitySpikes(AbstractMeasurementFault):
 
 
 class SwappedMarkers(AbstractMeasurementFault):
-    """One pose in every so many is that of a rigid body whose markers were confused: turned and shifted."""
+    """Periodically one pose is that of a rigid body with confused markers: rotated and shifted."""
 
     p: Float[Array, "3"]
     """Shift, world [m]."""
     rotation: Float[Array, "3"]
     """Rotation vector, body frame [rad]."""
     every: Int[Array, ""]
-    """[ticks]"""
+    """Period [ticks]."""
 
     def __call__(self, past: State, tick: Int[Array, ""], key: Key[Array, ""]) -> State:
-        """Turn and shift the last of every ``every`` poses."""
+        """Rotate and shift the last of every ``every`` poses."""
         x = _newest(past)
         now = _last_of(tick, self.every).astype(x.p.dtype)
         turned = so3.mul(x.R, so3.exp(now * self.rotation.astype(x.p.dtype)))
@@ -97,7 +97,7 @@ class Late(AbstractMeasurementFault):
 
 
 class Frozen(AbstractMeasurementFault):
-    """The measurement system stops now and then and repeats its last state with new times."""
+    """The measurement system stops periodically and repeats its last state with new times."""
 
     every: Int[Array, ""]
     """Time between two stops [ticks]."""
@@ -161,12 +161,12 @@ class Biased(AbstractMeasurementFault):
 
 
 class DriftingPosition(AbstractMeasurementFault):
-    """The position drifts back and forth, as the estimate of a camera does, and the velocity does not show it."""
+    """The position drifts back and forth, as the estimate of a camera does; the velocity does not contain the drift."""
 
     amplitude: Float[Array, "3"]
-    """World [m]."""
+    """Amplitude, world [m]."""
     period: Float[Array, ""]
-    """[ticks]"""
+    """Period [ticks]."""
 
     def __call__(self, past: State, tick: Int[Array, ""], key: Key[Array, ""]) -> State:
         """Add the drift of this tick."""
@@ -176,7 +176,7 @@ class DriftingPosition(AbstractMeasurementFault):
 
 
 class Gaps(AbstractMeasurementFault):
-    """No measurement arrives for a while; the vehicle goes on with the last command."""
+    """Measurements are periodically missing for a while; the vehicle continues with the last command."""
 
     every: int = eqx.field(static=True)
     """Time between two gaps [ticks]."""
@@ -194,12 +194,12 @@ class Gaps(AbstractMeasurementFault):
 
 
 class JumpingClock(AbstractMeasurementFault):
-    """The clock of the measurements jumps ahead, and back again later."""
+    """The clock of the measurements jumps ahead, and later back again."""
 
     every: int = eqx.field(static=True)
     """Time between two jumps [ticks]."""
     jump: float = eqx.field(static=True)
-    """[s]"""
+    """Size of a jump [s]."""
     interrupts: ClassVar[bool] = True
 
     def __call__(self, past: State, tick: Int[Array, ""], key: Key[Array, ""]) -> State:

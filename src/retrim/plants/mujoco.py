@@ -38,13 +38,13 @@ MODEL = """
   </actuator>
 </mujoco>
 """
-"""Units are MuJoCo's, which are SI. Density and viscosity: air. The thrust lags behind its command as the motors do."""
+"""MuJoCo model in SI units. Density and viscosity are those of air. The thrust has the time constant of the motors."""
 
 
 def semi_axes(drag_area: np.ndarray) -> np.ndarray:
-    """Of the ellipsoid that has ``drag_area`` [m^2] as its silhouette along each axis [m].
+    """Return the semi-axes [m] of the ellipsoid with ``drag_area`` [m^2] as its silhouette along each axis.
 
-    Silhouettes are pi b c, pi a c and pi a b. MuJoCo's drag is density k A v^2; k = 0.5 makes A our c A.
+    Silhouettes are pi b c, pi a c and pi a b. MuJoCo's drag is density k A v^2; with k = 0.5, A is our c A.
     """
     return math.sqrt(np.prod(drag_area) / math.pi**3) / (drag_area / math.pi)
 
@@ -52,10 +52,10 @@ def semi_axes(drag_area: np.ndarray) -> np.ndarray:
 class MujocoPlant(ExternalPlant):
     """One rigid body in MuJoCo: thrust at its centre, torques by a rate loop, drag of the medium on its body.
 
-    2 ms steps. The drag is that of the vehicle's ``drag_area``; there is no rotor drag, so that wind moves it less
-    than it moves the other plants. The rate loop is proportional: the torque of a weak rotor leaves it with a steady
-    error. It knows of no load. Loads and weak rotors are heard once per tick, wind and push at each step. There is no
-    ground.
+    Steps are 2 ms long. The drag is that of the vehicle's ``drag_area``; rotor drag is not modelled, so that wind moves
+    this plant less than the other plants. The rate loop is proportional: the torque of a weak rotor causes a steady
+    error. The rate loop does not account for loads. Loads and weak rotors are updated once per tick, wind and push at
+    each step. The ground is not modelled.
     """
 
     def __init__(self, vehicle: Vehicle, disturbance: Disturbance, *, dt: float = 0.02) -> None:
@@ -66,7 +66,7 @@ class MujocoPlant(ExternalPlant):
         self._inertia = np.asarray(vehicle.inertia, dtype=np.float64)
         arm = np.asarray(vehicle.arm, dtype=np.float64)
         self._levers = np.array([arm[1], arm[0], float(vehicle.torque_ratio)])
-        # As much as two rotors at full thrust and two at rest give:
+        # Torque of two rotors at full thrust and two at rest:
         self._torque_max = self._levers * float(vehicle.thrust_max) / 2.0
         self._mujoco: Any = import_extra("mujoco", "mujoco")
         text = MODEL.format(
@@ -79,7 +79,7 @@ class MujocoPlant(ExternalPlant):
             tau=float(vehicle.motor_tau),
         )
         self._model = self._mujoco.MjModel.from_xml_string(text)
-        self._model.geom_fluid[0, 6:] = 0.0  # no added mass: the ellipsoid stands for drag areas, it is not solid
+        self._model.geom_fluid[0, 6:] = 0.0  # no added mass: the ellipsoid represents drag areas, it is not solid
         self._data = self._mujoco.MjData(self._model)
         self._load = np.zeros(4)
 
@@ -108,11 +108,11 @@ class MujocoPlant(ExternalPlant):
         return Pose(data.qpos[:3].copy(), R.reshape(3, 3), data.qvel[:3].copy(), data.qvel[3:].copy())
 
     def _carry(self, load: np.ndarray) -> None:
-        """Let the body weigh ``load`` = [mass [kg], inertia [kg m^2]] more than the vehicle."""
+        """Add ``load`` = [mass [kg], inertia [kg m^2]] to the mass and inertia of the vehicle."""
         if not np.array_equal(load, self._load):
             self._model.body_mass[1] = self._mass + load[0]
             self._model.body_inertia[1] = self._inertia + load[1:]
-            spare = self._mujoco.MjData(self._model)  # what it is given, it moves
+            spare = self._mujoco.MjData(self._model)  # mj_setConst changes the data that it receives
             self._mujoco.mj_setConst(self._model, spare)
             self._load = load
 

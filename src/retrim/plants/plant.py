@@ -1,4 +1,4 @@
-"""The one imperative seam: simulators, other engines and vehicles stand behind the same three calls."""
+"""The imperative interface to the world: simulators, other engines and vehicles implement the same three calls."""
 
 import math
 from types import TracebackType
@@ -15,24 +15,24 @@ P = TypeVar("P")
 
 
 class Measurement(NamedTuple):
-    """What a plant measured at the end of a tick."""
+    """Measurement of a plant at the end of a tick."""
 
     t: float
-    """Time by the plant's clock [s]; it may start anywhere."""
+    """Time by the plant's clock [s]; its origin is arbitrary."""
     x: State
     """Measured position, attitude and velocity."""
     omega: Float[Array, "3"] | None = None
     """Body rates [rad/s], if they are measured."""
     a: Float[Array, "3"] | None = None
-    """Acceleration, world [m/s^2], if it is measured; the mean over the tick."""
+    """Mean acceleration over the tick, world [m/s^2], if it is measured."""
     motor_speeds: Float[Array, "4"] | None = None
     """Rotor speeds [rad/s], if they are measured."""
     battery: float | None = None
-    """Charge left, 0 to 1, if it is known."""
+    """Remaining charge, 0 to 1, if it is known."""
     age: float = 0.0
     """Time since the state was valid [s]."""
     truth: State | None = None
-    """True state, where the plant knows better than its sensors. For scores, never for pilots."""
+    """True state, if it is available in addition to the measured one. For scores, never for pilots."""
 
     @property
     def p(self) -> Float[Array, "3"]:
@@ -51,13 +51,13 @@ class Measurement(NamedTuple):
 
     @property
     def true_state(self) -> State:
-        """True state, or the measured one where no other is known."""
+        """True state, or the measured one if the true state is not available."""
         return self.x if self.truth is None else self.truth
 
 
 @runtime_checkable
 class Plant(Protocol):
-    """Three calls and a context manager: leaving it stops the plant.
+    """Three calls and a context manager, whose exit stops the plant.
 
     A plant derives from this class, or has the same methods.
     """
@@ -69,7 +69,7 @@ class Plant(Protocol):
         """Start a flight.
 
         Args:
-            x0: State in which it starts; None for where the vehicle is.
+            x0: Initial state; None for the current state of the vehicle.
 
         Returns:
             The first measurement.
@@ -80,17 +80,17 @@ class Plant(Protocol):
         ...
 
     def step(self, u: Command) -> tuple[Measurement, Command]:
-        """Apply a command for one tick and block until it is over.
+        """Apply a command for one tick and block until the tick is over.
 
         Args:
             u: The command.
 
         Returns:
-            The measurement at the end of the tick, and the command that was really accepted: ``u`` itself unless the
-            plant limited it.
+            The measurement at the end of the tick, and the command that was accepted: ``u`` itself unless the plant
+            limited it.
 
         Raises:
-            PlantError: The command is not finite (it then never reaches the vehicle), or the plant was stopped.
+            PlantError: The command is not finite (it is then not sent to the vehicle), or the plant was stopped.
         """
         ...
 
@@ -110,7 +110,7 @@ class Plant(Protocol):
 
 
 def as_numpy(u: Command) -> np.ndarray:
-    """Return [c, omega] as a NumPy array, without an operation of JAX."""
+    """Return [c, omega] as a NumPy array, without a JAX operation."""
     return np.append(np.asarray(u.c), np.asarray(u.omega))
 
 
@@ -122,10 +122,10 @@ def check_command(u: Command, plant: str) -> np.ndarray:
         plant: Name of the plant, for the message.
 
     Returns:
-        The command as :func:`as_numpy` gives it.
+        The command as returned by :func:`as_numpy`.
 
     Raises:
-        PlantError: It names the plant and the entry.
+        PlantError: The command is not finite; the message contains the plant and the entry.
     """
     wanted = as_numpy(u)
     for name, value in zip(("c", "omega[0]", "omega[1]", "omega[2]"), wanted.tolist(), strict=True):
@@ -135,7 +135,7 @@ def check_command(u: Command, plant: str) -> np.ndarray:
 
 
 def limited(u: Command, wanted: np.ndarray, low: np.ndarray, high: np.ndarray) -> Command:
-    """Return ``u``, which is ``wanted`` as an array, within limits of [c, omega]; ``u`` itself if it already is."""
+    """Return ``u`` clipped to limits of [c, omega], or ``u`` itself if it is within them; ``wanted`` is its array."""
     if (low <= wanted).all() and (wanted <= high).all():
         return u
     accepted = np.clip(wanted, low, high).astype(wanted.dtype)

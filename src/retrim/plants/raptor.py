@@ -1,8 +1,8 @@
 """A vehicle whose motors RAPTOR commands: the foundation policy, 2,084 weights, without a rate controller.
 
-It was distilled from a thousand teachers, each for a vehicle of its own, and adapts in its hidden state (Eschmann,
-Albani and Loianno 2025). It runs on board, at 100 Hz, on what it observes of its vehicle without delay; the reference
-is what it is given from outside. Differences from the reference are clipped as in the flight firmware that has it.
+It was distilled from a thousand teachers, each for a different vehicle, and adapts through its hidden state (Eschmann,
+Albani and Loianno 2025). It runs on board at 100 Hz and observes its vehicle without delay; only the reference comes
+from outside. Differences from the reference are clipped as in the flight firmware that contains it.
 """
 
 import functools
@@ -24,12 +24,12 @@ from ..physics.substep import SUBSTEP, AbstractSubstepDynamics, RotorState
 from .extras import import_extra
 
 PERIOD = 10  # [ms]
-FARTHEST, FASTEST = 0.5, 1.0  # [m], [m/s]: differences that it is shown, at most
-ORDER = (0, 2, 1, 3)  # its rotors are front-right, back-right, back-left, front-left; ours, of those
+FARTHEST, FASTEST = 0.5, 1.0  # [m], [m/s]: largest differences in its observation
+ORDER = (0, 2, 1, 3)  # its rotor for each of ours; its order is front-right, back-right, back-left, front-left
 
 
 class RaptorNet(eqx.Module):
-    """The network: a layer, a gated recurrent unit, a layer."""
+    """The network: a linear layer, a gated recurrent unit, and a linear layer."""
 
     first: eqx.nn.Linear
     unit: eqx.nn.GRUCell
@@ -39,14 +39,14 @@ class RaptorNet(eqx.Module):
 
     @classmethod
     def load(cls) -> "RaptorNet":
-        """Return the network that the package ``foundation-policy`` brings.
+        """Return the network of the package ``foundation-policy``.
 
         Raises:
-            PlantError: It is not installed.
+            PlantError: The package is not installed.
         """
         first, unit, last = _layers()
         inputs, hidden = unit.weights_input.shape[1], unit.hidden_dim
-        # The library's unit has one bias for what both inputs of a gate add up to, and one for the candidate alone.
+        # The library's unit has one bias for the sum of both inputs of a gate, and a separate one for the candidate.
         both = unit.biases_input + np.append(unit.biases_hidden[: 2 * hidden], np.zeros(hidden))
         weights = unit.weights_input, unit.weights_hidden, both, unit.biases_hidden[2 * hidden :]
         cell = eqx.tree_at(
@@ -59,12 +59,12 @@ class RaptorNet(eqx.Module):
     def __call__(
         self, hidden: Float[Array, " hidden"], o: Float[Array, "22"]
     ) -> tuple[Float[Array, "4"], Float[Array, " hidden"]]:
-        """Return four motor commands, and the hidden state after them.
+        """Return four motor commands and the next hidden state.
 
         Args:
             hidden: Hidden state.
-            o: Differences of position [m] and velocity [m/s] from the reference around the attitude, row by row (12 and
-                3 numbers), body rates [rad/s], and the last commands.
+            o: Observation: position difference from the reference [m], attitude by rows (together 12 numbers), velocity
+                difference [m/s] (3 numbers), body rates [rad/s], and the last commands.
         """
         hidden = self.unit(jax.nn.relu(self.first(o)), hidden)
         return self.last(hidden), hidden
@@ -72,7 +72,7 @@ class RaptorNet(eqx.Module):
 
 @functools.cache
 def _layers() -> tuple[Any, ...]:
-    """The package's layers, NumPy arrays: a file is read, and its example checked, once and not for each flight."""
+    """Return the package's layers as NumPy arrays; the file is read and its example checked once, not per flight."""
     return tuple(
         import_extra("foundation_policy", "raptor", package="foundation-policy", kind="method").Raptor().layers
     )
@@ -92,13 +92,13 @@ class RaptorState(eqx.Module):
     body: BemState
     hidden: Float[Array, " hidden"]
     action: Float[Array, "4"]
-    """Last commands, as the network gave them; motors take -1 to 1."""
+    """Last commands, as the network returned them; motors accept -1 to 1."""
     ms: Int[Array, ""]
-    """Milliseconds flown."""
+    """Time since the start of the flight [ms]."""
 
 
 class RaptorQuadrotor(AbstractSubstepDynamics[RaptorState]):
-    """A blade-element vehicle with RAPTOR on board; commands from outside are not listened to."""
+    """A blade-element vehicle with RAPTOR on board; it ignores commands from outside."""
 
     base: BemQuadrotor
     net: RaptorNet
@@ -107,11 +107,11 @@ class RaptorQuadrotor(AbstractSubstepDynamics[RaptorState]):
 
     @property
     def dt(self) -> float:
-        """Control tick of the loop outside [s]."""
+        """Control tick of the outer loop [s]."""
         return self.base.dt
 
     def init(self, x: State) -> RaptorState:
-        """Return the state of a vehicle that hovers, with RAPTOR switched on."""
+        """Return the state of a hovering vehicle with RAPTOR switched on."""
         zero = jnp.zeros(4, dtype=x.p.dtype)
         return RaptorState(self.base.init(x), self.net.start.astype(x.p.dtype), zero, jnp.array(0))
 

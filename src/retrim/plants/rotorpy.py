@@ -11,15 +11,16 @@ from ..physics.state import STANDARD_GRAVITY
 from .external import ExternalPlant, Pose, thrust_limits
 from .extras import import_extra
 
-RATE_GAIN = 20.0  # [1/s]; rotorpy's own default, 1 1/s, lets the rates lag by a second
-STEPS = 2  # rotorpy's rate loop runs once per step of its integrator: at 100 Hz, as its own simulations do
+RATE_GAIN = 20.0  # [1/s]; with rotorpy's own default, 1 1/s, the rates lag by a second
+STEPS = 2  # rotorpy's rate loop runs once per step of its integrator: at 100 Hz, as in its own simulations
 
 
 class RotorpyPlant(ExternalPlant):
     """rotorpy's AscTec Hummingbird (0.5 kg): its rate loop, motors (5 ms), rotor and body drag, integrator.
 
-    Wind and push hold for a tick. The push is an external acceleration; rotorpy has no input for one, so that the
-    weight, a force in the world frame that rotorpy uses for nothing else, takes it in. There is no ground.
+    Wind and push are constant during a tick. The push is an external acceleration; rotorpy does not have an input for
+    it. It is therefore added to the weight, a force in the world frame that rotorpy uses for no other purpose. The
+    ground is not modelled.
     """
 
     def __init__(self, disturbance: Disturbance, *, dt: float = 0.02) -> None:
@@ -32,7 +33,7 @@ class RotorpyPlant(ExternalPlant):
 
     def _launch(self, x: Pose) -> None:
         hover = math.sqrt(self._quad.mass * STANDARD_GRAVITY / (4.0 * self._quad.k_eta))
-        q = self._rotation.from_matrix(x.R).as_quat()  # scalar last, as rotorpy's
+        q = self._rotation.from_matrix(x.R).as_quat()  # scalar last, as in rotorpy
         self._state = {"x": x.p, "v": x.v, "q": q, "w": np.zeros(3), "rotor_speeds": np.full(4, hover)}
 
     def _advance(self, u: np.ndarray, effects: ExternalEffects) -> Pose:

@@ -20,9 +20,9 @@ class SensorModel(eqx.Module):
     attitude: Float[Array, ""]
     """Standard deviation of a rotation about each body axis [rad]."""
     dropout: Float[Array, ""]
-    """Probability that a sample is lost; the last one then stands."""
+    """Probability that a sample is lost; the previous sample is then used again."""
     latency: int = eqx.field(static=True)
-    """Age of a sample when it arrives [ms]; :attr:`age` says how old it is when it is looked at."""
+    """Age of a sample at its arrival [ms]; :attr:`age` is its age at the end of a tick."""
     period: int = eqx.field(static=True, default=10)
     """Time between samples [ms]."""
     gyro: float = eqx.field(static=True, default=0.0)
@@ -31,7 +31,7 @@ class SensorModel(eqx.Module):
     """Standard deviation of the acceleration per axis [m/s^2]."""
 
     def __check_init__(self) -> None:
-        """Raise ``ValueError`` if a deviation is negative or a probability is none."""
+        """Raise ``ValueError`` if a deviation or time is negative, or the probability is not in [0, 1)."""
         if self.latency < 0 or self.period < 1:
             raise ValueError(f"SensorModel: latency = {self.latency} ms, period = {self.period} ms")
         if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(self)):
@@ -54,19 +54,19 @@ class SensorModel(eqx.Module):
         gyro: float = 0.0,
         accelerometer: float = 0.0,
     ) -> "SensorModel":
-        """Build a sensor model from plain numbers; by default exact, without latency, every 10 ms.
+        """Build a sensor model from plain numbers; the default is exact, without latency, every 10 ms.
 
         Args:
             position: Standard deviation per axis [m].
             velocity: Standard deviation per axis [m/s].
             attitude: Standard deviation per body axis [rad].
             dropout: Probability that a sample is lost.
-            latency: Age of a sample when it arrives [ms].
+            latency: Age of a sample at its arrival [ms].
             gyro: Standard deviation of the body rates per axis [rad/s].
             accelerometer: Standard deviation of the acceleration per axis [m/s^2].
 
         Raises:
-            ValueError: A deviation or time is negative, or the probability is none.
+            ValueError: A deviation or time is negative, or the probability is not in [0, 1).
         """
         return cls(
             jnp.array(position),
@@ -80,16 +80,16 @@ class SensorModel(eqx.Module):
 
     @property
     def held(self) -> int:
-        """Number of samples under way, and the one that has arrived."""
+        """Number of samples: those in transit, and the one that has arrived."""
         return -(-self.latency // self.period) + 1
 
     @property
     def age(self) -> float:
-        """How old the newest sample that has arrived is at the end of a tick [s]: the latency, in whole periods."""
+        """Age of the newest arrived sample at the end of a tick [s]: the latency, rounded up to whole periods."""
         return 1e-3 * (self.period * (self.held - 1))
 
     def noisy(self, x: State, key: Key[Array, ""]) -> State:
-        """One sample of ``x``."""
+        """Return one noisy sample of ``x``."""
         kp, kv, kr = random.split(key, 3)
         dtype = x.p.dtype
         p, v, r = (random.normal(k, (3,), dtype) for k in (kp, kv, kr))
@@ -99,9 +99,9 @@ class SensorModel(eqx.Module):
         """Sample true states.
 
         Args:
-            queue: Samples that were under way, oldest first, :attr:`held` of them.
+            queue: Samples, oldest first, :attr:`held` of them.
             xs: True states, one per period (leading axis).
-            key: Consumed.
+            key: Seed of noise and dropouts; consumed.
 
         Returns:
             The queue after the last sample.

@@ -34,37 +34,37 @@ class Reports(eqx.Module):
 
 
 class SimState(eqx.Module):
-    """Everything the simulation remembers."""
+    """State of the simulation."""
 
     model: Any
-    """The model's own state."""
+    """State of the model."""
     queue: CommandQueue
-    """Commands issued, those that have acted, too."""
+    """Issued commands, including those that have already acted."""
     samples: State
-    """Samples of the state, oldest first: the one that has arrived, and those that the latency still holds back."""
+    """Samples of the state, oldest first: the one that has arrived, and those that the latency still delays."""
     a: Float[Array, "3"]
     """Mean acceleration over the last tick, world [m/s^2]."""
     reports: Reports | None = None
-    """None: measurements have no fault."""
+    """Memory of the measurement fault; None without a fault."""
 
 
 class Simulation(eqx.Module):
-    """All of a simulated plant that is a value: a flight is a pure function of it, a start and commands."""
+    """The constant part of a simulated plant: a flight is a pure function of it, the initial state and the commands."""
 
     model: AbstractSubstepDynamics[Any]
     """The vehicle."""
     disturbance: Disturbance
     """External effects, as a function of time since the start of the flight and state."""
     sensors: SensorModel | None
-    """None: every measurement is exact."""
+    """Sensor model; None for exact measurements."""
     key: Key[Array, ""]
-    """Seed of noise and dropouts, which follow from it and the tick, so that a flight repeats."""
+    """Seed of noise and dropouts. They depend only on it and the tick, so that a flight is reproducible."""
     delay: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(0.02))
-    """Transport delay of commands [s]. Another one is not another program."""
+    """Transport delay of commands [s]. A change does not cause recompilation."""
     fault: AbstractMeasurementFault | None = None
     """Fault of the measurements."""
     longest_delay: float = eqx.field(static=True, default=LONGEST_DELAY)
-    """Longest delay that the queue of commands has room for [s]."""
+    """Capacity of the command queue as a delay [s]."""
 
     def __check_init__(self) -> None:
         """Raise ``ValueError`` for an impossible delay, and if a tick is not a whole number of samples."""
@@ -76,15 +76,15 @@ class Simulation(eqx.Module):
 
     @property
     def age(self) -> float:
-        """How old measurements are [s]."""
+        """Age of measurements [s]."""
         return 0.0 if self.sensors is None else self.sensors.age
 
     def undisturbed(self) -> "Simulation":
-        """Return the same without its disturbance."""
+        """Return a copy without the disturbance."""
         return dataclasses.replace(self, disturbance=_calm)
 
     def launch(self, x0: State) -> SimState:
-        """Return the state of a plant that hovers at ``x0``, with hover commands under way and one sample of ``x0``."""
+        """Return the state of a plant that hovers at ``x0``, with queued hover commands and one sample of ``x0``."""
         queue = CommandQueue.of(Command.hover(x0.p.dtype), self.model.dt, longest=self.longest_delay)
         held = 1 if self.sensors is None else self.sensors.held
         sample = x0 if self.sensors is None else self.sensors.noisy(x0, random.fold_in(self.key, FIRST_SAMPLE))
@@ -131,17 +131,17 @@ class Simulation(eqx.Module):
         return Reports(past, self.fault(past, tick, key))
 
     def time(self, tick: Int[ArrayLike, ""], dtype: Any) -> Float[Array, ""]:
-        """Return the time since the start of the flight [s]: not a sum, which drifts off in single precision."""
+        """Return the time since the start of the flight [s]; it is not a sum, which would drift in single precision."""
         return jnp.asarray(tick, dtype) * self.model.dt
 
     def measured(self, s: SimState) -> State:
-        """Return the newest sample that has arrived, as it is reported."""
+        """Return the newest sample that has arrived, as reported by the measurement system."""
         if s.reports is not None:
             return s.reports.reported
         return jax.tree.map(lambda leaf: leaf[0], s.samples)  # type: ignore[no-any-return]
 
     def inertial(self, s: SimState, tick: Int[ArrayLike, ""]) -> tuple[Float[Array, "3"], Float[Array, "3"]] | None:
-        """Return measured body rates [rad/s] and acceleration, world [m/s^2]; None where the model has no rates.
+        """Return measured body rates [rad/s] and acceleration, world [m/s^2]; None if the model does not have rates.
 
         Args:
             s: State at the end of a tick.
@@ -159,7 +159,7 @@ class Simulation(eqx.Module):
         return self.model.state(s.model)
 
     def within_limits(self, u: Command) -> Command:
-        """Return ``u`` as the vehicle accepts it."""
+        """Return ``u``, clipped to the limits of the vehicle."""
         return u if self.model.command_limits is None else u.within(*self.model.command_limits)
 
 
@@ -192,12 +192,13 @@ class SimPlant(Plant):
             model: The vehicle.
             disturbance: External effects as a function of time since the reset and state.
             delay_s: Transport delay of commands [s].
-            sensors: None: every measurement is exact.
-            fault: Fault of the measurements; None for none.
-            seed: Noise and dropouts of the sensors follow from it and the tick, so that a flight repeats.
+            sensors: Sensor model; None for exact measurements.
+            fault: Fault of the measurements; None for correct measurements.
+            seed: Seed of noise and dropouts of the sensors. They depend only on it and the tick, so that a flight is
+                reproducible.
 
         Raises:
-            ValueError: The delay is negative, or a tick is no whole number of sensor periods.
+            ValueError: The delay is negative, or a tick is not a whole number of sensor periods.
         """
         if not 0.0 <= delay_s < math.inf:
             raise ValueError(f"SimPlant: delay_s = {delay_s} s must be a finite, non-negative number of seconds")
@@ -212,9 +213,9 @@ class SimPlant(Plant):
         self._ticks = 0
 
     def reset(self, x0: State | None) -> Measurement:
-        """Hover at ``x0``; without one, 1 m above the ground."""
+        """Hover at ``x0``; if it is None, 1 m above the ground."""
         start = State.at(jnp.array([0.0, 0.0, 1.0])) if x0 is None else x0
-        self._state = _launch(self.simulation.undisturbed(), start)  # one program, whatever disturbs it later
+        self._state = _launch(self.simulation.undisturbed(), start)  # one compilation for all disturbances
         self._ticks = 0
         return self._measurement()
 
@@ -229,11 +230,11 @@ class SimPlant(Plant):
             self._state = _advance(self.simulation, self._state, accepted, np.int32(self._ticks))
             self._ticks += 1
             if fault is None or not fault.is_missing(self._ticks):
-                break  # the vehicle goes on with the last command while no measurement arrives
+                break  # in a gap of the measurements the vehicle continues with the last command
         return self._measurement(), accepted
 
     def disturb(self, disturbance: Disturbance) -> None:
-        """Fly on under another disturbance; one of the same kind with other numbers compiles nothing."""
+        """Change the disturbance in flight; new numbers for the same kind do not cause recompilation."""
         self.simulation = dataclasses.replace(self.simulation, disturbance=disturbance)
 
     def _measurement(self) -> Measurement:
@@ -251,5 +252,5 @@ class SimPlant(Plant):
         return Measurement(t, simulation.measured(state), omega, a, speeds, age=simulation.age, truth=truth)
 
     def stop(self) -> None:
-        """Forget the flight."""
+        """Discard the state of the flight."""
         self._state = None

@@ -1,1 +1,1 @@
-"""Links to vehicles that are not ours to simulate: autopilots, and firmware in the place of a rate controller."""
+"""Links to vehicles outside the simulation: autopilots, and firmware that replaces the rate controller."""

@@ -1,4 +1,4 @@
-"""Betaflight as a plant: its real firmware as the rate controller of a blade-element vehicle, in real time."""
+"""Betaflight as a plant: its real firmware is the rate controller of a blade-element vehicle, in real time."""
 
 import math
 import time
@@ -19,27 +19,27 @@ from .patience import KeepOn
 from .vehicle_plant import VehiclePlant
 from .vehicle_state import VehicleState
 
-HEARD_S, ARMS_S, SPINS_S = 2.0, 6.0, 0.4  # [s]: the receiver is up; arming; motors reach hover
-MARGIN = 1.05  # by which a stick at its end asks for more than the fastest command
-ON = 0.8 * IDLE  # motors of an armed board
+HEARD_S, ARMS_S, SPINS_S = 2.0, 6.0, 0.4  # [s]: start of the receiver; arming; motors reach hover
+MARGIN = 1.05  # ratio of the body rate of a stick at its end to the fastest command
+ON = 0.8 * IDLE  # smallest motor command of an armed board
 
 
 class BetaflightPlant(VehiclePlant):
-    """A vehicle whose motors Betaflight commands. The firmware runs beside, as a process; the world is simulated.
+    """A vehicle whose motors Betaflight commands. The firmware runs in its own process; the world is simulated.
 
-    There is no autopilot that takes off or lands: the vehicle stands on a stand, its motors turning, until the first
-    command lets it go, and is taken away when the flight is over. On a board the companion's last command is held for
-    ever; here the world ends with the process that flies it.
+    There is no autopilot for take-off and landing: the vehicle stands on a stand with turning motors until the first
+    command releases it, and is removed when the flight is over. A real board holds the companion's last command for
+    ever; here the world ends with the process that flies the vehicle.
     """
 
     def __init__(self, model: BemQuadrotor, disturbance: Disturbance, low: np.ndarray, high: np.ndarray) -> None:
-        """Build a plant; nothing is started before it connects.
+        """Build a plant; it does not start the firmware before it connects.
 
         Args:
-            model: The vehicle; of its rate controller only the thrust map is used, to find the throttle.
-            disturbance: External effects, as a function of the time since the vehicle was let go and of its state.
+            model: The vehicle; from its rate controller only the thrust map is used, to compute the throttle.
+            disturbance: External effects, as a function of the time since the release and of the state.
             low: Smallest command [c, omega].
-            high: Largest one.
+            high: Largest command [c, omega].
         """
         super().__init__(model.dt, low, high)
         self._model, self._disturbance = model, disturbance
@@ -56,7 +56,8 @@ class BetaflightPlant(VehiclePlant):
             return
         if not keep_on():
             raise PlantError("the flight was given up before the hand-over")
-        self._firmware = Firmware(find_firmware(), self._steps)  # before the world: what hears a state too early dies
+        # before the world: a firmware that receives a state too early crashes
+        self._firmware = Firmware(find_firmware(), self._steps)
         try:
             world = self._world = World(self._model, self._disturbance, math.radians(10.0 * self._steps))
             self.until(lambda: False, HEARD_S, keep_on)
@@ -68,7 +69,7 @@ class BetaflightPlant(VehiclePlant):
             raise
 
     def take_off(self, p: np.ndarray | None, yaw: float | None, keep_on: KeepOn = lambda: True) -> None:
-        """Put the vehicle on the stand, its motors at hover."""
+        """Put the vehicle on the stand with its motors at hover."""
         world = self._running()
         place = jnp.array([0.0, 0.0, 1.0]) if p is None else jnp.asarray(p, dtype=float)
         world.place(State(place, rotz(jnp.asarray(yaw or 0.0, dtype=place.dtype)), jnp.zeros_like(place)))
@@ -89,7 +90,7 @@ class BetaflightPlant(VehiclePlant):
         return now
 
     def transmit(self, u: np.ndarray) -> np.ndarray:
-        """Move the sticks; the first command lets the vehicle go."""
+        """Move the sticks; the first command releases the vehicle."""
         world = self._running()
         world.tell(self._throttle(float(u[0])), u[1:])
         if not self._flies:
@@ -98,11 +99,11 @@ class BetaflightPlant(VehiclePlant):
         return u
 
     def wait(self, until: float) -> None:
-        """Wait; the world goes on by itself."""
+        """Wait; the world runs in its own thread."""
         time.sleep(max(0.0, until - time.monotonic()))
 
     def land(self) -> None:
-        """Take the vehicle away, and end the firmware."""
+        """Remove the vehicle, and end the firmware."""
         world, self._world = self._world, None
         firmware, self._firmware = self._firmware, None
         if world is not None:
@@ -118,5 +119,5 @@ class BetaflightPlant(VehiclePlant):
         return self._world
 
     def _throttle(self, c: float) -> float:
-        """Return the throttle at which the rotors give c per mass, by the thrust map that the companion believes in."""
+        """Return the throttle for a thrust of c per mass, by the thrust map that the companion assumes."""
         return max(1e-3, throttle_of(float(self._motor(jnp.asarray(max(c, 0.0))))))

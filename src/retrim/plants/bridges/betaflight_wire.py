@@ -1,4 +1,4 @@
-"""What Betaflight's simulated board (SITL, 4.6) says and hears over UDP, little endian."""
+"""UDP packets from and to Betaflight's simulated board (SITL, 4.6), little endian."""
 
 import struct
 
@@ -6,21 +6,21 @@ import numpy as np
 
 from ...errors import MessageError
 
-MOTORS, STATE, STICKS, CLI = 9002, 9003, 9004, 5761  # ports: motors come from it, the others are its own
+MOTORS, STATE, STICKS, CLI = 9002, 9003, 9004, 5761  # ports: the board sends motors, and listens on the others
 CENTRE, SPAN, LOW, HIGH = 1500, 500, 1000, 2000  # [us] of a stick
-THROTTLE_FROM, THROTTLE_SPAN = 1050.0, 950.0  # [us]: where the throttle begins, and how far it goes
-IDLE = 0.055  # share of a motor's range below which an armed one does not go
-CHANNELS, ARM = 16, 4  # channels of a receiver, and which of them arms
+THROTTLE_FROM, THROTTLE_SPAN = 1050.0, 950.0  # [us]: start and length of the throttle range
+IDLE = 0.055  # smallest share of a motor's range while it is armed
+CHANNELS, ARM = 16, 4  # number of channels of a receiver, and index of the one that arms
 GYRO = np.array([1.0, -1.0, -1.0])  # from forward-left-up body rates
 RATE_STICKS = np.array([1.0, 1.0, -1.0])  # roll, pitch and yaw up, from forward-left-up body rates
-OUR_ROTORS = [0, 1, 3, 2]  # its motors are front-right, back-left, front-left, back-right; ours end the other way round
+OUR_ROTORS = [0, 1, 3, 2]  # its motors are front-right, back-left, front-left, back-right; our last two are swapped
 _STATE, _STICKS, _MOTORS = struct.Struct("<18d"), struct.Struct("<d16H"), struct.Struct("<4f")
 
 
 def state_packet(omega: np.ndarray) -> bytes:
-    """Return a packet with body rates; a board that flies by rates looks at nothing else.
+    """Return a packet with body rates; a board in rate mode ignores all other values.
 
-    Its time stands still: the board then takes its own clock, which the jitter of stamps would carry away.
+    Its time stamp is constant. The board then uses its own clock, which the jitter of varying stamps would disturb.
 
     Args:
         omega: Body rates, forward-left-up [rad/s].
@@ -33,9 +33,9 @@ def sticks_packet(throttle: float, omega: np.ndarray, fastest: float, *, armed: 
     """Return a packet of a receiver.
 
     Args:
-        throttle: Share of the throttle, 0 to 1; at 0 the stick is at its end, as it must be to arm.
+        throttle: Share of the throttle, 0 to 1; at 0 the stick is at its lower end, which arming requires.
         omega: Body rates, forward-left-up [rad/s].
-        fastest: What a stick at its end asks for [rad/s].
+        fastest: Body rate of a stick at its end [rad/s].
         armed: Whether the switch is on.
     """
     roll, pitch, yaw = np.clip(CENTRE + SPAN * RATE_STICKS * omega / fastest, LOW, HIGH).round().astype(int)
@@ -49,7 +49,7 @@ def motors_of(packet: bytes) -> np.ndarray:
     """Return the four motors of a packet, 0 to 1, in the order of our rotors.
 
     Raises:
-        MessageError: It is no packet of motors.
+        MessageError: The bytes are not a packet of motors.
     """
     if len(packet) != _MOTORS.size:
         raise MessageError(f"{len(packet)} bytes are no packet of motors, which has {_MOTORS.size}")
@@ -60,15 +60,15 @@ def motors_of(packet: bytes) -> np.ndarray:
 
 
 def throttle_of(motor: float) -> float:
-    """Return the share of the throttle at which all motors go at ``motor``."""
+    """Return the share of the throttle at which all motors are at ``motor``."""
     return float(np.clip((motor - IDLE) / (1.0 - IDLE), 0.0, 1.0))
 
 
 def settings(steps: int) -> list[str]:
-    """Return the lines that make a board fly by rates, from a receiver, without what smooths its sticks.
+    """Return the settings of a board in rate mode with a receiver and without smoothing of the sticks.
 
     Args:
-        steps: A stick at its end asks for so many times 10 deg/s.
+        steps: Body rate of a stick at its end, in units of 10 deg/s.
     """
     rates = [f"set {axis}_{name} = {value}" for axis in ("roll", "pitch", "yaw")
              for name, value in (("rc_rate", steps), ("srate", steps), ("expo", 0))]  # fmt: skip

@@ -1,4 +1,4 @@
-"""The world behind a board that Betaflight's firmware flies: rotors, body and air, a millisecond at a time, in time."""
+"""Simulated world for a board with Betaflight's firmware: rotors, body and air, in real time with 1 ms steps."""
 
 import socket
 import threading
@@ -24,17 +24,17 @@ from .vehicle_state import VehicleState
 GROUND = 0.0  # [m]
 HOST = "127.0.0.1"
 STICKS_EVERY = 5  # [ms] between packets of the receiver
-BEHIND = 0.02  # [s] after which the world does not catch up any more
+BEHIND = 0.02  # [s] of delay, above which the world does not catch up any more
 
 
 class Ears:
-    """Hears motors, and nobody but the first that sent some."""
+    """Receives motor commands, only from the first sender of valid ones."""
 
     def __init__(self, port: int = MOTORS) -> None:
         """Open the port.
 
         Raises:
-            PlantError: It is taken.
+            PlantError: The port is in use.
         """
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
@@ -46,10 +46,10 @@ class Ears:
         self._board: Any = None
         self.port: int = self._socket.getsockname()[1]
         self.refused = 0
-        """Packets that were none, or somebody else's."""
+        """Number of invalid packets and packets from other senders."""
 
     def hear(self, motors: np.ndarray) -> np.ndarray:
-        """Return the newest motors, or those that were known."""
+        """Return the newest motor commands, or ``motors`` if there are no new ones."""
         while True:
             try:
                 packet, sender = self._socket.recvfrom(256)
@@ -72,18 +72,18 @@ class Ears:
 
 
 class World:
-    """A vehicle on a stand, or free; a thread flies it. Its methods may be called from another one."""
+    """A vehicle on a stand, or free; a thread simulates it. Its methods may be called from another thread."""
 
     def __init__(self, model: BemQuadrotor, disturbance: Disturbance, fastest: float) -> None:
-        """Build one, on the stand, and open the wires.
+        """Build a world with the vehicle on the stand, and open the sockets.
 
         Args:
             model: The vehicle; its rate controller is not used.
-            disturbance: External effects, as a function of the time since it was let go [s] and of the state.
-            fastest: What a stick at its end asks for [rad/s].
+            disturbance: External effects, as a function of the time since the release [s] and of the state.
+            fastest: Body rate of a stick at its end [rad/s].
 
         Raises:
-            PlantError: The port of the motors is taken.
+            PlantError: The port of the motors is in use.
         """
         self._model, self._fastest = model, fastest
         self._ears = Ears()
@@ -92,13 +92,13 @@ class World:
         self._over, self._lock = threading.Event(), threading.Lock()
         self._thread = threading.Thread(target=self._run, name="betaflight world", daemon=True)
         self.motors, self.slipped = np.zeros(4), 0.0
-        """Last motors, 0 to 1; time that the world has lost since the vehicle was let go [s]."""
+        """Last motor commands, 0 to 1; time that the world has lost since the release [s]."""
         self._told, self._armed, self._free = (0.0, np.zeros(3)), False, False
         self.place(State.at(jnp.array([0.0, 0.0, 1.0])))
         self._thread.start()
 
     def place(self, x: State) -> None:
-        """Put the vehicle on the stand, at a place and heading."""
+        """Put the vehicle on the stand, at a position and heading."""
         s = _on_the_stand(self._model, x)
         with self._lock:
             self._free, self._s, self._t = False, s, 0.0
@@ -113,7 +113,7 @@ class World:
             self._told, self._armed = (throttle, np.array(omega, dtype=float)), armed
 
     def release(self) -> None:
-        """Let the vehicle go."""
+        """Release the vehicle."""
         with self._lock:
             self._free, self.slipped = True, 0.0
 
@@ -125,7 +125,7 @@ class World:
         return found._replace(truth=found)
 
     def close(self) -> None:
-        """End the world."""
+        """Stop the thread and close the sockets."""
         self._over.set()
         self._thread.join(2.0)
         self._ears.close()
@@ -142,7 +142,7 @@ class World:
                 self.slipped += late if self._free else 0.0
                 due += late
             self.motors = self._ears.hear(self.motors)
-            if was_free != self._free:  # and again: the process that it is part of has set its own priority since
+            if was_free != self._free:  # set again at a release, because the process has since set its own priority
                 was_free = self._free
                 in_real_time(0)
             with self._lock:
@@ -151,7 +151,7 @@ class World:
                     self._t += SUBSTEP
                     self._seen, self._stamp = np.asarray(seen, dtype=float), time.monotonic()
                     if not np.isfinite(self._seen).all() or self._seen[2] < GROUND:
-                        self._over.set()  # what lies on the ground is not simulated
+                        self._over.set()  # contact with the ground is not simulated
                 rates = self._seen[15:18] if self._free else np.zeros(3)
                 sticks = sticks_packet(*self._told, self._fastest, armed=self._armed) if k % STICKS_EVERY == 0 else None
             self._out.sendto(state_packet(rates), (HOST, STATE))
@@ -160,7 +160,7 @@ class World:
 
 
 def _on_the_stand(model: BemQuadrotor, x: State) -> BemState:
-    """Return a vehicle at rest, its rotors turning, with leaves of the type that a step returns."""
+    """Return a vehicle at rest with turning rotors, with leaves of the type that a step returns."""
     s: BemState = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)), model.init(x))
     return s
 
@@ -168,7 +168,7 @@ def _on_the_stand(model: BemQuadrotor, x: State) -> BemState:
 def _compiled(
     model: BemQuadrotor, disturbance: Disturbance
 ) -> Callable[[BemState, np.ndarray, float], tuple[BemState, Array]]:
-    """Return a millisecond of flight: from state, motors and time to the state, and it as p, R, v, omega."""
+    """Return a function for a millisecond of flight: (state, motors, time) -> (state, state as p, R, v, omega)."""
     vehicle, hover = model.vehicle, Command.hover()
 
     @jax.jit
@@ -186,7 +186,7 @@ def _compiled(
         return found
 
     s = _on_the_stand(model, State.at(jnp.array([0.0, 0.0, 1.0])))
-    for _ in range(2):  # compiled before anything flies, for what a step returns, too
+    for _ in range(2):  # compile before the flight, also for the types that a step returns
         s, seen = step(s, np.full(4, 0.3), 0.0)
     jax.block_until_ready(seen)
     return step

@@ -1,21 +1,21 @@
-"""The clock of another machine, as ours tells it."""
+"""Mapping from the clock of another machine to the clock of this machine."""
 
 from collections import deque
 
 import numpy as np
 
 KEPT = 10  # exchanges
-ENOUGH = 3  # of them, to know the rate
-APART = 0.03  # [s], standard deviation of their times, to know the rate
-SLIP = 3e-3  # [s] beyond what a round trip explains
+ENOUGH = 3  # smallest number of exchanges for an estimate of the rate
+APART = 0.03  # [s], smallest standard deviation of their times for an estimate of the rate
+SLIP = 3e-3  # [s], largest deviation in excess of the error bound by the round trip
 JITTER = 1e-4  # [s], of the quickest exchange
-WINDOW_S = 2.0  # [s] within which some message has come without a delay
+WINDOW_S = 2.0  # [s] in which at least one message is assumed to arrive without a delay
 
 
 class RemoteClock:
-    """Follows the offset and the rate of a clock that is asked again and again: a simulated one does not keep time.
+    """Estimates the offset and the rate of a clock from repeated exchanges. Simulated clocks do not run in real time.
 
-    An exchange counts by the inverse square of its round trip, which bounds its error.
+    The weight of an exchange is the inverse square of its round-trip time, which bounds its error.
     """
 
     def __init__(self) -> None:
@@ -24,17 +24,17 @@ class RemoteClock:
         self._rate = 1.0
 
     def exchanged(self, asked: float, remote: float, answered: float) -> None:
-        """Take note of one exchange.
+        """Record one exchange.
 
         Args:
-            asked: When the other clock was asked, by ours [s].
-            remote: What it said [s].
-            answered: When its answer came, by ours [s].
+            asked: Time of the request, our clock [s].
+            remote: Time in the answer, other clock [s].
+            answered: Time of arrival of the answer, our clock [s].
         """
         known = self.here(remote) if len(self._exchanges) >= ENOUGH else None
         slipped = known is not None and abs(0.5 * (asked + answered) - known) > 0.5 * (answered - asked) + SLIP
         if slipped or (self._exchanges and remote < self._exchanges[-1][0]):
-            self._exchanges.clear()  # the other machine stood still, or has started again
+            self._exchanges.clear()  # the other machine stalled or restarted
         self._exchanges.append((remote, 0.5 * (asked + answered), answered - asked))
         x, y, trips = np.array(self._exchanges).T
         weights = (trips + JITTER) ** -2
@@ -46,7 +46,7 @@ class RemoteClock:
         self._line = centre, height
 
     def here(self, remote: float) -> float | None:
-        """Return what our clock shows when the other shows ``remote`` [s]; None if it was never asked."""
+        """Return the time of our clock at time ``remote`` of the other clock [s]; None before the first exchange."""
         if self._line is None:
             return None
         centre, height = self._line
@@ -54,20 +54,20 @@ class RemoteClock:
 
 
 class ArrivalClock:
-    """Follows a clock that nobody can ask, by when its messages arrive: the quickest of the last ones count.
+    """Estimates the offset of a clock from the arrival times of its messages; the quickest recent messages count.
 
-    How long even they took is not known to it.
+    The transmission time of these messages remains unknown.
     """
 
     def __init__(self) -> None:
         self._arrived: deque[tuple[float, float]] = deque()
 
     def arrived(self, remote: float, now: float) -> None:
-        """Take note of a message, of a time of the other clock, that came at one of ours [s]."""
+        """Record a message with its time on the other clock and its arrival time on our clock [s]."""
         while self._arrived and now - self._arrived[0][0] > WINDOW_S:
             self._arrived.popleft()
         self._arrived.append((now, now - remote))
 
     def here(self, remote: float) -> float | None:
-        """Return what our clock shows when the other shows ``remote`` [s]; None if it was never heard."""
+        """Return the time of our clock at time ``remote`` of the other clock [s]; None before the first message."""
         return remote + min(offset for _, offset in self._arrived) if self._arrived else None

@@ -1,4 +1,4 @@
-"""A Crazyflie as a plant: it takes off by itself, hands over, and lands when the flight is over."""
+"""A Crazyflie as a plant: it takes off by itself, hands over control, and lands when the flight is over."""
 
 import socket
 import time
@@ -14,35 +14,35 @@ from .linked_plant import LinkedPlant, ThrustScale
 from .patience import KeepOn, insisting
 from .vehicle_state import VehicleState
 
-ADDRESS = "udp:127.0.0.1:19850"  # where a simulated one, or a bridge to the radio, listens on this machine
+ADDRESS = "udp:127.0.0.1:19850"  # of a simulated Crazyflie, or a bridge to the radio, on this machine
 ANSWERS_S, READY_S, STILL_S, ARM_S, GO_S, LANDING_S = 5.0, 20.0, 2.0, 5.0, 20.0, 15.0  # [s]
-AGAIN_S = 1.0  # [s] after which an order that is not obeyed is given again
+AGAIN_S = 1.0  # [s] after which an order without effect is sent again
 LOST_S = 2.0  # [s] of silence; by then it has stopped its motors
-WANDERS = 0.1  # [m] by which the place of one who stands may change
-SPEED, RISE_S = 0.5, 2.0  # [m/s] on the way to the start; [s] of a take-off
-THRUST_S = 2.0  # [s] over which the thrust at hover is learnt
-GROUND = 0.1  # [m] above where it took off
+WANDERS = 0.1  # [m], largest change of the estimated position while it stands
+SPEED, RISE_S = 0.5, 2.0  # [m/s] during the flight to the start; [s] of a take-off
+THRUST_S = 2.0  # [s] over which the thrust at hover is identified
+GROUND = 0.1  # [m] above its take-off height
 WRONG = {crtp.TUMBLED: "lies on its back", crtp.LOCKED: "has locked itself", crtp.CRASHED: "has crashed"}
 
 
 class CrazyfliePlant(LinkedPlant[CrazyflieLink]):
     """A Crazyflie, by CRTP over UDP: thrust and body rates as its manual setpoint, states from its log.
 
-    World and body are its own, which are ours. Thrust per mass is a share of the range of its thrust command, g over
-    what that was at hover; battery and thrust map are left to adaptation.
+    World and body frame are its own, which are also ours. Thrust per mass is its thrust command times g over the thrust
+    command at hover; adaptation compensates for battery and thrust map.
     """
 
     def __init__(self, address: str, dt: float, low: np.ndarray, high: np.ndarray) -> None:
-        """Build a plant; nothing is sent before it connects.
+        """Build a plant; it does not send packets before it connects.
 
         Args:
-            address: ``udp:HOST:PORT`` where it listens.
+            address: ``udp:HOST:PORT`` that it listens on.
             dt: Control period [s].
             low: Smallest command [c, omega].
-            high: Largest one.
+            high: Largest command [c, omega].
 
         Raises:
-            ConfigError: The address is none, or the period is not one that it can be flown at.
+            ConfigError: The address is invalid, or the control period is outside the supported range.
         """
         super().__init__(check_address(address), dt, low, high)
         if not 0.01 <= dt <= 0.1:
@@ -51,7 +51,7 @@ class CrazyfliePlant(LinkedPlant[CrazyflieLink]):
         self._flies, self._floor = False, 0.0
 
     def connect(self, keep_on: KeepOn = lambda: True) -> None:
-        """Wait for it, and until it knows where it is and could be armed."""
+        """Connect, and wait until it has a position estimate and can be armed."""
         if self._link is None:
             _, host, port = address_of(self.address)
             try:
@@ -73,13 +73,13 @@ class CrazyfliePlant(LinkedPlant[CrazyflieLink]):
             self._stands_still(keep_on)
 
     def take_off(self, p: np.ndarray | None, yaw: float | None, keep_on: KeepOn = lambda: True) -> None:
-        """Let it fly to a place by its own commander, and learn what thrust it takes to hover there."""
+        """Let it fly to a position by its own commander, and identify its thrust command at hover."""
         link, x = self.link, self.reading()
         if not self._is(crtp.FLYING):
             self._floor = float(x.p[2])
         place = x.p + np.array([0.0, 0.0, 1.0]) if p is None else np.asarray(p, dtype=float)
         heading = heading_of(x.R) if yaw is None else yaw
-        self._flies = True  # from here on it has to be landed and disarmed
+        self._flies = True  # from now on it must be landed and disarmed
         ready = lambda: self._is(crtp.ARMED) and self._is(crtp.CAN_FLY)  # noqa: E731
         arming = insisting(lambda: link.send(crtp.arm(True, link.version)), ready, AGAIN_S)
         if not self.until(arming, ARM_S, keep_on):
@@ -104,7 +104,7 @@ class CrazyfliePlant(LinkedPlant[CrazyflieLink]):
         self.thrust.learn(link.thrusts)
 
     def hold(self, until: float) -> None:
-        """Let its commander hold the place of the take-off."""
+        """Let its commander hold the position of the take-off."""
         self.link.pump(until)
 
     def read(self) -> VehicleState:
@@ -132,7 +132,7 @@ class CrazyfliePlant(LinkedPlant[CrazyflieLink]):
         self.link.pump(until)
 
     def land(self) -> None:
-        """Let its commander land it, and disarm it; who does not answer any more is left alone."""
+        """Let its commander land it, and disarm it; a vehicle that does not answer any more is ignored."""
         link, self._link = self._link, None
         if link is None:
             return
@@ -145,7 +145,7 @@ class CrazyfliePlant(LinkedPlant[CrazyflieLink]):
             link.close()
 
     def _sink(self, link: CrazyflieLink) -> None:
-        """Land, with orders that are given again, since they may be lost."""
+        """Land, with repeated orders, since orders may be lost."""
         reading = link.reading
         assert reading is not None
         until = time.monotonic() + LANDING_S
@@ -165,12 +165,12 @@ class CrazyfliePlant(LinkedPlant[CrazyflieLink]):
             link.pump(time.monotonic() + 0.1)
 
     def _is(self, bits: int) -> bool:
-        """Whether its supervisor says any of these."""
+        """Return whether its supervisor reports any of these bits."""
         status = self.link.status
         return status is not None and bool(status.info & bits)
 
     def _stands_still(self, keep_on: KeepOn) -> None:
-        """Check that its estimate does not wander, as one without a positioning system does."""
+        """Check that its position estimate does not drift, as it does without a positioning system."""
         first = self.reading().p
         wanders = 0.0
 
@@ -188,10 +188,10 @@ class CrazyfliePlant(LinkedPlant[CrazyflieLink]):
 
 
 def check_address(address: str) -> str:
-    """Return an address of a Crazyflie; where one is by default if it is empty.
+    """Return an address of a Crazyflie; the default for an empty address.
 
     Raises:
-        ConfigError: It is none, or not one of UDP.
+        ConfigError: The text is not an address, or its kind is not UDP.
     """
     if address_of(address or ADDRESS)[0] != "udp":
         raise ConfigError(f"address {address!r}: a Crazyflie is reached by udp:HOST:PORT, as {ADDRESS}")

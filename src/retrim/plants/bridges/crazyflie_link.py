@@ -1,6 +1,6 @@
-"""One end of a connection to a Crazyflie: what it logs, and what it is told.
+"""One end of a connection to a Crazyflie: it receives logs and sends packets.
 
-Nothing here decides when to arm or who flies; :mod:`.crazyflie` does.
+This module does not decide when to arm or which controller flies; :mod:`.crazyflie` does.
 """
 
 import math
@@ -17,23 +17,24 @@ from .patience import KeepOn, insisting, wait_until
 from .vehicle_state import Reading
 
 STATES, STATUSES = 1, 2  # numbers of our blocks of the log
-STATE_S, STATUS_S = 0.01, 0.05  # [s] between two of them
-ECHO_S = 0.1  # [s] between two questions of how long a packet takes
-AGAIN_S = 0.2  # [s] after which a question that is not answered is asked again
-WRAP_MS = 1 << 24  # of its time
+STATE_S, STATUS_S = 0.01, 0.05  # [s] between two states and between two statuses
+ECHO_S = 0.1  # [s] between two measurements of the round-trip time
+AGAIN_S = 0.2  # [s] after which an unanswered request is repeated
+WRAP_MS = 1 << 24  # [ms], period after which its time wraps around
 LATE_S, EARLY_S = 0.5, 1.0  # [s] by which its time may go back and ahead of ours, from one message to the next
-LEAP, LEAPS_S, FASTEST = 1.0, 0.5, 20.0  # [m] that no state is from the last one; [s] it is believed for; [m/s]
+# [m], largest plausible jump between two states; [s] for which the last state is used for this check; [m/s]
+LEAP, LEAPS_S, FASTEST = 1.0, 0.5, 20.0
 
 
 class CrazyflieLink:
-    """Listens, remembers the last of everything, and keeps the connection alive."""
+    """Receives messages, stores the newest of each kind, and keeps the connection alive."""
 
     def __init__(self, endpoint: Endpoint, to: tuple[str, int]) -> None:
         """Build one end.
 
         Args:
-            endpoint: Where packets come from and go to.
-            to: Address of the Crazyflie; everybody else is ignored.
+            endpoint: Endpoint for received and sent packets.
+            to: Address of the Crazyflie; other senders are ignored.
         """
         self._endpoint, self._to = endpoint, to
         self._clock, self._trips = ArrivalClock(), deque[float](maxlen=20)
@@ -42,37 +43,37 @@ class CrazyflieLink:
         self._awaited: Packet | None = None
         self._answer: bytes | None = None
         self.version = 0
-        """Of its protocol; 0 before it was asked."""
+        """Version of its protocol; 0 before it was requested."""
         self.reading: Reading | None = None
         self.status: crtp.Status | None = None
         self.thrusts: deque[float] = deque(maxlen=100)
-        """What its controller commanded, 0 to 65535."""
+        """Thrust commands of its controller, 0 to 65535."""
         self.console = ""
-        """The end of what it said in words."""
+        """End of its console output."""
         self.heard = -math.inf
-        """When it said anything last, monotonic clock [s]."""
+        """Time of its last valid packet, monotonic clock [s]."""
         self.ignored = 0
-        """Packets of strangers, and those that are damaged or make no sense."""
+        """Number of packets that were damaged, implausible or from other senders."""
 
     def pump(self, until: float) -> None:
-        """Read what comes, and say what has to be said now and then, until an instant of the monotonic clock [s]."""
+        """Read received packets and send periodic ones, until an instant of the monotonic clock [s]."""
         pump(self._endpoint, until, self._chores, self._take)
 
     def send(self, packet: Packet) -> None:
-        """Send a packet; nobody says whether it arrives."""
+        """Send a packet; its arrival is not confirmed."""
         self._endpoint.send(packet.pack(), self._to)
 
     def ask(self, question: Packet, same: int, patience: float, keep_on: KeepOn) -> bytes:
-        """Return the answer to a question, which is asked until it comes.
+        """Send a request repeatedly until the answer arrives, and return the answer.
 
         Args:
-            question: What is asked; its answer comes from the same port and channel.
-            same: How many bytes of the question the answer begins with.
-            patience: How long to ask [s].
-            keep_on: Asked again and again; False gives up.
+            question: The request; its answer comes from the same port and channel.
+            same: Number of leading bytes of the request that the answer repeats.
+            patience: Time limit [s].
+            keep_on: Called repeatedly; False gives up.
 
         Returns:
-            What follows the bytes that are the same.
+            The bytes after the repeated ones.
 
         Raises:
             PlantError: There is no answer, or the flight was given up.
@@ -87,10 +88,10 @@ class CrazyflieLink:
             self._awaited = None
 
     def start_logs(self, patience: float, keep_on: KeepOn) -> None:
-        """Ask for states and statuses, as long as the connection lives.
+        """Request states and statuses for the duration of the connection.
 
         Raises:
-            PlantError: It does not answer, or does not know a variable.
+            PlantError: The Crazyflie does not answer, or does not have a variable.
         """
         self.version = self.ask(Packet(crtp.PLATFORM, 1, b"\0"), 1, patience, keep_on)[0]
         self.ask(Packet(crtp.LOG, crtp.CONTROL, bytes([crtp.RESET])), 1, patience, keep_on)
@@ -104,15 +105,15 @@ class CrazyflieLink:
                     raise PlantError(f"the Crazyflie refuses a block of its log: error {refused}")
 
     def stop_logs(self) -> None:
-        """Ask it to be silent."""
+        """Request the end of the log messages."""
         self.send(Packet(crtp.LOG, crtp.CONTROL, bytes([crtp.RESET])))
 
     def close(self) -> None:
-        """Give the port back."""
+        """Close the port."""
         self._endpoint.close()
 
     def _numbers(self, wanted: set[str], patience: float, keep_on: KeepOn) -> dict[str, int]:
-        """Return the numbers of variables, from its table of contents."""
+        """Return the numbers of variables from its table of contents."""
         about = self.ask(Packet(crtp.LOG, crtp.TOC, bytes([crtp.INFO])), 1, patience, keep_on)
         length, found = int.from_bytes(about[:2], "little"), dict[str, int]()
         for number in range(length):
@@ -177,7 +178,7 @@ class CrazyflieLink:
             raise MessageError("a block of a log that nobody asked for")
 
     def _take_state(self, x: crtp.StateRow, ms: int, now: float) -> None:
-        """Take a state; one that no vehicle could have got to is not believed while others are."""
+        """Process a state; one that is implausibly far from a recent state is refused."""
         last, since = self.reading, now - self._logged_at
         if last is not None and since < LEAPS_S and abs(x.p - last.p).max() > LEAP + FASTEST * since:
             raise MessageError("a state that is far from the last one")
@@ -185,11 +186,11 @@ class CrazyflieLink:
         here = self._clock.here(1e-3 * ms)
         assert here is not None
         stamp = here - 0.5 * min(self._trips, default=0.0)
-        if ms > self._remote_ms or last is None:  # and not overtaken on the way
+        if ms > self._remote_ms or last is None:  # skip states that arrive out of order
             self._remote_ms, self._logged_at = ms, now
             self.reading = Reading(stamp, *x)
 
     def said(self) -> str:
-        """Return what it said in words, to be put behind a reason."""
+        """Return its console output, as a suffix of an error message."""
         words = " ".join(self.console.split())
         return f"; it said: {words}" if words else ""

@@ -1,6 +1,7 @@
-"""CRTP, the language of a Crazyflie: packets of a port, a channel and up to 30 bytes, little endian.
+"""CRTP, the protocol of a Crazyflie: packets of a port, a channel and up to 30 bytes, little endian.
 
-Its world is ours, x, y and z up, and so is its body, forward, left, up; but its pitch is nose up, against our y.
+Its world frame (x, y and z up) and its body frame (forward, left, up) equal ours. Its positive pitch is nose up, which
+is a negative rotation about our y axis.
 """
 
 import math
@@ -16,19 +17,19 @@ LONGEST = 31  # bytes, with the header
 TOC, CONTROL, DATA = 0, 1, 2  # channels of LOG
 ITEM, INFO = 2, 3  # commands of a table of contents
 RESET, CREATE, APPEND, START = 5, 6, 7, 3  # commands of LOG's CONTROL
-LISTED = 9  # variables that one of them has room for
-LOG_MS = 10  # of START's unit
+LISTED = 9  # largest number of variables in one CREATE or APPEND
+LOG_MS = 10  # [ms], unit of the period of START
 MANUAL, RELAX = 11, 0  # of SETPOINT's channels 0 and 1
 HL_STOP, GO_TO, TAKE_OFF, LAND, GO_TO_LINEAR = 3, 4, 7, 8, 12  # commands of HIGH_LEVEL
-NEW_GO_TO, OWN_SUPERVISOR = 8, 12  # protocol versions since which there is GO_TO_LINEAR, and the port SUPERVISOR
+NEW_GO_TO, OWN_SUPERVISOR = 8, 12  # first protocol versions with GO_TO_LINEAR, and with the port SUPERVISOR
 CAN_ARM, ARMED, _, CAN_FLY, FLYING, TUMBLED, LOCKED, CRASHED = (1 << bit for bit in range(8))
-THRUST = (1.0, 65_535.0)  # at 0 the motors stop and its controllers begin anew
+THRUST = (1.0, 65_535.0)  # at 0 the motors stop and its controllers are reset
 STATE_LOG = {
     **{f"stateEstimateZ.{name}": "h" for name in ("x", "y", "z", "vx", "vy", "vz")},
     "stateEstimateZ.quat": "I",
     **{f"stateEstimateZ.{name}": "h" for name in ("rateRoll", "ratePitch", "rateYaw")},
 }
-"""What a block of states holds, and how [mm, mm/s, packed quaternion, mrad/s]."""
+"""Variables of a block of states and their types [mm, mm/s, packed quaternion, mrad/s]."""
 STATUS_LOG = {"stabilizer.thrust": "f", "supervisor.info": "H", "pm.vbat": "f"}
 LOG_TYPES = {"B": 1, "H": 2, "I": 3, "b": 4, "h": 5, "i": 6, "f": 7}
 _STATE, _STATUS = (struct.Struct("<" + "".join(block.values())) for block in (STATE_LOG, STATUS_LOG))
@@ -37,14 +38,14 @@ _BITS, _HALF = 511, math.sqrt(0.5)
 
 
 class Packet(NamedTuple):
-    """What came, or goes."""
+    """A received packet, or one to send."""
 
     port: int
     channel: int
     body: bytes = b""
 
     def pack(self) -> bytes:
-        """Return the bytes of the wire."""
+        """Return the bytes of the datagram."""
         return bytes([self.port << 4 | 3 << 2 | self.channel]) + self.body
 
 
@@ -52,7 +53,7 @@ def unpacked(data: bytes) -> Packet:
     """Return the packet of a datagram.
 
     Raises:
-        MessageError: It is empty or too long.
+        MessageError: The datagram is empty or too long.
     """
     if not 0 < len(data) <= LONGEST:
         raise MessageError(f"{len(data)} bytes are no packet, which has 1 to {LONGEST}")
@@ -64,35 +65,35 @@ def rates_setpoint(thrust: int, omega: np.ndarray) -> Packet:
 
     Args:
         thrust: 0 to 65535.
-        omega: Body rates, ours [rad/s].
+        omega: Body rates in our frame [rad/s].
     """
     roll, pitch, yaw = (float(rate) for rate in np.degrees(_PITCH_UP * omega))
     return Packet(SETPOINT, 0, struct.pack("<BfffHB", MANUAL, roll, pitch, yaw, thrust, 1))
 
 
 def take_off(height: float, yaw: float, duration: float) -> Packet:
-    """Return the order to take off, to a height [m] and heading [rad], in a time [s]."""
+    """Return the order to take off to a height [m] and heading [rad] in a given time [s]."""
     return Packet(HIGH_LEVEL, 0, struct.pack("<BBff?f", TAKE_OFF, 0, height, yaw, False, duration))
 
 
 def go_to(p: np.ndarray, yaw: float, duration: float, version: int) -> Packet:
-    """Return the order to go to a place [m] and heading [rad], in a time [s]."""
+    """Return the order to go to a position [m] and heading [rad] in a given time [s]."""
     head = (GO_TO_LINEAR, 0, 0, 0) if version >= NEW_GO_TO else (GO_TO, 0, 0)
     return Packet(HIGH_LEVEL, 0, struct.pack(f"<{len(head)}B5f", *head, *map(float, p), yaw, duration))
 
 
 def land(height: float, duration: float) -> Packet:
-    """Return the order to land, to a height [m], in a time [s]."""
+    """Return the order to land at a height [m] in a given time [s]."""
     return Packet(HIGH_LEVEL, 0, struct.pack("<BBff?f", LAND, 0, height, 0.0, True, duration))
 
 
 def stop_planning() -> Packet:
-    """Return the order that ends what take_off, go_to and land began; the motors stop."""
+    """Return the order that ends the motions of take_off, go_to and land; the motors stop."""
     return Packet(HIGH_LEVEL, 0, bytes([HL_STOP, 0]))
 
 
 def relax() -> Packet:
-    """Return the word that no more setpoints come, so that orders count again; without it the motors stop."""
+    """Return the notice that setpoints end, so that orders take effect again; without it the motors stop."""
     return Packet(SETPOINT, 1, struct.pack("<BI", RELAX, 0))
 
 
@@ -103,14 +104,14 @@ def arm(yes: bool, version: int) -> Packet:
 
 
 def new_block(number: int, variables: list[tuple[str, int]]) -> list[Packet]:
-    """Return the orders to make a block of a log, of types and numbers of variables."""
+    """Return the orders to create a block of a log from types and numbers of variables."""
     listed = [struct.pack("<BH", LOG_TYPES[kind], item) for kind, item in variables]
     parts = [b"".join(listed[k : k + LISTED]) for k in range(0, len(listed), LISTED)]
     return [Packet(LOG, CONTROL, bytes([APPEND if k else CREATE, number]) + part) for k, part in enumerate(parts)]
 
 
 def start_block(number: int, period: float) -> Packet:
-    """Return the order to send a block every so many seconds."""
+    """Return the order to send a block with a period [s]."""
     return Packet(LOG, CONTROL, bytes([START, number, max(1, round(1e3 * period / LOG_MS))]))
 
 
@@ -128,10 +129,10 @@ class StateRow(NamedTuple):
 
 
 def state_of(values: bytes) -> StateRow:
-    """Return the state in what STATE_LOG lists.
+    """Return the state in a block of STATE_LOG.
 
     Raises:
-        MessageError: It has another length, or its attitude is none.
+        MessageError: The block has a wrong length, or its attitude is invalid.
     """
     if len(values) != _STATE.size:
         raise MessageError(f"{len(values)} bytes are no state, which has {_STATE.size}")
@@ -141,27 +142,27 @@ def state_of(values: bytes) -> StateRow:
 
 
 def state_values(p: np.ndarray, R: np.ndarray, v: np.ndarray, omega: np.ndarray) -> bytes:
-    """Return what STATE_LOG lists; the inverse of :func:`state_of`."""
+    """Return a block of STATE_LOG; the inverse of :func:`state_of`."""
     rows = [np.clip(np.round(1e3 * x), -32_768, 32_767).astype(int).tolist() for x in (p, v, _PITCH_UP * omega)]
     return _STATE.pack(*rows[0], *rows[1], quaternion_of(R), *rows[2])
 
 
 class Status(NamedTuple):
-    """How it is, in a log."""
+    """Status of the vehicle in a log."""
 
     thrust: float
-    """What its controller commands, 0 to 65535."""
+    """Thrust command of its controller, 0 to 65535."""
     info: int
     """Bits of its supervisor: CAN_ARM, ARMED and so on."""
     battery: float
-    """[V]."""
+    """Battery voltage [V]."""
 
 
 def status_of(values: bytes) -> Status:
-    """Return the status in what STATUS_LOG lists.
+    """Return the status in a block of STATUS_LOG.
 
     Raises:
-        MessageError: It has another length, or is not finite.
+        MessageError: The block has a wrong length, or is not finite.
     """
     if len(values) != _STATUS.size:
         raise MessageError(f"{len(values)} bytes are no status, which has {_STATUS.size}")
@@ -172,24 +173,24 @@ def status_of(values: bytes) -> Status:
 
 
 def status_values(status: Status) -> bytes:
-    """Return what STATUS_LOG lists; the inverse of :func:`status_of`."""
+    """Return a block of STATUS_LOG; the inverse of :func:`status_of`."""
     return _STATUS.pack(*status)
 
 
 def attitude_of(packed: int) -> np.ndarray:
-    """Return an attitude, body to world, of 32 bits: which element is largest, and sign and size of the others.
+    """Return an attitude, body to world, from 32 bits: index of the largest element, and sign and size of the others.
 
     Raises:
-        MessageError: The others are larger than a unit quaternion has room for.
+        MessageError: The others are too large for a unit quaternion.
     """
-    from scipy.spatial.transform import Rotation  # here: it takes as long to import as all of retrim
+    from scipy.spatial.transform import Rotation  # local, because it takes as long to import as all of retrim
 
     largest, q = packed >> 30, np.zeros(4)
     for k, i in enumerate(i for i in (3, 2, 1, 0) if i != largest):
         bits = packed >> 10 * k
         q[i] = (-1.0 if bits >> 9 & 1 else 1.0) * (bits & _BITS) / _BITS * _HALF
     rest = 1.0 - float(q @ q)
-    if rest < 0.24:  # the largest of four is half the length at least
+    if rest < 0.24:  # the largest of four elements is at least half the length
         raise MessageError("a packed quaternion whose largest element is not")
     q[largest] = math.sqrt(rest)
     out: np.ndarray = Rotation.from_quat(q).as_matrix()
@@ -198,7 +199,7 @@ def attitude_of(packed: int) -> np.ndarray:
 
 def quaternion_of(R: np.ndarray) -> int:
     """Return an attitude in 32 bits; the inverse of :func:`attitude_of` to 2 mrad."""
-    from scipy.spatial.transform import Rotation  # here, likewise
+    from scipy.spatial.transform import Rotation  # local for the same reason
 
     q = Rotation.from_matrix(R).as_quat()
     packed = largest = int(np.argmax(np.abs(q)))

@@ -1,4 +1,4 @@
-"""Where bytes of an autopilot come from and go to: a UDP port, or a serial line."""
+"""Endpoints for the bytes of an autopilot: a UDP port, or a serial line."""
 
 import contextlib
 import select
@@ -11,27 +11,27 @@ from ...errors import ConfigError, PlantError
 from ..extras import import_extra
 
 LONGEST = 65_535
-NAP_S = 0.02  # [s]: at least as often, chores are done
+NAP_S = 0.02  # [s], longest time between two calls of the periodic work
 
 
 @runtime_checkable
 class Endpoint(Protocol):
-    """One end of a link. Nothing of it blocks."""
+    """One end of a link. Its methods do not block."""
 
     def fileno(self) -> int:
-        """Return the descriptor that becomes readable when something has come."""
+        """Return the descriptor that becomes readable when data has arrived."""
         ...
 
     def receive(self) -> tuple[bytes, Any] | None:
-        """Return what has come and who sent it; None if nothing has."""
+        """Return received data and its sender; None if there is no new data."""
         ...
 
     def send(self, data: bytes, to: Any) -> None:
-        """Send to who was heard; what cannot be sent is lost, as on any link."""
+        """Send data to a sender of received data; data that cannot be sent is lost, as on any link."""
         ...
 
     def close(self) -> None:
-        """Give the port back. Idempotent."""
+        """Close the port. Idempotent."""
         ...
 
 
@@ -39,10 +39,10 @@ class UdpEndpoint:
     """A UDP port that an autopilot sends to."""
 
     def __init__(self, host: str, port: int) -> None:
-        """Listen.
+        """Open the port.
 
         Raises:
-            PlantError: The port cannot be had.
+            PlantError: The port cannot be opened.
         """
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
@@ -60,7 +60,7 @@ class UdpEndpoint:
         """Return a datagram and its sender."""
         try:
             return self._socket.recvfrom(LONGEST)
-        except OSError:  # nothing there, or somebody who was sent to is not there any more
+        except OSError:  # no data, or the receiver of an earlier datagram does not exist any more
             return None
 
     def send(self, data: bytes, to: Any) -> None:
@@ -80,7 +80,7 @@ class SerialEndpoint:
         """Open the line.
 
         Raises:
-            PlantError: There is no such line, or pyserial is not installed.
+            PlantError: The line does not exist, or pyserial is not installed.
         """
         serial = import_extra("serial", "mavlink", package="pyserial")
         try:
@@ -94,7 +94,7 @@ class SerialEndpoint:
         return int(self._line.fileno())
 
     def receive(self) -> tuple[bytes, Any] | None:
-        """Return what has come; the sender is the line."""
+        """Return received data; the sender is ``"line"``."""
         try:
             data = self._line.read(4096)
         except self._lost:
@@ -112,13 +112,13 @@ class SerialEndpoint:
 
 
 def address_of(text: str) -> tuple[str, str, int]:
-    """Return the parts of an address: its kind, where, and the port or the baud rate.
+    """Return the parts of an address: its kind, the host or device, and the port or the baud rate.
 
     Args:
-        text: ``udp:HOST:PORT`` to listen there, or ``serial:DEVICE:BAUD``.
+        text: ``udp:HOST:PORT`` to listen on, or ``serial:DEVICE:BAUD``.
 
     Raises:
-        ConfigError: It is no address.
+        ConfigError: The text is not an address.
     """
     kind, _, rest = text.partition(":")
     place, _, number = rest.rpartition(":")
@@ -138,13 +138,13 @@ def address_of(text: str) -> tuple[str, str, int]:
 
 
 def address_towards(host: str, port: int) -> str:
-    """Return the address of this machine from which another one is reached; nothing is sent.
+    """Return the address of this machine on the route to another host, without sending data.
 
-    Whoever listens on that address only is not reached by other networks: the loopback address for a vehicle on this
-    machine, that of the radio for one on a radio.
+    A socket on only this address is not reachable from other networks. It is the loopback address for a vehicle on this
+    machine, and the address of the radio for a vehicle on a radio.
 
     Raises:
-        PlantError: There is no way there.
+        PlantError: There is no route to the host.
     """
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
@@ -155,24 +155,24 @@ def address_towards(host: str, port: int) -> str:
 
 
 def open_endpoint(address: str) -> Endpoint:
-    """Open what an address names.
+    """Open the endpoint of an address.
 
     Raises:
-        ConfigError: It is no address.
-        PlantError: It cannot be opened.
+        ConfigError: The text is not an address.
+        PlantError: The endpoint cannot be opened.
     """
     kind, place, number = address_of(address)
     return UdpEndpoint(place, number) if kind == "udp" else SerialEndpoint(place, number)
 
 
 def pump(endpoint: Endpoint, until: float, chores: Callable[[float], None], take: Callable[[bytes, Any], None]) -> None:
-    """Read what comes, and do what has to be done now and then, until an instant of the monotonic clock [s].
+    """Read received data and call the periodic work, until an instant of the monotonic clock [s].
 
     Args:
-        endpoint: Where bytes come from.
-        until: When it ends; what has come is read all the same.
-        chores: Called with the time.
-        take: Called with what has come in one go, and who sent it.
+        endpoint: Source of the data.
+        until: Time of the end; data that has already arrived is read even if this time has passed.
+        chores: Periodic work; called with the time.
+        take: Called with the data of one read, and its sender.
     """
     while True:
         chores(time.monotonic())

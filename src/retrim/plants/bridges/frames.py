@@ -33,16 +33,16 @@ def attitude_of(q: np.ndarray) -> np.ndarray:
     """Return the attitude, body FLU to world ENU.
 
     Args:
-        q: Quaternion w, x, y, z, body FRD to world NED; of any length but zero.
+        q: Quaternion w, x, y, z, body FRD to world NED; of any non-zero length.
     """
-    from scipy.spatial.transform import Rotation  # here: it takes as long to import as all of retrim
+    from scipy.spatial.transform import Rotation  # local, because it takes as long to import as all of retrim
 
     out: np.ndarray = WORLD @ Rotation.from_quat(np.roll(q, -1)).as_matrix() * BODY
     return out
 
 
 def quaternion_of(R: np.ndarray) -> np.ndarray:
-    """Return an attitude as autopilots send it; the inverse of :func:`attitude_of` up to the sign.
+    """Return an attitude in the form that autopilots send; the inverse of :func:`attitude_of` up to the sign.
 
     Args:
         R: Body FLU to world ENU.
@@ -50,12 +50,12 @@ def quaternion_of(R: np.ndarray) -> np.ndarray:
     Returns:
         Unit quaternion w, x, y, z, body FRD to world NED, w >= 0.
     """
-    from scipy.spatial.transform import Rotation  # here, likewise
+    from scipy.spatial.transform import Rotation  # local for the same reason
 
     out: np.ndarray = np.roll(Rotation.from_matrix(WORLD @ R * BODY).as_quat(canonical=True), 1)
     return out
 
 
 def heading_of(R: np.ndarray) -> float:
-    """Return where the nose points, from east counter-clockwise [rad]."""
+    """Return the direction of the nose, from east counter-clockwise [rad]."""
     return float(np.arctan2(R[1, 0], R[0, 0]))

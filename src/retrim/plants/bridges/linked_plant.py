@@ -1,4 +1,4 @@
-"""A vehicle at the other end of a link, which tells its state and takes thrust and body rates."""
+"""A vehicle at the other end of a link, which reports its state and accepts thrust and body rates."""
 
 from collections.abc import Collection
 from typing import Generic, Protocol, TypeVar, runtime_checkable
@@ -13,12 +13,12 @@ from .vehicle_state import Reading
 
 @runtime_checkable
 class VehicleLink(Protocol):
-    """What every link remembers."""
+    """Attributes of every link."""
 
     reading: Reading | None
-    """The newest state; None before the first."""
+    """Newest state; None before the first."""
     heard: float
-    """When anything came last, monotonic clock [s]."""
+    """Time of the last received message, monotonic clock [s]."""
 
 
 L = TypeVar("L", bound=VehicleLink)
@@ -31,10 +31,10 @@ class LinkedPlant(VehiclePlant, Generic[L]):
         """Build a plant.
 
         Args:
-            address: Where the vehicle is reached; what went wrong is told with it.
+            address: Address of the vehicle; error messages contain it.
             dt: Control period [s].
-            low: Smallest command [c, omega] that the vehicle is given.
-            high: Largest one.
+            low: Smallest command [c, omega] that is sent to the vehicle.
+            high: Largest command [c, omega] that is sent to the vehicle.
         """
         super().__init__(dt, low, high)
         self.address = address
@@ -45,17 +45,17 @@ class LinkedPlant(VehiclePlant, Generic[L]):
         """The connection.
 
         Raises:
-            PlantError: There is none.
+            PlantError: The plant is not connected.
         """
         if self._link is None:
             raise PlantError(f"{self.address}: not connected; call connect or reset first")
         return self._link
 
     def reading(self) -> Reading:
-        """Return the newest state that was heard.
+        """Return the newest state that was received.
 
         Raises:
-            PlantError: There is none yet.
+            PlantError: A state was not received yet.
         """
         if self.link.reading is None:
             raise PlantError(f"{self.address}: the vehicle has sent no state")
@@ -63,27 +63,27 @@ class LinkedPlant(VehiclePlant, Generic[L]):
 
 
 class ThrustScale:
-    """Between thrust per mass and an autopilot's thrust command, which is linear; learnt where the vehicle hovers."""
+    """Linear scale between thrust per mass and an autopilot's thrust command; identified while the vehicle hovers."""
 
     def __init__(self, smallest: float, largest: float) -> None:
-        """Build one that is not learnt yet.
+        """Build a scale that is not identified yet.
 
         Args:
-            smallest: The smallest command that is given.
-            largest: The largest one.
+            smallest: The smallest command that is sent.
+            largest: The largest command that is sent.
         """
         self._range = smallest, largest
         self.hover: float | None = None
-        """The command that carries the vehicle; None before it has hovered."""
+        """Command at hover; None before the vehicle has hovered."""
 
     def learn(self, commands: Collection[float]) -> None:
-        """Learn the scale.
+        """Identify the scale.
 
         Args:
-            commands: What the autopilot has commanded in hover.
+            commands: Thrust commands of the autopilot at hover.
 
         Raises:
-            PlantError: They are too few, or none that carries a vehicle.
+            PlantError: The commands are too few, or cannot be those of a hovering vehicle.
         """
         shares = np.array(commands) / self._range[1]
         if len(shares) < 5 or not 0.05 < np.median(shares) < 0.95:
@@ -101,7 +101,7 @@ class ThrustScale:
         return float(np.clip(c / self._step, *self._range))
 
     def per_mass(self, command: float) -> float:
-        """Return the thrust per mass that a command stands for [m/s^2].
+        """Return the thrust per mass of a command [m/s^2].
 
         Raises:
             PlantError: The vehicle has not hovered.

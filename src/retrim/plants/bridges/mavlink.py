@@ -1,4 +1,4 @@
-"""PX4 by MAVLink, as a plant: it takes off by itself, hands over, and lands when the flight is over."""
+"""PX4 by MAVLink as a plant: it takes off by itself, hands over control, and lands when the flight is over."""
 
 import math
 import time
@@ -14,51 +14,52 @@ from .mavlink_link import MavlinkLink
 from .patience import KeepOn, insisting, wait_until
 from .vehicle_state import VehicleState
 
-ADDRESS = "udp:127.0.0.1:14540"  # to which PX4 sends on the machine that it runs on
+ADDRESS = "udp:127.0.0.1:14540"  # that PX4 sends to on its own machine
 PX4 = 12  # MAV_AUTOPILOT
 OFFBOARD, LAND = (6, 0), (4, 6)  # main and sub mode
 SET_MODE, ARM_DISARM = 176, 400  # MAV_CMD
 STREAMS = {"ODOMETRY": 100.0, "ATTITUDE_TARGET": 25.0, "HIL_STATE_QUATERNION": 50.0}  # [Hz]
 UNUSED = ("HIGHRES_IMU", "ATTITUDE", "ALTITUDE", "VFR_HUD", "SERVO_OUTPUT_RAW", "HIL_ACTUATOR_CONTROLS")
-HEARD_S, READY_S, UNREADY_S = 10.0, 40.0, 12.0  # [s] to be heard; to be ready; after which arming is tried all the same
+# [s], limits for the first message and for readiness; time after which arming is tried even if PX4 is not ready
+HEARD_S, READY_S, UNREADY_S = 10.0, 40.0, 12.0
 SWITCH_S, ARM_S, GO_S, LANDING_S = 5.0, 8.0, 40.0, 40.0  # [s]
 ASK_AGAIN_S = 1.0  # [s]
-LOST_S = 2.0  # [s] of silence, after which the autopilot has long gone its own way
-THRUST_S = 2.0  # [s] over which the thrust at hover is learnt
-TELL_EVERY_S = 0.05  # [s] between two setpoints of where to go
+LOST_S = 2.0  # [s] of silence, after which the failsafe of the autopilot has long taken over
+THRUST_S = 2.0  # [s] over which the thrust at hover is identified
+TELL_EVERY_S = 0.05  # [s] between two position setpoints
 
 
 class MavlinkPlant(LinkedPlant[MavlinkLink]):
-    """A vehicle that PX4 flies: offboard mode, thrust and body rates.
+    """A vehicle with PX4 in offboard mode: it receives thrust and body rates.
 
     World: east, north, up from the origin of the autopilot's local frame. Thrust per mass is a share of the motors'
-    thrust times g over the share at hover, which is learnt while the autopilot hovers before the hand-over. A thrust
-    map that is not linear (``THR_MDL_FAC``), a sagging battery or another load are left to adaptation.
+    thrust times g over the share at hover, which is identified while the autopilot hovers before the hand-over.
+    Adaptation compensates for a non-linear thrust map (``THR_MDL_FAC``), a sagging battery or another load.
     """
 
     def __init__(self, address: str, dt: float, low: np.ndarray, high: np.ndarray) -> None:
-        """Build a plant; the port is listened on once it connects.
+        """Build a plant; it opens the port when it connects.
 
         Args:
             address: ``udp:HOST:PORT`` that PX4 sends to, or ``serial:DEVICE:BAUD``.
             dt: Control period [s].
             low: Smallest command [c, omega].
-            high: Largest one.
+            high: Largest command [c, omega].
 
         Raises:
-            ConfigError: The address is none, or the period is not one that PX4 can be flown at.
+            ConfigError: The address is invalid, or the control period is outside the range that PX4 supports.
         """
         super().__init__(address or ADDRESS, dt, low, high)
         if not 0.004 <= dt <= 0.1:
             raise ConfigError(f"dt = {dt} s: PX4 is commanded at 10 to 250 Hz")
         address_of(self.address)
         self.thrust = ThrustScale(0.0, 1.0)
-        """From what the motors can give."""
+        """Scale of thrust commands; its range is the full thrust of the motors."""
         self._engaged = False
         self._place, self._heading, self._told = np.zeros(3), 0.0, -math.inf
 
     def connect(self, keep_on: KeepOn = lambda: True) -> None:
-        """Wait for PX4, and until it can be armed."""
+        """Connect to PX4, and wait until it can be armed."""
         if self._link is None:
             endpoint = open_endpoint(self.address)
             try:
@@ -78,18 +79,18 @@ class MavlinkPlant(LinkedPlant[MavlinkLink]):
         for message in UNUSED:
             link.stream(message, 1.0)
         began = time.monotonic()
-        # With motion capture in the place of a GPS, PX4 does not say that it could be armed, and can be.
+        # With motion capture instead of GPS, PX4 does not report that it can be armed, although it can.
         known = lambda: link.reading is not None and (link.ready or time.monotonic() - began > UNREADY_S)  # noqa: E731
         if not self.until(known, READY_S, keep_on):
             raise PlantError(f"{self.address}: no position in {READY_S:g} s{self._said()}")
 
     def take_off(self, p: np.ndarray | None, yaw: float | None, keep_on: KeepOn = lambda: True) -> None:
-        """Let PX4 fly to a place, and learn how much thrust it takes to hover there."""
+        """Let PX4 fly to a position, and identify its thrust command at hover."""
         x, link = self.reading(), self.link
         up = np.array([0.0, 0.0, 0.0 if link.armed else 1.0])
         self._place = x.p + up if p is None else np.asarray(p, dtype=float)
         self._heading = heading_of(x.R) if yaw is None else yaw
-        self.hold(time.monotonic() + 0.5)  # a setpoint has to be there before the mode
+        self.hold(time.monotonic() + 0.5)  # PX4 needs a setpoint before the change of mode
         self._ask(self._offboard, SET_MODE, (1.0, *map(float, OFFBOARD)), SWITCH_S, keep_on, "offboard mode")
         self._engaged = True
         self._ask(lambda: link.armed, ARM_DISARM, (1.0,), ARM_S, keep_on, "to be armed")
@@ -103,7 +104,7 @@ class MavlinkPlant(LinkedPlant[MavlinkLink]):
         self.thrust.learn(link.thrusts)
 
     def hold(self, until: float) -> None:
-        """Let PX4 hold the place of the take-off until an instant of the monotonic clock [s]."""
+        """Let PX4 hold the position of the take-off until an instant of the monotonic clock [s]."""
         while time.monotonic() < until:
             self._tell()
             self.link.pump(min(until, time.monotonic() + TELL_EVERY_S))
@@ -131,7 +132,7 @@ class MavlinkPlant(LinkedPlant[MavlinkLink]):
         self.link.pump(until)
 
     def land(self) -> None:
-        """Ask PX4 to land, wait until it has, and hang up; a pilot who has taken over is left alone."""
+        """Order PX4 to land, wait until it has landed, and disconnect; do not land if a pilot has taken over."""
         link, self._link = self._link, None
         if link is None:
             return
@@ -153,7 +154,7 @@ class MavlinkPlant(LinkedPlant[MavlinkLink]):
         return self.link.mode[0] == OFFBOARD[0]
 
     def _tell(self) -> None:
-        """Say where to go, now and then."""
+        """Send the position setpoint periodically."""
         if time.monotonic() - self._told >= TELL_EVERY_S:
             self._told = time.monotonic()
             self.link.fly_to(self._place, self._heading)
@@ -161,7 +162,7 @@ class MavlinkPlant(LinkedPlant[MavlinkLink]):
     def _ask(
         self, done: KeepOn, number: int, parameters: tuple[float, ...], patience: float, keep_on: KeepOn, what: str
     ) -> None:
-        """Ask again and again until it is so."""
+        """Repeat a command until its effect is visible."""
 
         def obeyed() -> bool:
             self._tell()
@@ -177,5 +178,5 @@ class MavlinkPlant(LinkedPlant[MavlinkLink]):
 
     @property
     def notes(self) -> Sequence[str]:
-        """Kinds of messages of the vehicle that were ignored."""
+        """Kinds of ignored messages of the vehicle."""
         return () if self._link is None else tuple(self._link.notes)

@@ -1,6 +1,6 @@
-"""One end of a MAVLink connection: what the autopilot says of itself, and what it is told.
+"""One end of a MAVLink connection: it receives the state of the autopilot and sends commands.
 
-Nothing here decides when to arm or who flies; :mod:`.mavlink` does.
+This module does not decide when to arm or which controller flies; :mod:`.mavlink` does.
 """
 
 import math
@@ -19,29 +19,29 @@ from .endpoint import Endpoint, pump
 from .vehicle_state import Reading
 
 HEARTBEAT_S, SYNC_S = 0.5, 0.1
-PREARM = 0x10000000  # bit of SYS_STATUS: it could be armed
+PREARM = 0x10000000  # bit of SYS_STATUS: arming is possible
 ARMED = 0x80  # bit of HEARTBEAT.base_mode
 ONBOARD_COMPUTER, INVALID = 18, 8  # MAV_TYPE, MAV_AUTOPILOT
 LOCAL_NED, LOCAL_FRD, BODY_FRD, BODY_NED = 1, 20, 12, 8
 WORLDS, BODIES = (LOCAL_NED, LOCAL_FRD), (BODY_FRD, BODY_NED)
 VISION, INT32, REAL32 = 2, 6, 9  # MAV_ESTIMATOR_TYPE, MAV_PARAM_TYPE
-RATES_ONLY = 128  # SET_ATTITUDE_TARGET: thrust and body rates count, the attitude does not
-PLACE_AND_YAW = 0x9F8  # SET_POSITION_TARGET_LOCAL_NED: velocity, acceleration and yaw rate do not count
-PAIRED_S = 0.025  # [s] between a position and an attitude that are one state
+RATES_ONLY = 128  # SET_ATTITUDE_TARGET: use thrust and body rates, ignore the attitude
+PLACE_AND_YAW = 0x9F8  # SET_POSITION_TARGET_LOCAL_NED: ignore velocity, acceleration and yaw rate
+PAIRED_S = 0.025  # [s], largest time between a position and an attitude that are combined into a state
 MOST_NOTES = 5
-SETTLED_S = 1.0  # [s] without ODOMETRY, after which other messages are made do with
+SETTLED_S = 1.0  # [s] without ODOMETRY, after which other messages are used instead
 
 
 class MavlinkLink:
-    """Listens, remembers the last of everything, and keeps the connection alive."""
+    """Receives messages, stores the newest of each kind, and keeps the connection alive."""
 
     def __init__(self, endpoint: Endpoint, *, datagrams: bool = True) -> None:
         """Build one end.
 
         Args:
-            endpoint: Where bytes come from and go to. The first autopilot that is heard there is the one that is
-                spoken to; everybody else is ignored.
-            datagrams: Whether messages are never cut in two: a damaged datagram then spoils no other.
+            endpoint: Endpoint for received and sent bytes. The link communicates with the first autopilot that it
+                receives a message from, and ignores all other senders.
+            datagrams: Whether every message arrives in one piece; a damaged datagram then does not affect the next.
 
         Raises:
             PlantError: pymavlink is not installed.
@@ -56,21 +56,21 @@ class MavlinkLink:
         self._attitude: Any = None
         self._odometry_at = -math.inf
         self.system: tuple[int, int] | None = None
-        """Number and component of the autopilot; None before it was heard."""
+        """System and component number of the autopilot; None before its first message."""
         self.autopilot, self.mode, self.armed, self.ready = -1, (0, 0), False, False
         self.reading: Reading | None = None
         self.truth: Reading | None = None
-        """Of the autopilot's own simulator, where it tells it; its origin is where it was first heard."""
+        """True state from the autopilot's own simulator, if it reports it; the origin is its first position."""
         self.thrusts: deque[float] = deque(maxlen=50)
-        """What the autopilot commands its motors, as a share of their thrust."""
+        """Thrust commands of the autopilot to its motors, as a share of their thrust."""
         self.texts: deque[str] = deque(maxlen=20)
-        """What it said in words."""
+        """Text messages of the autopilot."""
         self.heard = -math.inf
-        """When it said anything last, monotonic clock [s]."""
+        """Time of its last message, monotonic clock [s]."""
         self.ignored = 0
-        """Messages of strangers, and those that are damaged or make no sense."""
+        """Number of messages that were damaged, implausible or from other senders."""
         self.notes: list[str] = []
-        """What kinds of messages of the autopilot were ignored, each once."""
+        """Kinds of ignored messages of the autopilot, each once."""
         self._origin: tuple[float, float, float] | None = None
         self._takes: dict[str, Callable[[Any, float], None]] = {
             "HEARTBEAT": self._heartbeat, "SYS_STATUS": self._sys_status, "TIMESYNC": self._timesync,
@@ -80,17 +80,17 @@ class MavlinkLink:
         }  # fmt: skip
 
     def pump(self, until: float) -> None:
-        """Read what comes, and say what has to be said now and then, until an instant of the monotonic clock [s]."""
+        """Read received messages and send periodic ones, until an instant of the monotonic clock [s]."""
         pump(self._endpoint, until, self._chores, self._take)
 
     def command(self, number: int, *parameters: float) -> None:
-        """Send COMMAND_LONG. Its first answer only says that it arrived; the autopilot's state says what came of it."""
+        """Send COMMAND_LONG. Its first answer only confirms its arrival; the autopilot's state shows its effect."""
         padded = (*parameters, *([0.0] * (7 - len(parameters))))
         if self.system is not None:
             self._send(self._sender.command_long_encode(*self.system, number, 0, *padded))
 
     def stream(self, message: str, rate: float) -> None:
-        """Ask for a message at a rate [Hz]."""
+        """Request a message at a rate [Hz]."""
         number = getattr(self._dialect, f"MAVLINK_MSG_ID_{message}")
         self.command(self._dialect.MAV_CMD_SET_MESSAGE_INTERVAL, float(number), 1e6 / rate)
 
@@ -99,7 +99,7 @@ class MavlinkLink:
 
         Args:
             thrust: Share of the motors' thrust, 0 to 1.
-            omega: Body rates, ours [rad/s].
+            omega: Body rates in our frame [rad/s].
         """
         if self.system is not None:
             rates = frames.turned_body(omega)
@@ -111,8 +111,8 @@ class MavlinkLink:
         """Send SET_POSITION_TARGET_LOCAL_NED.
 
         Args:
-            p: Where to be, our world [m].
-            yaw: Where to look, our heading [rad].
+            p: Target position, our world [m].
+            yaw: Target heading, our convention [rad].
         """
         if self.system is not None:
             place = [float(x) for x in frames.turned_world(p)]
@@ -121,10 +121,10 @@ class MavlinkLink:
             ))  # fmt: skip
 
     def see(self, x: Reading) -> None:
-        """Send ODOMETRY: what motion capture sees of the vehicle, for the autopilot's estimator.
+        """Send ODOMETRY: a state measured by motion capture, for the autopilot's estimator.
 
         Args:
-            x: The state; its stamp is left out, since it is sent at once.
+            x: The state; its stamp is not sent, since the message is sent immediately.
         """
         place = [float(each) for each in frames.turned_world(x.p)]
         velocity = [float(each) for each in frames.turned_body(x.R.T @ x.v)]
@@ -136,14 +136,14 @@ class MavlinkLink:
         ))  # fmt: skip
 
     def set_parameter(self, name: str, value: float | int) -> None:
-        """Send PARAM_SET; an integer travels as its bit pattern, which is PX4's way."""
+        """Send PARAM_SET; an integer is sent as its bit pattern, which is the convention of PX4."""
         if self.system is not None:
             real = struct.unpack("<f", struct.pack("<i", value))[0] if isinstance(value, int) else value
             kind = INT32 if isinstance(value, int) else REAL32
             self._send(self._sender.param_set_encode(*self.system, name.encode(), real, kind))
 
     def close(self) -> None:
-        """Give the port back."""
+        """Close the port."""
         self._endpoint.close()
 
     def _fresh(self) -> Any:
@@ -164,13 +164,13 @@ class MavlinkLink:
             self._send(self._sender.timesync_encode(0, int(time.monotonic() * 1e9)))
 
     def _take(self, data: bytes, peer: Any) -> None:
-        """Take what came in one go."""
+        """Process the data of one read."""
         if self._datagrams:
             self._parser = self._fresh()
         now = time.monotonic()
         try:
             messages = self._parser.parse_buffer(data) or []
-        except Exception:  # whatever a parser does with bytes that mean harm
+        except Exception:  # a parser may raise any error on malicious bytes
             self._parser, messages, self.ignored = self._fresh(), [], self.ignored + 1
         for message in messages:
             if self._known(message, peer):
@@ -179,13 +179,13 @@ class MavlinkLink:
                 if take is not None:
                     try:
                         take(message, now)
-                    except (ArithmeticError, LookupError, TypeError, ValueError) as error:  # one message ends nothing
+                    except (ArithmeticError, LookupError, TypeError, ValueError) as error:  # go on after a bad message
                         self._ignore(f"{message.get_type()} that makes no sense ({type(error).__name__})")
             else:
                 self.ignored += 1
 
     def _known(self, message: Any, peer: Any) -> bool:
-        """Whether a message is whole and of the autopilot; the first autopilot that is heard becomes it."""
+        """Return whether a message is intact and from the autopilot; the first autopilot that sends is selected."""
         kind = message.get_type()
         if kind == "BAD_DATA" or kind.startswith("UNKNOWN"):
             return False
@@ -203,7 +203,7 @@ class MavlinkLink:
         self.ready = bool(message.onboard_control_sensors_health & PREARM)
 
     def _timesync(self, message: Any, now: float) -> None:
-        if message.tc1 == 0:  # it asks us
+        if message.tc1 == 0:  # a request of the autopilot
             self._send(self._sender.timesync_encode(int(now * 1e9), message.ts1))
         elif 0.0 <= (trip := now - 1e-9 * message.ts1) < 1.0:
             self._clock.exchanged(now - trip, 1e-9 * message.tc1, now)
@@ -232,7 +232,7 @@ class MavlinkLink:
         self._attitude = message
 
     def _local_position(self, message: Any, now: float) -> None:
-        """Put a state together where the autopilot sends no ODOMETRY."""
+        """Combine position and attitude messages into a state if the autopilot does not send ODOMETRY."""
         attitude = self._attitude
         if now - self._odometry_at < SETTLED_S or attitude is None:
             return
@@ -253,7 +253,7 @@ class MavlinkLink:
         here = self._clock.here(remote)
         stamp = now if here is None else min(here, now)
         if self.reading is not None and stamp < self.reading.stamp and now - stamp < SETTLED_S:
-            return  # overtaken on the way
+            return  # it arrived out of order
         velocity = R @ frames.turned_body(v) if in_body else frames.turned_world(v)
         self.reading = Reading(stamp, frames.turned_world(p), R, velocity, frames.turned_body(rates))
 
@@ -265,7 +265,7 @@ class MavlinkLink:
         self.texts.append(str(message.text))
 
     def _hil_state(self, message: Any, now: float) -> None:
-        """Take the true state of PX4's own simulator, on a plane that touches the earth where it was first heard."""
+        """Read the true state of PX4's own simulator, on a plane that touches the earth at its first position."""
         q = np.array(message.attitude_quaternion)
         if not np.isfinite(q).all() or not 0.5 < q @ q < 2.0:
             self.ignored += 1

@@ -1,4 +1,4 @@
-"""Waiting for a vehicle, which nobody can hurry."""
+"""Waiting for conditions of a vehicle, with a time limit."""
 
 import math
 import time
@@ -7,21 +7,21 @@ from collections.abc import Callable
 from ...errors import PlantError
 
 KeepOn = Callable[[], bool]
-"""Asked again and again."""
-NAP_S = 0.01  # [s] between two questions
+"""Condition that is checked repeatedly."""
+NAP_S = 0.01  # [s] between two checks
 
 
 def wait_until(done: KeepOn, patience: float, keep_on: KeepOn, wait: Callable[[float], object]) -> bool:
-    """Wait until something is so; return whether it is.
+    """Wait until a condition holds; return whether it holds.
 
     Args:
-        done: Whether it is so.
-        patience: How long to wait at most [s].
-        keep_on: Asked again and again; False gives up.
+        done: Returns whether the condition holds.
+        patience: Longest time to wait [s].
+        keep_on: Called repeatedly; False gives up.
         wait: Keeps the link alive until an instant of the monotonic clock [s].
 
     Raises:
-        PlantError: ``keep_on`` says no: the flight was given up.
+        PlantError: ``keep_on`` returns False: the flight was given up.
     """
     until = time.monotonic() + patience
     while time.monotonic() < until:
@@ -34,11 +34,11 @@ def wait_until(done: KeepOn, patience: float, keep_on: KeepOn, wait: Callable[[f
 
 
 def insisting(order: Callable[[], object], done: KeepOn, every: float) -> KeepOn:
-    """Return a question that gives an order again and again, since it may be lost, until something is so.
+    """Return a condition that repeats an order, which may be lost, until another condition holds.
 
     Args:
-        order: Gives it.
-        done: Whether it is so; asked before each time.
+        order: Sends the order.
+        done: Returns whether the condition holds; called before each order.
         every: Time between two orders [s].
     """
     given = -math.inf

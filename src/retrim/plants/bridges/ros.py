@@ -1,4 +1,4 @@
-"""A vehicle behind ROS 1, as a plant: somebody else takes off, hands over, and takes back."""
+"""A vehicle behind ROS 1 as a plant: another pilot takes off, hands over, and takes back control."""
 
 import math
 import re
@@ -14,7 +14,7 @@ from .ros_link import ODOMETRY, POSE, RosLink
 from .vehicle_state import VehicleState
 
 MASTER, NAMESPACE = "127.0.0.1:11311", "/mavros"
-HEARD_S, GO_S = 10.0, 120.0  # [s] to be heard; to be flown to the start
+HEARD_S, GO_S = 10.0, 120.0  # [s], limits for the first state, and for the flight to the start
 LOST_S = 1.0  # [s] of silence
 ADDRESS = re.compile(r"(?P<master>[\w.-]+:\d{1,5})(?P<namespace>(/\w+)*)")
 HEADING = math.radians(20.0)
@@ -23,23 +23,24 @@ HEADING = math.radians(20.0)
 class RosPlant(LinkedPlant[RosLink]):
     """A vehicle whose states and targets are topics of ROS 1.
 
-    World and body are those of ROS, which are ours. Who flies it (mavros, a pilot of a flight stack) takes off, flies
-    it to the start, follows our targets while they come, and takes it back when they stop. Thrust per mass becomes a
-    share of the motors' thrust by the vehicle's mass and largest thrust; errors of these are left to adaptation.
+    World and body frame are those of ROS, which are also ours. The other pilot (mavros, a pilot of a flight stack)
+    takes off, flies the vehicle to the start, follows our targets while they are published, and takes back control when
+    they stop. Thrust per mass is converted to a share of the motors' thrust with the vehicle's mass and largest thrust;
+    adaptation compensates for errors of these.
     """
 
     def __init__(self, address: str, dt: float, low: np.ndarray, high: np.ndarray, strongest: float) -> None:
-        """Build a plant; nothing is joined before it connects.
+        """Build a plant; it joins the ROS network when it connects.
 
         Args:
             address: ``HOST:PORT`` of the rosmaster, with ``/NAMESPACE`` of the topics or without.
             dt: Control period [s].
             low: Smallest command [c, omega].
-            high: Largest one.
-            strongest: Thrust per mass of all motors at their end [m/s^2].
+            high: Largest command [c, omega].
+            strongest: Thrust per mass of all motors at full throttle [m/s^2].
 
         Raises:
-            ConfigError: The address is none.
+            ConfigError: The address is invalid.
         """
         self.master, self.namespace = parts_of(address)
         super().__init__(f"ros:{self.master}", dt, low, high)
@@ -59,7 +60,7 @@ class RosPlant(LinkedPlant[RosLink]):
             )
 
     def take_off(self, p: np.ndarray | None, yaw: float | None, keep_on: KeepOn = lambda: True) -> None:
-        """Wait until somebody has flown it to the start, and it stays there."""
+        """Wait until another pilot has flown the vehicle to the start and it stays there."""
         x = self.reading()
         place = x.p if p is None else np.asarray(p, dtype=float)
         stays = self.staying(place)
@@ -77,7 +78,7 @@ class RosPlant(LinkedPlant[RosLink]):
             )
 
     def hold(self, until: float) -> None:
-        """Leave it to who flies it."""
+        """Let the other pilot hold the vehicle."""
         self.wait(until)
 
     def read(self) -> VehicleState:
@@ -94,21 +95,21 @@ class RosPlant(LinkedPlant[RosLink]):
         return np.concatenate([[thrust * self._strongest], u[1:]])
 
     def wait(self, until: float) -> None:
-        """Wait; rospy hears by itself."""
+        """Wait; rospy receives messages in its own threads."""
         time.sleep(max(0.0, until - time.monotonic()))
 
     def land(self) -> None:
-        """Publish no more: who else flies it takes it back."""
+        """Stop publishing, so that the other pilot takes back control."""
         link, self._link = self._link, None
         if link is not None:
             link.close()
 
 
 def parts_of(address: str) -> tuple[str, str]:
-    """Return HOST:PORT of a rosmaster and the namespace of the topics; what is usual if it is empty.
+    """Return HOST:PORT of a rosmaster and the namespace of the topics; the defaults for an empty address.
 
     Raises:
-        ConfigError: It is no address.
+        ConfigError: The text is not an address.
     """
     found = ADDRESS.fullmatch(address or MASTER)
     if found is None or not 0 < int(found["master"].rpartition(":")[2]) < 65_536:

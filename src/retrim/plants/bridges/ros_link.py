@@ -1,6 +1,6 @@
-"""A node of ROS 1 that hears where a vehicle is, and says how it shall fly; topics are those of mavros.
+"""A node of ROS 1 that receives the state of a vehicle and publishes attitude targets, on the topics of mavros.
 
-Nothing here decides who flies; :mod:`.ros` does.
+This module does not decide which pilot flies; :mod:`.ros` does.
 """
 
 import math
@@ -16,9 +16,9 @@ from .clock import ArrivalClock
 from .vehicle_state import Reading
 
 ODOMETRY, POSE, TARGET = "local_position/odom", "local_position/pose", "setpoint_raw/attitude"
-RATES_ONLY = 128  # type_mask of an AttitudeTarget: the attitude does not count
-FRESH_S = 0.5  # [s] without odometry, after which poses are made do with
-SMOOTH_S = 0.03  # [s] over which velocities that follow from poses are smoothed
+RATES_ONLY = 128  # type_mask of an AttitudeTarget: ignore the attitude
+FRESH_S = 0.5  # [s] without odometry, after which poses are used instead
+SMOOTH_S = 0.03  # [s] over which velocities from differences of poses are smoothed
 ATTITUDE_TARGET = """std_msgs/Header header
 uint8 type_mask
 uint8 IGNORE_ROLL_RATE = 1
@@ -46,7 +46,7 @@ float64 x
 float64 y
 float64 z
 """
-"""The fields of mavros_msgs/AttitudeTarget, by whose checksum nodes know each other; Debian has no mavros."""
+"""Fields of mavros_msgs/AttitudeTarget; nodes compare their checksum. Debian does not provide mavros."""
 
 
 def attitude_target() -> Any:
@@ -60,17 +60,17 @@ def attitude_target() -> Any:
 
 
 class RosLink:
-    """Subscribes to odometry and poses, and publishes attitude targets; callbacks come in threads of rospy's."""
+    """Subscribes to odometry and poses, and publishes attitude targets; callbacks run in threads of rospy."""
 
     def __init__(self, master: str, namespace: str) -> None:
-        """Join.
+        """Join the ROS network.
 
         Args:
-            master: Where the rosmaster is, as ``http://127.0.0.1:11311``.
-            namespace: What names of topics begin with, as ``/mavros``.
+            master: Address of the rosmaster, for example ``http://127.0.0.1:11311``.
+            namespace: Prefix of the names of topics, for example ``/mavros``.
 
         Raises:
-            ConfigError: ROS is not installed, or there is no master.
+            ConfigError: ROS is not installed, or the master is not running.
         """
         rospy = join(master)
         self._rospy, self._target = rospy, attitude_target()
@@ -78,9 +78,9 @@ class RosLink:
         self._one_at_a_time = threading.Lock()
         self.reading: Reading | None = None
         self.heard = -math.inf
-        """When a state that makes sense came last, monotonic clock [s]."""
+        """Time of the last valid state, monotonic clock [s]."""
         self.ignored = 0
-        """States that make no sense."""
+        """Number of invalid states."""
         odometry, pose = system_module("nav_msgs.msg").Odometry, system_module("geometry_msgs.msg").PoseStamped
         self._ends = [
             rospy.Subscriber(f"{namespace}/{topic}", kind, self._alone(take), queue_size=1, tcp_nodelay=True)
@@ -94,7 +94,7 @@ class RosLink:
 
         Args:
             thrust: Share of the motors' thrust, 0 to 1.
-            omega: Body rates, ours, which are those of ROS: forward, left, up [rad/s].
+            omega: Body rates in our frame, which is that of ROS: forward, left, up [rad/s].
         """
         target = self._target()
         target.header.stamp = self._rospy.Time.from_sec(time.time())
@@ -103,12 +103,12 @@ class RosLink:
         self._publisher.publish(target)
 
     def close(self) -> None:
-        """Leave the topics; the node stays as long as the process."""
+        """Unregister from the topics; the node stays until the process ends."""
         for end in self._ends:
             end.unregister()
 
     def _alone(self, take: Callable[[Any], None]) -> Callable[[Any], None]:
-        """Return a callback that waits for those of other topics, whose threads are others."""
+        """Return a callback that waits for the callbacks of other topics, which run in other threads."""
 
         def taken(message: Any) -> None:
             with self._one_at_a_time:
@@ -117,7 +117,7 @@ class RosLink:
         return taken
 
     def _odometry(self, message: Any) -> None:
-        """Take nav_msgs/Odometry: pose in its frame, twist in its child's frame, the body, unless that is the same."""
+        """Process nav_msgs/Odometry: pose in its frame, twist in its child frame (the body, unless both are equal)."""
         twist, pose = message.twist.twist, message.pose.pose
         v, omega = (np.array([a.x, a.y, a.z]) for a in (twist.linear, twist.angular))
         found = _pose(pose)
@@ -130,8 +130,8 @@ class RosLink:
         self._take(message.header.stamp.to_sec(), p, R, v if in_world else R @ v, R.T @ omega if in_world else omega)
 
     def _pose(self, message: Any) -> None:
-        """Take geometry_msgs/PoseStamped, where no odometry comes: velocities follow from two of them, smoothed."""
-        from scipy.spatial.transform import Rotation  # here: it takes as long to import as all of retrim
+        """Process geometry_msgs/PoseStamped without recent odometry; velocities are smoothed differences of poses."""
+        from scipy.spatial.transform import Rotation  # local, because it takes as long to import as all of retrim
 
         found, last = _pose(message.pose), self.reading
         if found is None:
@@ -159,8 +159,8 @@ class RosLink:
 
 
 def _pose(pose: Any) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return place and attitude of geometry_msgs/Pose; None if it makes no sense."""
-    from scipy.spatial.transform import Rotation  # here, likewise
+    """Return position and attitude of geometry_msgs/Pose; None if it is invalid."""
+    from scipy.spatial.transform import Rotation  # local for the same reason
 
     p, q = pose.position, pose.orientation
     place, quaternion = np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w])

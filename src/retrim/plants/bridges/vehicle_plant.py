@@ -1,4 +1,4 @@
-"""A vehicle as a plant: its time does not wait, and it cannot be put anywhere."""
+"""A vehicle as a plant: it runs in real time, and its state cannot be set."""
 
 import abc
 import math
@@ -15,13 +15,13 @@ from .frames import heading_of
 from .patience import KeepOn, wait_until
 from .vehicle_state import VehicleState
 
-THERE, STILL, STAY_S = 0.2, 0.25, 1.0  # [m], [m/s], [s] of one who has arrived
+THERE, STILL, STAY_S = 0.2, 0.25, 1.0  # [m], [m/s], [s]: limits for a vehicle that has arrived
 
 
 class VehiclePlant(Plant, abc.ABC):
-    """A link to one vehicle. A live flight speaks to it tick by tick; :meth:`step` makes a plant like others of it.
+    """A link to one vehicle. A live flight uses it tick by tick; :meth:`step` makes it a plant like the others.
 
-    A tick that is missed is missed: measurements then say so by their time.
+    Missed ticks are not repeated; the times of the measurements show them.
     """
 
     def __init__(self, dt: float, low: np.ndarray, high: np.ndarray) -> None:
@@ -29,73 +29,74 @@ class VehiclePlant(Plant, abc.ABC):
 
         Args:
             dt: Control period [s].
-            low: Smallest command [c, omega] that the vehicle is given.
-            high: Largest one.
+            low: Smallest command [c, omega] that is sent to the vehicle.
+            high: Largest command [c, omega] that is sent to the vehicle.
         """
         self.dt = dt
         self.low, self.high = low, high
         self.lost: float | None = None
-        """Time that a vehicle, simulated here, did not fly because the machine was busy [s]; None for any other."""
+        """Time that the simulation of a vehicle on this machine lost because the machine was busy [s]; None for other
+        vehicles."""
         self._tick: int | None = None
         self._began = 0.0
         self._thrust = STANDARD_GRAVITY
 
     @property
     def notes(self) -> Sequence[str]:
-        """Kinds of messages of the vehicle that were ignored, in words, each once."""
+        """Descriptions of the kinds of ignored messages of the vehicle, each once."""
         return ()
 
     @abc.abstractmethod
     def connect(self, keep_on: KeepOn = lambda: True) -> None:
-        """Return when the vehicle could be armed; at once if it was before.
+        """Connect, and wait until the vehicle can be armed; return immediately if this was already so.
 
         Args:
-            keep_on: Asked again and again; False gives up.
+            keep_on: Called repeatedly; False gives up.
 
         Raises:
-            PlantError: It cannot be armed, with what it said of the reason.
+            PlantError: The vehicle cannot be armed. The error contains the reason that it reported.
         """
 
     @abc.abstractmethod
     def take_off(self, p: np.ndarray | None, yaw: float | None, keep_on: KeepOn = lambda: True) -> None:
-        """Return when the vehicle hovers by its autopilot and is ready for commands.
+        """Take off, and wait until the vehicle hovers by its autopilot and is ready for commands.
 
         Args:
-            p: Where, world [m]; None for where it is, or a metre above the ground.
-            yaw: Its heading [rad]; None for what it is.
-            keep_on: Asked again and again; False gives up.
+            p: Position of the hover, world [m]; None for its current position, or a metre above the ground.
+            yaw: Heading of the hover [rad]; None for its current heading.
+            keep_on: Called repeatedly; False gives up.
 
         Raises:
-            PlantError: It does not arm, or does not get there.
+            PlantError: The vehicle does not arm, or does not reach the position.
         """
 
     @abc.abstractmethod
     def read(self) -> VehicleState:
-        """Return the newest state, at once.
+        """Return the newest state without waiting.
 
         Raises:
-            PlantError: The link is lost, or somebody else has taken over.
+            PlantError: The link is lost, or another pilot has taken over.
         """
 
     @abc.abstractmethod
     def hold(self, until: float) -> None:
-        """Let the autopilot hold the place of the take-off until an instant of the monotonic clock [s]."""
+        """Let the autopilot hold the position of the take-off until an instant of the monotonic clock [s]."""
 
     @abc.abstractmethod
     def transmit(self, u: np.ndarray) -> np.ndarray:
-        """Send a command [c, omega] that is within the limits, at once; return what of it the vehicle takes."""
+        """Send a command [c, omega] within the limits immediately; return the command that the vehicle accepts."""
 
     def send(self, u: np.ndarray) -> np.ndarray:
-        """Send a command [c, omega] at once, within the limits; return what of it the vehicle takes."""
+        """Clip a command [c, omega], send it immediately, and return the command that the vehicle accepts."""
         taken = self.transmit(np.clip(u, self.low, self.high))
         self._thrust = float(taken[0])
         return taken
 
     def now(self) -> VehicleState:
-        """Return the newest state, carried on to the present; its age is what is left of that of the news.
+        """Return the newest state, extrapolated to the current time; its age is the time that was not extrapolated.
 
         Raises:
-            PlantError: As for :meth:`read`.
+            PlantError: See :meth:`read`.
         """
         return self.read().carried_on(self._thrust)
 
@@ -104,19 +105,19 @@ class VehiclePlant(Plant, abc.ABC):
         """Keep the link alive until an instant of the monotonic clock [s]."""
 
     def until(self, done: KeepOn, patience: float, keep_on: KeepOn) -> bool:
-        """Keep the link alive until something is so, for ``patience`` [s] at most; return whether it is.
+        """Keep the link alive until a condition holds, for ``patience`` [s] at most; return whether it holds.
 
         Raises:
-            PlantError: ``keep_on`` says no: the flight was given up.
+            PlantError: ``keep_on`` returns False: the flight was given up.
         """
         return wait_until(done, patience, keep_on, self.wait)
 
     def staying(self, place: np.ndarray, meanwhile: Callable[[], object] = lambda: None) -> KeepOn:
-        """Return what tells whether the vehicle has been at a place [m] for a while.
+        """Return a function that checks whether the vehicle has been at a position [m] for a while.
 
         Args:
-            place: World [m].
-            meanwhile: Done at each question.
+            place: Position, world [m].
+            meanwhile: Called at each check.
         """
         since = math.inf
 
@@ -132,12 +133,12 @@ class VehiclePlant(Plant, abc.ABC):
 
     @abc.abstractmethod
     def land(self) -> None:
-        """Leave the vehicle to its autopilot, which lands it, unless somebody else has taken over. Idempotent."""
+        """Let the autopilot land the vehicle, unless another pilot has taken over. Idempotent."""
 
     def reset(self, x0: State | None) -> Measurement:
-        """Take off if the vehicle stands, go to the place and heading of ``x0``, and begin to command there.
+        """Take off if the vehicle stands, fly to the position and heading of ``x0``, and begin to send commands there.
 
-        Attitude and velocity of ``x0`` are left out: nobody puts a vehicle into them.
+        Attitude and velocity of ``x0`` are ignored, since they cannot be set on a vehicle.
         """
         self.connect()
         if x0 is None:
@@ -148,7 +149,7 @@ class VehiclePlant(Plant, abc.ABC):
         return self._measured()
 
     def step(self, u: Command) -> tuple[Measurement, Command]:
-        """Send a command, and return what is known when the tick is over."""
+        """Send a command, and return the measurement at the end of the tick."""
         wanted = check_command(u, type(self).__name__)
         if self._tick is None:
             raise PlantError(f"{type(self).__name__}: not flying; call reset first")

@@ -1,4 +1,4 @@
-"""What a vehicle says of itself, and what follows from it for the present."""
+"""Vehicle state estimates, extrapolated to the current time."""
 
 from typing import NamedTuple
 
@@ -6,11 +6,11 @@ import numpy as np
 
 from ...physics.state import STANDARD_GRAVITY
 
-LONGEST_S = 0.05  # [s] over which a state is carried on; what is older is too old to say more
+LONGEST_S = 0.05  # [s], limit of the extrapolation of a state; beyond it the state is too old to be useful
 
 
 class VehicleState(NamedTuple):
-    """A state in NumPy, and how old it is."""
+    """A state in NumPy, and its age."""
 
     p: np.ndarray
     """World [m]."""
@@ -21,28 +21,29 @@ class VehicleState(NamedTuple):
     omega: np.ndarray
     """Body rates [rad/s]."""
     age: float
-    """Time since this was so [s]."""
+    """Time since the state was valid [s]."""
     truth: "VehicleState | None" = None
-    """As it is, where a simulator behind the autopilot tells it."""
+    """True state, if a simulator behind the autopilot reports it."""
     carried: float = 0.0
-    """By how much it has been carried on [s]; what the vehicle said is older than ``age`` by that."""
+    """Time of extrapolation [s]; the reported state is older than ``age`` by this time."""
 
     @property
     def news(self) -> float:
-        """Time since what the vehicle said of its state was so [s]."""
+        """Age of the state as the vehicle reported it [s]."""
         return self.age + self.carried
 
     def carried_on(self, c: float) -> "VehicleState":
-        """Return the state as it is now, by thrust, gravity and body rates, all constant; its age is what is left.
+        """Return the state extrapolated to now with constant thrust, gravity and body rates; its age is the remainder.
 
-        States come at instants of the autopilot's, 5 to 20 ms old. Taken for the present they are a delay that no
-        model has, and the times between them are no ticks. A controller makes up for the age that it is told, so none
-        of what is made up for here may be in it.
+        The autopilot chooses the times of its states, and they arrive 5 to 20 ms old. If they were used as current
+        states, they would have a delay that is not part of any model, and the intervals between them would not be
+        ticks. A controller compensates for the reported age, so this age must not include the time that is compensated
+        for here.
 
         Args:
             c: Thrust per mass that was commanded last [m/s^2].
         """
-        from scipy.spatial.transform import Rotation  # here: it takes as long to import as all of retrim
+        from scipy.spatial.transform import Rotation  # local, because it takes as long to import as all of retrim
 
         h = min(self.age, LONGEST_S)
         a = c * self.R[:, 2] - np.array([0.0, 0.0, STANDARD_GRAVITY])
@@ -55,10 +56,10 @@ class VehicleState(NamedTuple):
 
 
 class Reading(NamedTuple):
-    """A state that a link has heard, in our frames."""
+    """A state that a link has received, in our frames."""
 
     stamp: float
-    """When it was valid, by the monotonic clock of this machine [s]."""
+    """Time at which it was valid, monotonic clock of this machine [s]."""
     p: np.ndarray
     """World [m]."""
     R: np.ndarray
@@ -69,5 +70,5 @@ class Reading(NamedTuple):
     """Body rates [rad/s]."""
 
     def at(self, now: float) -> VehicleState:
-        """Return it as a state with an age, at an instant of the same clock [s]."""
+        """Return the reading as a state with its age at an instant of the same clock [s]."""
         return VehicleState(self.p, self.R, self.v, self.omega, max(0.0, now - self.stamp))
