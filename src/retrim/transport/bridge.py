@@ -41,7 +41,7 @@ class Bridge:
         """Version of each topic up to which it is carried."""
         self._carried = dict.fromkeys(self._slowly, float("-inf"))
         self.refused = 0
-        """Number of messages that were too long for the other bus."""
+        """Number of messages that the other bus rejected."""
 
     def step(self) -> int:
         """Carry new messages; return their number."""

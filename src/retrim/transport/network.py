@@ -111,7 +111,7 @@ class NetworkBus(Bus):
             self._answering.start()
 
     def _end(self) -> None:
-        """Stop to answer."""
+        """Stop answering."""
         self._over = True
         if self._talk is not None and self._answering is not None:
             self._talk.pending.set()

@@ -84,7 +84,7 @@ class Session:
             if sender in self._former:
                 self._refuse("")
                 return None
-            if receiver != self._me:  # it may be a repeated message: its sender has to prove that it is running
+            if receiver != self._me:  # it may be an old message: its sender has to prove that it is running
                 if self._greeted != sender:
                     self._greet = sender
                     self.pending.set()

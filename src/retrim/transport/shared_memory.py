@@ -84,7 +84,7 @@ class SharedMemoryBus(Bus):
             os.close(lock)
 
     def take_in(self, file: Path) -> Path:
-        """Copy a file to the folder of the topics, which keeps it as long as them; return the copy.
+        """Copy a file to the folder of the topics, where it exists as long as they do; return the copy.
 
         Raises:
             OSError: It cannot be read, or there is not enough space; the bus is then removed.

@@ -115,7 +115,7 @@ def _explained(x: np.ndarray, by: np.ndarray) -> float:
 
 
 def _alike(x: np.ndarray, by: np.ndarray) -> float:
-    """Return the correlation times the root of the ratio of sizes; a lag reduces it little."""
+    """Return the correlation times the root of the ratio of sizes, so that a lag is not a disagreement."""
     small, large = sorted((float(np.linalg.norm(x)), float(np.linalg.norm(by))))
     return float(np.sum(x * by)) / max(small * large, 1e-12) * float(np.sqrt(small / max(large, 1e-12)))
 

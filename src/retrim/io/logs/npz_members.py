@@ -17,7 +17,7 @@ SUFFIX = ".npy"
 
 
 class NpzMembers(Mapping[str, Any]):
-    """The arrays of a file by name. A member is unpacked only when it is accessed, so that its size has no effect."""
+    """The arrays of a file by name. A member that is not accessed is not unpacked, whatever its size."""
 
     def __init__(self, path: Path) -> None:
         """Read the table of members.

@@ -72,7 +72,7 @@ def grid_of(path: Path, series: dict[str, Series], part: maps.Part, dt: float) -
         )
     if own < SHORTEST:
         raise LogError(f"{path}: {slowest} comes every {own:.3g} s; is time in ms, us or ns?")
-    needed = {name: each for name, each in series.items() if " " not in name}  # marks extend beyond their samples
+    needed = {name: each for name, each in series.items() if " " not in name}  # marks also hold before and after
     zero = min(each.t[0] for each in needed.values())
     first = max(max(each.t[0] for each in needed.values()), zero + part.start)
     last = min(min(series[name].t[-1] for name in states), np.inf if part.end is None else zero + part.end)
