@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-DELAYS = np.arange(0.0, 0.1601, 0.005)  # [s]
-LAGS = np.concatenate([[0.0], np.geomspace(0.005, 1.0, 33)])  # [s]
+DELAYS = np.arange(0.0, 0.1601, 0.005)  # grid of delays [s]
+LAGS = np.concatenate([[0.0], np.geomspace(0.005, 1.0, 33)])  # grid of lags [s]
 EXPLAINED = 0.6  # share that the commands must explain; see Channel.told
 POOLS = (1, 5)  # number of rows whose mean is explained
 PIECES = 3.0  # minimum number of blocks that contribute to the explained share
@@ -19,13 +19,13 @@ class Sums(NamedTuple):
     """Sums of squares of each block, for every pair of delay and lag."""
 
     xx: np.ndarray
-    """(delays, lags, blocks, k, k)"""
+    """Sums of products of features, (delays, lags, blocks, k, k)."""
     xy: np.ndarray
-    """(delays, lags, blocks, k)"""
+    """Sums of products of features and outputs, (delays, lags, blocks, k)."""
     yy: np.ndarray
-    """(blocks,)"""
+    """Sums of squares of outputs, (blocks,)."""
     n: np.ndarray
-    """(blocks,)"""
+    """Numbers of output values, (blocks,)."""
 
     @classmethod
     def of(

@@ -13,7 +13,7 @@ from .identification import Estimate, Identified
 from .vehicle import vehicle_toml
 
 MEMORY = 1e4  # [s]: the vehicle does not change during a flight
-LEAST = 1.0  # [s] of flight
+LEAST = 1.0  # shortest flight [s]
 
 
 def flight_vehicle_toml(log: Log, setup: Setup, name: str) -> str:

@@ -22,9 +22,9 @@ class Foretold:
     rmse: float
     """Root of the sum over axes of the mean over windows of the mean squared error [m/s^2]."""
     per_axis: tuple[float, float, float]
-    """World x, y, z [m/s^2]."""
+    """Error along the world axes x, y, z [m/s^2]."""
     per_window: tuple[float, ...]
-    """Root of the sum over axes of each window [m/s^2]."""
+    """Root of the sum over axes of the mean squared error of each window [m/s^2]."""
     times: tuple[float, ...]
     """Time of each prediction since the beginning of the log [s]."""
 

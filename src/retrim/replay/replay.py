@@ -33,7 +33,7 @@ DEFAULT = "hover/retrim"
 SAMPLES = (12, 100_000)  # samples that a residual model can be fitted to; the minimum is on top of the command delay
 SLOWEST = 0.1  # [s]: the longest tick of a preset; the tick of a log may differ slightly
 LOST = 0.5  # [m]: above this error, the corrected model no longer describes the flight
-SPANS = {"buffer": (0.2, 600.0), "horizon": (0.1, 600.0), "delay": (0.0, 1.0), "lag": (0.0, 5.0)}  # [s]
+SPANS = {"buffer": (0.2, 600.0), "horizon": (0.1, 600.0), "delay": (0.0, 1.0), "lag": (0.0, 5.0)}  # limits [s]
 
 
 @dataclass(frozen=True)
@@ -41,13 +41,13 @@ class Replay:
     """Options of a replay."""
 
     map: str | None = None
-    """TOML file that gives name, unit and frame of each field; or a name: px4, px4-1.9, px4-dds,
+    """TOML file with name, unit and frame of each field; or a name: px4, px4-1.9, px4-dds,
     px4-dds-1.13, mavros, mavros-pose, crazyflie, crazyflie-quaternion, crazyswarm, crazyswarm-quaternion,
     crazyswarm-ros, retrim-csv, retrim-npz, retrim-mcap. Default: the first map of the format whose fields exist."""
     buffer: float = 5.0
-    """Residual models are fitted to the last buffer seconds."""
+    """Duration of the data to which residual models are fitted [s]."""
     horizon: float = 5.0
-    """Residual models predict the next horizon seconds."""
+    """Duration of the following data that residual models predict [s]."""
     residual: str | None = None
     """Residual model of --adapt, or module:name; by default that of the policy. It is compared with regression,
     ensemble and linear."""

@@ -17,8 +17,8 @@ from ..physics.state import STANDARD_GRAVITY, Command, State
 from ..plants.bridges import frames
 from ..plants.plant import as_numpy
 
-DT = 0.01  # [s]
-GROUND = 0.05  # [m]
+DT = 0.01  # tick [s]
+GROUND = 0.05  # height below which a vehicle touches the ground [m]
 
 
 class PeerVehicle:

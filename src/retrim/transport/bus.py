@@ -35,7 +35,7 @@ class Bus(abc.ABC):
 
     @abc.abstractmethod
     def latest(self, topic: str, after: int = 0) -> Message | None:
-        """Return the last message of ``topic``, whole and as it was published.
+        """Return the last message of ``topic``, complete and unchanged.
 
         Args:
             topic: Name.

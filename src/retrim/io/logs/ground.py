@@ -46,7 +46,7 @@ def _hover(ticks: Ticks, candidates: np.ndarray, speed: np.ndarray) -> float:
     flies = candidates & ((speed > MOVES) | (z > np.percentile(z[candidates], 5) + HIGH))
     if np.sum(flies) * ticks.dt < ENOUGH:
         flies = candidates
-    upwards = np.maximum((ticks.a + UP)[flies, 2], 0.3 * STANDARD_GRAVITY)  # wind pushes sideways
+    upwards = np.maximum((ticks.a + UP)[flies, 2], 0.3 * STANDARD_GRAVITY)  # vertical only: wind pushes sideways
     return float(np.median(ticks.thrust[flies] * ticks.R[flies, 2, 2] * STANDARD_GRAVITY / upwards))
 
 
