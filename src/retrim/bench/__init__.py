@@ -1,1 +1,1 @@
-"""How long each piece of work takes on this machine, and how much memory."""
+"""Measures time and memory of each benchmark on this machine."""

@@ -1,4 +1,4 @@
-"""Policies a second beside a flight: the learner on one core, plant and pilot on another, by the clock on the wall."""
+"""Measures policy updates per second during a flight: learner on one core, plant and pilot on another, in real time."""
 
 import json
 import os
@@ -24,14 +24,14 @@ PRESET = "hover/retrim"
 
 
 def policies() -> dict[str, Any]:
-    """Fit and re-train as fast as one core can, while a flight goes on at 50 Hz on another; return the row.
+    """Fit and re-train as fast as one core permits, during a flight at 50 Hz on another; return the row.
 
     Raises:
-        OSError: The flight did not begin or go on, or the system does not let a process choose its core.
+        OSError: The flight did not begin or did not continue, or the system does not let a process choose its core.
     """
     command = [*PYTHON, "retrim.bench.beside"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as flight:
-        on_core(-1)  # the flight has begun with a choice of all
+        on_core(-1)  # after the start of the flight, whose process must be able to choose any core
         learner, state, window = learner_in_flight(PRESET)
         keys = iter(random.split(random.key(0), 2 * POLICIES))
 
@@ -56,7 +56,7 @@ def policies() -> dict[str, Any]:
 
 
 def _fly() -> None:
-    """Fly by the clock until the standard input is closed, and print how it went."""
+    """Fly in real time until the standard input is closed, and print the result."""
     on_core(0)
     setup = Setup.of(load(PRESET))
     pilot = setup.pilot(setup.new_policy(random.key(0)), "base-do")
@@ -84,7 +84,7 @@ def _fly() -> None:
 
 
 def _over() -> bool:
-    """Whether the standard input has been closed."""
+    """Return whether the standard input has been closed."""
     try:
         return os.read(sys.stdin.fileno(), 1) == b""
     except BlockingIOError:

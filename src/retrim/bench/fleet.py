@@ -1,4 +1,4 @@
-"""Works on several vehicles at once: flights of a plant, and policy updates of a fleet."""
+"""Benchmarks with several vehicles at once: flights of a plant, and policy updates of a fleet."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -25,12 +25,12 @@ from ..runtime.batched import stacked
 from .flown import learner_in_flight
 from .timing import compiled, timed
 
-FLEET = 8  # vehicles
+FLEET = 8  # number of vehicles
 Update = Callable[[Key[Array, ""]], tuple[PolicyState, Verdict]]
 
 
 def eight_flights() -> dict[str, Any]:
-    """Eight flights of 30 s on bem, plant and policy as one program; four on each of two threads."""
+    """Time eight flights of 30 s on bem; plant and policy are one program; two threads run four flights each."""
     setup = Setup.of(load("hover/fast"))
     controller = PolicyController(setup.flown.observation_in_flight, setup.new_policy(random.key(0)))
     simulation = SimPlant(BemQuadrotor.of(small(), 0.02), disturbance("none")).simulation
@@ -49,17 +49,17 @@ def eight_flights() -> dict[str, Any]:
 
 
 def one_after_another() -> dict[str, Any]:
-    """Time eight updates as one program that makes them in turn; the row of the table."""
+    """Time eight updates in one program that makes them in turn; return the row of the table."""
     return _as_one(lambda one, keys: lax.map(one, keys))
 
 
 def side_by_side() -> dict[str, Any]:
-    """Time eight updates as one program that makes them all at once; the row of the table."""
+    """Time eight updates in one program that makes them all at once; return the row of the table."""
     return _as_one(lambda one, keys: jax.vmap(one)(keys))
 
 
 def on_threads() -> dict[str, Any]:
-    """Time eight updates of one program on two threads; the row of the table."""
+    """Time eight updates of one program on two threads; return the row of the table."""
     learner, policy, fitted, window = _learnt()
     keys = random.split(random.key(0), FLEET)
 
@@ -87,7 +87,7 @@ def _as_one(together: Callable[[Update, Key[Array, " n"]], Any]) -> dict[str, An
 
 
 def _learnt() -> tuple[OnlineLearner, PolicyState, Any, Window]:
-    """What an update is given: the learner, a policy, a fitted residual and the window that it was fitted to."""
+    """Return the inputs of an update: the learner, a policy, a fitted residual and the window of the fit."""
     learner, state, window = learner_in_flight()
     fitted, _ = learner.fit_residual(state.residual, window)
     return learner, state.policy, fitted, window

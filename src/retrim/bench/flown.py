@@ -1,4 +1,4 @@
-"""What a learner has in flight, for the bench to time."""
+"""Provides the inputs of a learner in flight for benchmarks."""
 
 from jax import random
 
@@ -10,7 +10,7 @@ from ..learn.window import Window
 
 
 def learner_in_flight(name: str = "hover/paper") -> tuple[OnlineLearner, LearnerState, Window]:
-    """A learner, its state before the first fit, and a full window of flight under the large disturbance."""
+    """Return a learner, its state before the first fit, and a full window of flight under the large disturbance."""
     setup = Setup.of(load(name))
     state = setup.learner.init(setup.new_policy(random.key(0)), random.key(1))
     return setup.learner, state, full_window(setup)

@@ -1,4 +1,4 @@
-"""The machine's own rate, beside which a figure means the same on every machine."""
+"""Measures the machine's own rate, so that relative figures are comparable between machines."""
 
 import os
 import statistics
@@ -12,17 +12,17 @@ from jax import lax
 
 ROWS, WIDTH, STEPS = 10, 512, 1000
 UNIT_FLOP = 2.0 * ROWS * WIDTH * WIDTH * STEPS
-"""Of a unit: a scan of 1,000 products of 10 rows with a matrix of 512 x 512, which a roll-out is mostly made of."""
+"""Operations of a unit: a scan of 1,000 products of 10 rows with a 512 x 512 matrix, the main part of a roll-out."""
 
 
 def on_core(i: int) -> None:
-    """Keep this process, and the threads that JAX will start, on one of the cores that it may use.
+    """Keep this process, and the threads that JAX will start, on one of the cores available to it.
 
     Args:
-        i: Which of them; -1 for the last.
+        i: Index of the core; -1 for the last.
 
     Raises:
-        OSError: The system does not let a process choose.
+        OSError: The system does not let a process choose its core.
     """
     if not hasattr(os, "sched_setaffinity"):
         raise OSError("this system does not let a process choose its core")
@@ -30,10 +30,10 @@ def on_core(i: int) -> None:
 
 
 def last_core() -> int:
-    """Return the number of the last core that this process may use.
+    """Return the number of the last core available to this process.
 
     Raises:
-        OSError: The system does not let a process choose.
+        OSError: The system does not let a process choose its core.
     """
     if not hasattr(os, "sched_getaffinity"):
         raise OSError("this system does not let a process choose its core")
@@ -41,11 +41,11 @@ def last_core() -> int:
 
 
 def unit() -> Callable[[], float]:
-    """Return a function that takes the time of one unit now [s], the median of three runs."""
+    """Return a function that measures the current time of one unit [s], the median of three runs."""
     rows, weight = jnp.ones((ROWS, WIDTH)), jnp.full((WIDTH, WIDTH), 1.0 / WIDTH)
 
     @jax.jit
-    def scanned(x: Any, weight: Any) -> Any:  # a constant of the program would be laid out for another kind of product
+    def scanned(x: Any, weight: Any) -> Any:  # a constant weight would get the layout of another kind of product
         return lax.scan(lambda x, _: (x @ weight, None), x, None, length=STEPS)[0]
 
     jax.block_until_ready(scanned(rows, weight))
@@ -53,7 +53,7 @@ def unit() -> Callable[[], float]:
 
 
 def rates() -> dict[str, float]:
-    """Return what the machine does at best: a large product, the product of a roll-out, and copying memory."""
+    """Return the best rates of the machine: a large product, the product of a roll-out, and copying of memory."""
     large, long = jnp.ones((2048, 2048)), jnp.ones(2**25)
     product, copy = jax.jit(lambda a: a @ a), jax.jit(lambda a: a + 1.0)
     return {
@@ -69,7 +69,7 @@ def _median(run: Callable[[], Any], runs: int) -> float:
 
 
 def seconds(run: Callable[[], Any]) -> float:
-    """Return how long a run took [s]."""
+    """Return the duration of a run [s]."""
     began = time.perf_counter()
     jax.block_until_ready(run())
     return time.perf_counter() - began

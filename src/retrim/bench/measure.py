@@ -1,4 +1,4 @@
-"""Each work of the bench in a process of its own, and the document of all."""
+"""Runs each benchmark in a process of its own, and writes the document of all."""
 
 import json
 import os
@@ -31,19 +31,19 @@ does not. paper: reported for an RTX 4090. peak: memory of the process, JAX incl
 
 
 def bench(run: Run, reporter: Reporter, *, works: Sequence[str] = tuple(WORKS)) -> bool:
-    """Time works, and write ``bench.md`` and ``bench.json``.
+    """Run benchmarks, and write ``bench.md`` and ``bench.json``.
 
     Returns:
         Whether all of them ran.
 
     Raises:
-        ConfigError: There is no such work.
+        ConfigError: There is no such benchmark.
     """
     if unknown := [name for name in works if name not in WORKS]:
         raise ConfigError(f"no work {', '.join(unknown)}; there are {', '.join(WORKS)}")
     rows, machine, failed = list[dict[str, Any]](), dict[str, dict[str, float]](), False
     with tempfile.TemporaryDirectory() as cache, reporter.progress("bench") as advance:
-        # What is warm comes last: it fills the folder in which the others are cold.
+        # The warm benchmark comes last, because it fills the cache folder in which the others run cold.
         for i, name in enumerate(sorted(works, key=lambda name: name == "programs-warm")):
             advance(i / len(works), WORKS[name].title)
             if WORKS[name].two_cores and "one" not in CORES:
@@ -86,7 +86,7 @@ def _cells(row: dict[str, Any]) -> tuple[str, ...]:
 
 
 def _measured(name: str, cache: Path) -> dict[str, Any]:
-    """The row of one work, done by a fresh interpreter; ``cache`` starts empty, for the works that ask for one."""
+    """Return the row of one benchmark in a fresh interpreter; ``cache`` is empty at first and used if requested."""
     environment = {"RETRIM_COMPILE_CACHE": "0", "TF_CPP_MIN_LOG_LEVEL": "3"}
     if WORKS[name].cached:
         environment |= {
@@ -100,7 +100,7 @@ def _measured(name: str, cache: Path) -> dict[str, Any]:
 
 
 def _process(name: str, cores: str, environment: dict[str, str]) -> dict[str, Any]:
-    """What a process of its own prints; on one core it has no accelerator, and else all that it needs of its memory."""
+    """Return the printed result of a separate process; on one core, without accelerator, else without preallocation."""
     inherited = {key: value for key, value in os.environ.items() if key != "JAX_COMPILATION_CACHE_DIR"}
     inherited |= {"JAX_PLATFORMS": "cpu"} if cores == "one" else {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
     ran = subprocess.run(

@@ -1,4 +1,4 @@
-"""A row of ``retrim bench``, and how one is timed."""
+"""Defines and times a row of ``retrim bench``."""
 
 import statistics
 import time
@@ -12,26 +12,26 @@ from .machine import seconds, unit
 
 @dataclass(frozen=True)
 class Work:
-    """One row of the bench."""
+    """One row of ``retrim bench``."""
 
     title: str
     goal: str
     do: Callable[[], dict[str, Any]]
     """Returns compile_s, run_s and remarks."""
     paper: str = "-"
-    """What the paper reports, on an RTX 4090."""
+    """Time reported in the paper, on an RTX 4090."""
     cached: bool = False
-    """Uses the bench's own persistent compile cache, empty at first."""
+    """Whether it uses the persistent compile cache of ``retrim bench``, which is empty at first."""
     one_core: bool = False
-    """Is done on one core, too."""
+    """Whether it also runs on one core."""
     two_cores: bool = False
-    """Needs two cores, and chooses among them."""
+    """Whether it needs two cores and chooses among them."""
 
 
 def timed(compile_s: float, run: Callable[[], Any], runs: int) -> dict[str, Any]:
-    """The median of some runs, beside what compiling took, in seconds and in units of the machine.
+    """Return the median time of some runs, and the compile time, in seconds and in units of the machine.
 
-    A unit is timed before and after each run, since machines are busy with other things, too.
+    A unit is timed before and after each run, because other processes load the machine.
     """
     now = unit()
     units, took = [now()], []
@@ -45,7 +45,7 @@ def timed(compile_s: float, run: Callable[[], Any], runs: int) -> dict[str, Any]
 
 
 def compiled(jitted: Any, *arguments: Any) -> tuple[Any, float]:
-    """A jitted function compiled for its arguments, and the seconds that it took."""
+    """Return a jitted function that is compiled for its arguments, and the compile time [s]."""
     began = time.perf_counter()
     program = jitted.lower(*arguments).compile()
     return program, time.perf_counter() - began

@@ -1,4 +1,4 @@
-"""Many vehicles live on one machine, and one process that learns for all of them."""
+"""Benchmark of many live vehicles on one machine, with one process that learns for all of them."""
 
 import json
 import subprocess
@@ -40,10 +40,10 @@ PUSH = "small"
 
 
 def live_fleet(n: int) -> dict[str, Any]:
-    """Fly ``n`` vehicles by the clock on one core while one process learns for all on another; return the row.
+    """Fly ``n`` vehicles in real time on one core while one process learns for all on another; return the row.
 
     Raises:
-        OSError: The vehicles did not fly to the end.
+        OSError: The vehicles did not complete the flight.
     """
     ran = subprocess.run([*PYTHON, "retrim.bench.vehicles", str(n)], stdout=subprocess.PIPE, text=True, check=False)
     if ran.returncode != 0 or not ran.stdout:
@@ -58,7 +58,7 @@ def live_fleet(n: int) -> dict[str, Any]:
 
 
 class Air:
-    """The vehicles: their simulations as one program, and for each a bus and the loop that flies it."""
+    """The vehicles: their simulations in one program, and a bus and a control loop for each vehicle."""
 
     def __init__(self, n: int, place: Path) -> None:
         setup = Setup.of(load(PRESET))
@@ -76,7 +76,7 @@ class Air:
         self.tick = 0
 
     def plans(self) -> list[tuple[str, LearnerPlan]]:
-        """Return what is learnt for each vehicle and layer."""
+        """Return the plan of the learner of each vehicle and layer."""
         return [
             (layer, plan_of(layer, replace(self.spec, seed=i), self.spec.start, 0, bus.folder, frozenset(), 0))
             for i, bus in enumerate(self.buses)
@@ -84,7 +84,7 @@ class Air:
         ]
 
     def fly(self) -> None:
-        """Fly every vehicle for a tick: measure, decide, simulate."""
+        """Advance every vehicle by a tick: measure, compute the command, simulate."""
         now, t, commands = time.monotonic(), self.tick * self.dt, []
         for bus, loop, x, taken in zip(self.buses, self.loops, self._measured, self._accepted, strict=True):
             bus.publish("sample", Sample(self.tick, t, now, 0.0, x, x, taken).pack())
@@ -97,11 +97,11 @@ class Air:
         self.tick += 1
 
     def updates(self) -> int:
-        """Return how many updates of policies there were so far, of all vehicles; the gate refused some."""
+        """Return the number of policy updates of all vehicles so far, including those that the gate refused."""
         return sum(int(last_note(bus, "learner.policy").get("learnt", 0)) for bus in self.buses)
 
     def compile(self) -> None:
-        """Compile what a tick needs; what is simulated is dropped."""
+        """Compile the program of a tick; the simulated result is dropped."""
         u = jnp.asarray(self._accepted, dtype=float)
         jax.block_until_ready(_step(self._simulations, self._flown, u, jnp.asarray(0)))
 
@@ -134,9 +134,9 @@ def _step(simulations: Simulation, flown: SimState, u: Array, tick: Array) -> tu
 
 
 def main() -> None:
-    """Fly as many vehicles as the command line says, and print how it went."""
+    """Fly the number of vehicles on the command line, and print the result."""
     n, learning = int(sys.argv[1]), last_core()
-    on_core(0)  # before JAX begins: the threads that it has then stay where they are
+    on_core(0)  # before JAX starts its threads, so that they stay on this core
     jax.config.update("jax_cpu_enable_async_dispatch", False)
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
@@ -174,7 +174,7 @@ def _flown(air: Air, fleet: FleetProcess, place: Path) -> dict[str, Any]:
             known[i] = version
         behind = time.monotonic() - (epoch + air.tick * air.dt)
         late += behind > 0.0
-        epoch += max(0.0, behind - air.dt)  # the world waits rather than jump
+        epoch += max(0.0, behind - air.dt)  # delay the simulation instead of skipping ticks
     if fallen := sum(loop.mode != Mode.POLICY for loop in air.loops):
         raise OSError(f"{fallen} of {len(air.loops)} vehicles were taken over by the guard: this machine is too busy")
     return {

@@ -1,4 +1,4 @@
-"""The works of the bench. ``python -m retrim.bench.works NAME`` does one and prints JSON."""
+"""The benchmarks. ``python -m retrim.bench.works NAME`` runs one and prints JSON."""
 
 import json
 import resource
@@ -30,7 +30,7 @@ from .vehicles import live_fleet
 
 
 def _update(name: str, *, lora: bool = False) -> dict[str, Any]:
-    """A policy update: its products are three to a step of training and one to a tick of the gate."""
+    """Time a policy update; it has three products per step of training and one per tick of the gate."""
     learner, state, window = learner_in_flight(name)
     if lora:
         policy = Setup.of(load(name)).low_rank(state.policy.policy, random.key(2))
@@ -50,7 +50,7 @@ def _residual(name: str = "hover/paper") -> dict[str, Any]:
 
 
 def _programs() -> dict[str, Any]:
-    """Trace and compile, or load, everything a flight needs: policy, plant, residual fit, policy update."""
+    """Trace and compile, or load, all programs of a flight: policy, plant, residual fit, policy update."""
     watch, preset = Stopwatch(), load("hover/fast")
     policy = Setup.of(preset).new_policy(random.key(0))
     Fleet(preset, policy, [Scenario("large")], starts=1, seconds=3.0).warm_up()
@@ -58,7 +58,7 @@ def _programs() -> dict[str, Any]:
 
 
 def _tick() -> dict[str, Any]:
-    """One flight without adaptation: plant, observation, policy, checks."""
+    """Time a flight without adaptation: plant, observation, policy, checks."""
     setup = Setup.of(load("hover/fast"))
     policy, plant, x0 = setup.new_policy(random.key(0)), Scenario().make(), setup.flight_starts(1)[0]
     began = time.perf_counter()
@@ -70,7 +70,7 @@ def _tick() -> dict[str, Any]:
 
 
 def _bem_tick() -> dict[str, Any]:
-    """One step of the blade-element plant."""
+    """Time a step of the blade-element plant."""
     plant, u = Scenario().make(), Command.hover()
     began = time.perf_counter()
     plant.reset(None)
@@ -98,7 +98,7 @@ def _demo() -> dict[str, Any]:
 
 
 def _with_latency(title: str, name: str) -> Work:
-    """An update beside the latency that a preset charges for it."""
+    """Return an update whose goal is the latency that a preset assumes for it."""
     return Work(title, f"{load(name).adapt.update_latency:g} s, its latency", lambda: _update(name))
 
 
@@ -164,7 +164,7 @@ WORKS: dict[str, Work] = {
 
 
 def main() -> None:
-    """Do the work named on the command line, on one core if a second word says so, and print its row."""
+    """Run the benchmark that the command line names, on one core if its second word is ``one``; print the row."""
     if sys.argv[2:] == ["one"]:
         on_core(0)
     if sys.argv[1] == "machine":

@@ -1,1 +1,1 @@
-"""Policies for computers without JAX: NPZ with a runner of NumPy, ONNX, and a C header."""
+"""Exports policies for computers without JAX: NPZ with a runner in NumPy, ONNX, and a C header."""

@@ -1,6 +1,6 @@
-"""C: one header of C99, single precision, without allocation, with test vectors inside.
+"""Exports a policy as a C99 header in single precision, without allocation, with built-in test vectors.
 
-Numbers are tested by their bits: under -ffast-math a compiler removes comparisons that only NaN can fail.
+The code tests numbers by their bits. With -ffast-math, a compiler would remove comparisons that fail only for NaN.
 """
 
 import math
@@ -14,24 +14,24 @@ from ..control.finite_controller import LARGEST
 from ..io.files import write_whole
 from .portable import Portable
 
-WIDTH = 8  # numbers in a line
-BAD = (math.nan, math.inf, -math.inf, LARGEST)  # that the test vectors put in each place
+WIDTH = 8  # numbers per line
+BAD = (math.nan, math.inf, -math.inf, LARGEST)  # test vectors contain each of them at each index
 
 
 def write_c(path: Path, policy: Portable) -> list[Path]:
-    """Write a header; names in it begin with that of the file. Returns its path."""
+    """Write a header and return its path; names in the header begin with the name of the file."""
     write_whole(path, _header(name_of(path), policy))
     return [path]
 
 
 def name_of(path: Path) -> str:
-    """Return what all names in the header of a file begin with."""
+    """Return the prefix of all names in the header of a file."""
     name = re.sub(r"\W", "_", path.stem, flags=re.ASCII)
     return f"_{name}" if name[0].isdigit() else name
 
 
 def remark(text: object) -> str:
-    """Return a text as a comment may hold it: nothing in it ends the comment, continues a line or begins another."""
+    """Return a text that is safe in a comment: it cannot end the comment, continue a line or begin another comment."""
     return re.sub(r"[^\w./+ -]|/(?![\w.])", "_", str(text)[:64], flags=re.ASCII)
 
 
@@ -176,7 +176,7 @@ def _check_steps(name: str) -> list[str]:
 
 
 def _step(name: str, policy: Portable) -> list[str]:
-    """The observation of a state, and a step from state to command, where the policy sees the state alone."""
+    """Return the code of the observation and of a step from state to command, for policies that observe the state."""
     if policy.observation is None:
         return []
     seen, past = policy.observation, 4 * policy.observation["history"]
@@ -229,7 +229,7 @@ def _array(name: str, values: np.ndarray) -> list[str]:
 
 
 def _number(value: float) -> str:
-    """Return a number that single precision reads back exactly."""
+    """Return the text of a number that single precision reads back exactly."""
     text = f"{np.float32(value):.9g}"
     return f"{text}f" if any(sign in text for sign in ".e") else f"{text}.0f"
 

@@ -1,6 +1,6 @@
-"""Does an exported policy compute what JAX does? It is run, on 10,000 observations, and its steps are timed.
+"""Compares an exported policy with JAX on 10,000 observations, and measures the time of a step.
 
-NaN, infinite and too large numbers are among its test vectors, in each format.
+The test vectors of each format contain NaN, infinite and too large numbers.
 """
 
 import math
@@ -23,9 +23,9 @@ from .portable import Portable
 from .runner import Runner
 
 ROWS = 10_000
-STEPS = 2_000  # of one observation at a time, for the time of one
+STEPS = 2_000  # single observations that are used to measure the time of a step
 FLAGS = ("-std=c99", "-O3", "-Wall", "-Wextra", "-Werror")
-LONGEST = 300.0  # [s] that a compiler or a program of it may take
+LONGEST = 300.0  # time limit of the compiler and of the compiled program [s]
 MAIN = """#include <stdio.h>
 #include <time.h>
 #include "{header}"
@@ -46,10 +46,10 @@ int main(void)
 
 @dataclass(frozen=True)
 class Parity:
-    """What a run of an exported policy showed."""
+    """Result of a run of an exported policy."""
 
     by: str
-    """What ran it."""
+    """Program that ran the policy."""
     worst: float
     """Largest difference to JAX, as a share of the range of commands."""
     step_s: float
@@ -57,13 +57,13 @@ class Parity:
 
 
 def check_npz(path: Path, policy: Portable, rows: np.ndarray, wanted: np.ndarray) -> Parity | None:
-    """Run the runner."""
+    """Check the runner."""
     runner = Runner(path)
     return Parity("NumPy", _worst(policy, runner.command(rows), wanted), _timed(lambda o: runner.command(o), rows))
 
 
 def check_onnx(path: Path, policy: Portable, rows: np.ndarray, wanted: np.ndarray) -> Parity | None:
-    """Run ONNX Runtime, if it is installed."""
+    """Check the model with ONNX Runtime, if it is installed."""
     if find_spec("onnxruntime") is None:
         return None
     import onnxruntime
@@ -78,7 +78,7 @@ def check_onnx(path: Path, policy: Portable, rows: np.ndarray, wanted: np.ndarra
 
 
 def check_c(path: Path, policy: Portable, rows: np.ndarray, wanted: np.ndarray) -> Parity | None:
-    """Compile the header and run it, if there is a compiler.
+    """Compile the header and check it, if there is a compiler.
 
     Raises:
         ConfigError: It does not compile.
@@ -102,7 +102,7 @@ def check_c(path: Path, policy: Portable, rows: np.ndarray, wanted: np.ndarray) 
 
 
 def _spoilt(rows: np.ndarray) -> np.ndarray:
-    """The first row with NaN, infinity and the smallest number that is too large, in each place."""
+    """Return copies of the first row with NaN, infinity or the smallest number that is too large, at each index."""
     size = rows.shape[1]
     bad = (math.nan, math.inf, -math.inf, LARGEST)
     return np.array([np.where(np.arange(size) == i, x, rows[0]) for x in bad for i in range(size)], np.float32)

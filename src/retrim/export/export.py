@@ -1,4 +1,4 @@
-"""`retrim export`: a policy in another format, run there and compared with JAX."""
+"""Implements `retrim export`: writes a policy in another format, runs it and compares it with JAX."""
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
@@ -17,13 +17,13 @@ from .npz_file import write_delta, write_npz
 from .onnx_file import write_onnx
 from .portable import Portable, commands, observations, portable_of
 
-PARITY = 1e-5  # share of the range of commands that an exported policy may miss
-SPREAD = 1.5  # of the observations at which it is compared, in units of their usual size
+PARITY = 1e-5  # largest error of an exported policy, as a share of the range of commands
+SPREAD = 1.5  # scale of the observations for the comparison, in units of their usual size
 
 
 @dataclass(frozen=True)
 class Format:
-    """One format."""
+    """A format of exported policies."""
 
     suffix: str
     write: Callable[[Path, Portable], list[Path]]
@@ -40,21 +40,21 @@ FORMATS = {
 def export(
     policy: Path, to: str, out: Path | None, delta: Path | None, reporter: Reporter, *, trust: Collection[str] = ()
 ) -> list[Path]:
-    """Write a policy in another format, and say how well it computes there.
+    """Write a policy in another format, and report its accuracy there.
 
     Args:
         policy: A policy, or the folder that holds one.
-        to: A format; or ``delta``, for a low-rank delta alone.
+        to: A format; or ``delta``, to write only a low-rank delta.
         out: The file; by default ``policy`` or ``delta`` and the suffix of the format, in the current folder.
-        delta: A low-rank delta to put on the policy.
-        reporter: Receives what is found.
-        trust: Python names that the policy may hold, as ``mine:task``.
+        delta: A low-rank delta that is added to the policy.
+        reporter: Receives the results.
+        trust: Python names that the policy may refer to, for example ``mine:task``.
 
     Returns:
         The files.
 
     Raises:
-        ConfigError: There is no such format, another file is in the way, or the result does not compute what JAX does.
+        ConfigError: There is no such format, another file has the name of an output, or the result differs from JAX.
         CheckpointError: A file cannot be used.
     """
     if to not in (*FORMATS, "delta"):

@@ -1,4 +1,4 @@
-"""NPZ: arrays of a policy, or of a low-rank delta alone, with the runner beside."""
+"""Exports NPZ: arrays of a policy with a runner in the same folder, or a low-rank delta alone."""
 
 import json
 from importlib.resources import files
@@ -16,7 +16,7 @@ RUNNER = "runner.py"
 
 
 def write_npz(path: Path, policy: Portable) -> list[Path]:
-    """Write a policy and, beside it, the runner; return both paths.
+    """Write a policy, and the runner in the same folder; return both paths.
 
     Raises:
         ConfigError: Another file has the name of the runner.
@@ -35,7 +35,7 @@ def write_npz(path: Path, policy: Portable) -> list[Path]:
 
 
 def write_delta(path: Path, policy: LoraPolicy) -> list[Path]:
-    """Write what a low-rank policy has learnt, without its base; return the path."""
+    """Write the delta of a low-rank policy, without its base; return the path."""
     arrays = {f"down{i}": np.asarray(thin.down, np.float32) for i, thin in enumerate(policy.delta)}
     arrays |= {f"up{i}": np.asarray(thin.up, np.float32) for i, thin in enumerate(policy.delta)}
     _write(path, arrays | {"shift": np.asarray(policy.shift, np.float32)},

@@ -1,4 +1,4 @@
-"""ONNX: the network with its bounded output, for any number of rows. Needs the extra ``export``."""
+"""Exports ONNX: the network with its bounded output, for any number of rows. Needs the extra ``export``."""
 
 import json
 from importlib.util import find_spec
@@ -12,19 +12,19 @@ from ..errors import ConfigError
 from ..io.files import write_whole
 from .portable import Portable
 
-OPSET, IR = 17, 8  # old enough for every runtime that is in use
+OPSET, IR = 17, 8  # old enough for all current runtimes
 
 
 def write_onnx(path: Path, policy: Portable) -> list[Path]:
     """Write a model from ``observation`` (rows x numbers) to ``command`` (rows x 4) and ``finite`` (rows x 1).
 
-    It has no memory: where an observation or a command is not finite, the command is NaN, and ``finite`` is false.
+    The model has no memory: if an observation or a command is not finite, the command is NaN and ``finite`` is false.
 
     Returns:
-        Its path.
+        The path of the model.
 
     Raises:
-        ConfigError: What writes it is not installed.
+        ConfigError: The package ``onnx`` is not installed.
     """
     if find_spec("onnx") is None:
         raise ConfigError("--to onnx needs onnx: pip install 'retrim[export]'")
@@ -34,7 +34,7 @@ def write_onnx(path: Path, policy: Portable) -> list[Path]:
     values = {"largest": _scalar(LARGEST), "zero": _scalar(0.0), "nan": _scalar(np.nan)}
 
     def finite(x: str, out: str) -> list[onnx.NodeProto]:
-        """Nodes that say whether all numbers of a row are smaller than LARGEST; a comparison with NaN is false."""
+        """Return nodes that test whether all numbers of a row are below LARGEST; a comparison with NaN is false."""
         steps: tuple[tuple[str, list[str], dict[str, Any]], ...] = (
             ("Abs", [x], {}),
             ("Less", [f"{out}_Abs", "largest"], {}),

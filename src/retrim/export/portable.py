@@ -1,4 +1,4 @@
-"""What of a policy leaves JAX: weights in single precision, limits, the observation, and test vectors."""
+"""The portable part of a policy: weights in single precision, limits, the observation, and test vectors."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -24,16 +24,16 @@ class Portable:
     """A policy as NumPy arrays in single precision. u = low + (high - low) / (1 + exp(-(y + y0)))."""
 
     layers: tuple[tuple[np.ndarray, np.ndarray], ...]
-    """Weights (inputs, outputs) and biases; all but the last are followed by ReLU."""
+    """Weights (inputs, outputs) and biases; a ReLU follows each layer except the last."""
     low: np.ndarray
     """Smallest command: c [m/s^2], omega [rad/s]."""
     high: np.ndarray
     y0: np.ndarray
-    """Output that commands hover."""
+    """Offset of the network output, with which an output of zero commands hover."""
     observation: dict[str, Any] | None
-    """How a state is observed; None for what is not made of the state alone."""
+    """Parameters of the observation of a state; None if the observation depends on more than the state."""
     about: dict[str, Any]
-    """Preset, task, control tick [s], a hash of the weights."""
+    """Preset, task, control tick [s], and a hash of the weights."""
     test_observations: np.ndarray
     test_commands: np.ndarray
 
@@ -44,11 +44,11 @@ class Portable:
 
 
 def portable_of(policy: Policy, setup: Setup) -> Portable:
-    """Return a policy as it travels.
+    """Return the portable form of a policy.
 
     Args:
-        policy: What flies; a low-rank one, merged.
-        setup: Its preset, vehicle and task.
+        policy: Policy to export; a low-rank one must be merged.
+        setup: Set-up with its preset, vehicle and task.
     """
     single = [(_single(l.weight.T), _single(l.bias)) for l in policy.layers]
     low, high, hover = (_single(u.vector()) for u in (policy.u_min, policy.u_max, policy.u_hover))
@@ -73,7 +73,7 @@ def observations(size: int, n: int, seed: int) -> np.ndarray:
 
 
 def commands(policy: Policy, rows: np.ndarray) -> np.ndarray:
-    """Return what JAX commands for rows of observations, in single precision."""
+    """Return the commands of JAX for rows of observations, in single precision."""
     single: Policy = jax.tree.map(lambda leaf: leaf.astype(jnp.float32) if eqx.is_array(leaf) else leaf, policy)
     return np.asarray(_commands(single, jnp.asarray(rows)))
 

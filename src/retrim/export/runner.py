@@ -1,9 +1,9 @@
-"""Flies an exported policy with NumPy alone. This file needs nothing else of its package: copy it with the NPZ.
+"""Runs an exported policy with NumPy only. This file does not need the rest of its package: copy it with the NPZ.
 
     policy = Runner("policy.npz")
     policy.reset()
     c, *omega = policy.step(p, R, v)      # at every control tick
-    if policy.repeats > 50: ...           # for 50 ticks, no measurement was finite: the last command was repeated
+    if policy.repeats > 50: ...           # no finite measurement for 50 ticks: the last command was repeated
 
 World ENU, body forward-left-up; the command is the collective thrust, mass-normalised [m/s^2], and body rates [rad/s].
 """
@@ -14,22 +14,22 @@ from typing import Any
 
 import numpy as np
 
-TOLERANCE = 1e-5  # of the command range, by which the test vectors in the file may be missed
-LARGEST = 2.0**20  # a number of this size or more is no measurement
+TOLERANCE = 1e-5  # largest error at the test vectors in the file, as a share of the command range
+LARGEST = 2.0**20  # a measurement is smaller than this number
 
 
 class Runner:
-    """A policy from an NPZ file. It checks itself against the test vectors in the file when it is made."""
+    """A policy from an NPZ file. The constructor checks it against the test vectors in the file."""
 
     def __init__(self, path: str | Path, delta: str | Path | None = None) -> None:
         """Read a policy.
 
         Args:
             path: The NPZ file.
-            delta: An NPZ file with what a low-rank policy has learnt, to put on it.
+            delta: An NPZ file with the learned delta of a low-rank policy, which is added to the policy.
 
         Raises:
-            ValueError: The file does not compute what it says, or the delta is another policy's.
+            ValueError: The policy fails the test vectors of the file, or the delta belongs to another policy.
         """
         with np.load(path, allow_pickle=False) as file:
             self._arrays = {name: file[name] for name in file.files}
@@ -52,11 +52,11 @@ class Runner:
 
     @property
     def repeats(self) -> int:
-        """For how many ticks the last command has been repeated; 0: the command follows from the newest state."""
+        """Number of ticks for which the last command has been repeated; 0 if it follows from the newest state."""
         return self._repeats
 
     def command(self, observation: np.ndarray) -> np.ndarray:
-        """Return the command [c, omega] for an observation, or for rows of them; NaN where one is not finite."""
+        """Return the command [c, omega] for an observation, or for rows of them; NaN if one is not finite."""
         with np.errstate(over="ignore", invalid="ignore"):
             o = np.asarray(observation, dtype=np.float32)
             is_finite = _is_finite(o)
@@ -70,7 +70,7 @@ class Runner:
             return np.where(is_finite & _is_finite(u), u, np.float32(np.nan))
 
     def reset(self) -> None:
-        """Forget the last commands: the vehicle hovers."""
+        """Reset the history of commands to hover."""
         self._repeats = 0
         seen = self.about["observation"]
         self._past = np.zeros((0 if seen is None else seen["history"], 4), dtype=np.float32)
@@ -79,8 +79,8 @@ class Runner:
     def step(self, p: np.ndarray, R: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Return the command for a state, once per control tick.
 
-        While state or command are not finite, the last command is repeated, :attr:`repeats` counts, and the memory
-        stays as it is.
+        While state or command are not finite, the last command is repeated, :attr:`repeats` increases, and the memory
+        does not change.
 
         Args:
             p: Position, world [m].
@@ -98,7 +98,7 @@ class Runner:
         return self._last.copy()
 
     def observe(self, p: np.ndarray, R: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Return the observation of a state, after the last command that :meth:`step` gave."""
+        """Return the observation of a state, after the last command of :meth:`step`."""
         seen = self.about["observation"]
         if seen is None:
             raise ValueError("this policy does not see the state alone; call command() with its observation")
@@ -109,7 +109,7 @@ class Runner:
         return np.concatenate(parts).astype(np.float32)
 
     def _survives_bad_numbers(self) -> bool:
-        """Whether NaN, infinite and too large numbers, in each place, leave the memory as it is, and are reported."""
+        """Return whether NaN, infinite and too large numbers at each index are reported and leave the memory intact."""
         rows, bad = self._arrays["test_observations"], (np.nan, np.inf, -np.inf, LARGEST)
         spoilt = [np.where(np.arange(rows.shape[1]) == i, x, rows[0]) for x in bad for i in range(rows.shape[1])]
         if not np.isnan(self.command(np.array(spoilt))).all():
@@ -142,5 +142,5 @@ class Runner:
 
 
 def _is_finite(x: np.ndarray) -> np.ndarray:
-    """Whether all numbers of each row are smaller than LARGEST; NaN is not."""
+    """Return whether all numbers of each row are smaller than LARGEST; NaN is not."""
     return np.asarray((np.abs(x) < LARGEST).all(axis=-1, keepdims=True))

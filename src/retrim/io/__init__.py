@@ -1,4 +1,4 @@
-"""Files: policies, deltas, and what a flight has learnt."""
+"""Reads and writes files: policies, deltas, and the learned state of a flight."""
 
 from .checkpoint import load_delta as load_delta
 from .checkpoint import read_policy as read_policy

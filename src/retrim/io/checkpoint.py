@@ -1,4 +1,4 @@
-"""Policies as files: weights, limits, a description and a checksum. Reading one needs no configuration."""
+"""Policies as files: weights, limits, a description and a checksum. They can be read without a configuration."""
 
 import hashlib
 from collections.abc import Mapping
@@ -22,12 +22,12 @@ MAX_WIDTH, MAX_LAYERS = 16_384, 16
 
 
 def write_policy(path: str | Path, policy: Policy, about: Mapping[str, str]) -> None:
-    """Write a policy; the folder is made if need be.
+    """Write a policy; its folder is created if necessary.
 
     Args:
         path: The file.
-        policy: What to write.
-        about: Header fields, as a preset; the architecture and the version of this package are added.
+        policy: Policy to write.
+        about: Header fields, for example a preset; the architecture and the version of this package are added.
     """
     header = {**about, "architecture": architecture(policy), "version": this_release()}
     write_whole(Path(path), wire.pack(policy, kind="policy", about=header))
@@ -59,10 +59,10 @@ def read_policy(path: str | Path) -> tuple[Policy, dict[str, str]]:
 
 
 def policy_like(sizes: str, *, source: str) -> Policy:
-    """Return the shapes of a policy from its architecture, as ``15-512-512-4``.
+    """Return the shapes of a policy from its architecture, for example ``15-512-512-4``.
 
     Raises:
-        CheckpointError: It is no architecture of a policy.
+        CheckpointError: It is not an architecture of a policy.
     """
     try:
         widths = [int(word) for word in sizes.split("-")]
@@ -75,12 +75,12 @@ def policy_like(sizes: str, *, source: str) -> Policy:
 
 
 def architecture(policy: Policy) -> str:
-    """Return the sizes of a policy's layers, as ``15-512-512-4``."""
+    """Return the sizes of a policy's layers, for example ``15-512-512-4``."""
     return "-".join(str(n) for n in (policy.layers[0].weight.shape[1], *(l.weight.shape[0] for l in policy.layers)))
 
 
 def fingerprint(policy: Policy) -> str:
-    """Return a hash of a policy's weights in single precision: a low-rank delta belongs to one base."""
+    """Return a hash of a policy's weights in single precision, because a low-rank delta belongs to one base."""
     digest = hashlib.sha256()
     for layer in policy.layers:
         for leaf in (layer.weight, layer.bias):
@@ -89,11 +89,11 @@ def fingerprint(policy: Policy) -> str:
 
 
 def save_delta(path: str | Path, policy: LoraPolicy) -> None:
-    """Write what a low-rank policy has learnt, without its base: about 50 kB for the paper's network.
+    """Write the learned delta of a low-rank policy, without its base: about 50 kB for the paper's network.
 
     Args:
-        path: The file; its folder is made if need be.
-        policy: Delta and base; the file names the base by a hash.
+        path: The file; its folder is created if necessary.
+        policy: Delta and base; the file identifies the base by a hash.
 
     Raises:
         OSError: The file cannot be written.
@@ -103,14 +103,14 @@ def save_delta(path: str | Path, policy: LoraPolicy) -> None:
 
 
 def load_delta(path: str | Path, base: Policy) -> LoraPolicy:
-    """Read a delta and put it on its base; ``.merged()`` of the result flies.
+    """Read a delta and add it to its base; use ``.merged()`` of the result to fly.
 
     Args:
         path: The file.
-        base: The policy that the delta was made for.
+        base: The policy for which the delta was trained.
 
     Raises:
-        CheckpointError: The file is missing, damaged or of another kind, made for another base, or the merged policy
+        CheckpointError: The file is missing, damaged, of another kind, or for another base, or the merged policy
             cannot be flown.
     """
     path = Path(path)
@@ -141,7 +141,7 @@ def lora_like(base: Policy, header: Mapping[str, str], *, source: str) -> LoraPo
     """Return the shapes of a low-rank policy on ``base`` from header fields.
 
     Raises:
-        CheckpointError: Ranks or scale are missing or cannot be.
+        CheckpointError: Ranks or scale are missing or invalid.
     """
     try:
         ranks, scale = tuple(map(int, header["ranks"].split("-"))), float(header["scale"])

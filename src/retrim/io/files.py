@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all."""
+"""Writes files completely or not at all."""
 
 import contextlib
 import io
@@ -15,7 +15,7 @@ from ..transport.wire import MAX_BYTES
 
 
 def write_whole(path: Path, data: bytes | str) -> None:
-    """Write a file through a partial one beside it, so that an interruption leaves the old file or the new one.
+    """Write a file through a partial one in the same folder; an interruption leaves the old file or the new one.
 
     Raises:
         OSError: The folder cannot be written, or the disk is full.
@@ -30,7 +30,7 @@ def write_whole(path: Path, data: bytes | str) -> None:
         partial.replace(path)
     except OSError as error:
         if error.errno is not None:
-            error.filename = error.filename or str(path)  # a full disk names no file
+            error.filename = error.filename or str(path)  # the error of a full disk contains no file name
         raise
     finally:
         with contextlib.suppress(OSError):
@@ -38,16 +38,16 @@ def write_whole(path: Path, data: bytes | str) -> None:
 
 
 def npz_bytes(arrays: Mapping[str, Any], *, compressed: bool = False) -> bytes:
-    """Return an NPZ file. The same arrays have the same bytes: NumPy's own writer adds the time of day.
+    """Return an NPZ file. Equal arrays give equal bytes; NumPy's own writer adds the time of day.
 
     Args:
         arrays: Arrays by name.
-        compressed: Whether they are packed.
+        compressed: Whether to compress them.
     """
     data = io.BytesIO()
     with zipfile.ZipFile(data, "w", zipfile.ZIP_DEFLATED if compressed else zipfile.ZIP_STORED) as archive:
         for name, array in arrays.items():
-            member = zipfile.ZipInfo(f"{name}.npy")  # of 1980, where the calendar of archives begins
+            member = zipfile.ZipInfo(f"{name}.npy")  # dated 1980, the first year of the ZIP format
             member.compress_type = archive.compression
             with archive.open(member, "w", force_zip64=True) as file:
                 np.lib.format.write_array(file, np.asanyarray(array), allow_pickle=False)
@@ -58,7 +58,7 @@ def read_bounded(path: Path, advice: str) -> bytes:
     """Read a file of at most :data:`retrim.transport.wire.MAX_BYTES`.
 
     Raises:
-        CheckpointError: It is no regular file (with ``advice`` on how to make one), too large, or cannot be read.
+        CheckpointError: It is not a regular file (with ``advice`` on how to make one), too large, or cannot be read.
     """
     if not path.is_file():
         raise CheckpointError(f"{path}: no such file; {advice}")
@@ -71,10 +71,10 @@ def read_bounded(path: Path, advice: str) -> bytes:
 
 
 def check_writable(folder: Path) -> None:
-    """Check that files can be written to a folder, before anything long begins; leave no new folder behind.
+    """Check that files can be written to a folder, before a long computation begins; remove new folders again.
 
     Raises:
-        ConfigError: They cannot.
+        ConfigError: Files cannot be written.
     """
     probe, new = folder / ".retrim-probe", [each for each in (folder, *folder.parents) if not each.exists()]
     try:

@@ -1,4 +1,4 @@
-"""Which release wrote a file, and what that means for a preset that does not fit."""
+"""Determines the release that wrote a file, to explain a preset that does not fit."""
 
 import functools
 import re
@@ -14,15 +14,15 @@ def this_release() -> str:
     """Return the version of this package."""
     try:
         return version("retrim")
-    except PackageNotFoundError:  # a copy of the source that was never installed
+    except PackageNotFoundError:  # a source tree that is not installed
         return UNKNOWN
 
 
 def newer_release(header: Mapping[str, str]) -> str | None:
-    """Return the version that wrote a file if it is newer than this one; None if it is not, or not told.
+    """Return the version that wrote a file if it is newer than this one; otherwise, or if it is unknown, None.
 
     Args:
-        header: Of the file.
+        header: Header of the file.
     """
     told = header.get("version", "")
     theirs, ours = _numbers(told), _numbers(this_release())

@@ -1,4 +1,4 @@
-"""Is a policy fit to fly at all? A checksum proves that a file is whole; its numbers may be unusable."""
+"""Checks whether a policy can be flown. A checksum proves that a file is intact; its numbers may still be unusable."""
 
 from typing import Any
 
@@ -9,19 +9,19 @@ from ..control.policy import Policy
 from ..errors import CheckpointError, excerpt
 
 LARGEST = 1e5
-"""Of a weight; trained ones are below 100. Larger ones overflow within a few layers of single precision."""
+"""Largest weight; trained ones are below 100. Larger ones overflow within a few layers of single precision."""
 THRUST, RATES = 1000.0, 1000.0
 """Largest limits of commands: [m/s^2], [rad/s]; a racing quadrotor has 150 and 40."""
 TRIALS = 8
 
 
 def check_policy(policy: Policy, *, source: str, observation: np.ndarray | None = None) -> None:
-    """Check weights, limits, and the commands at hover and around it.
+    """Check weights, limits, and the commands at hover and near it.
 
     Args:
-        policy: What would fly; a low-rank one, merged.
-        source: Where it comes from; the message begins with it.
-        observation: What the policy sees at hover; by default zeros.
+        policy: Policy to check; a low-rank one must be merged.
+        source: Origin of the policy; error messages begin with it.
+        observation: Observation at hover; zeros by default.
 
     Raises:
         CheckpointError: A weight or limit is not finite or too large, limits do not enclose hover, or a command is not
@@ -54,15 +54,15 @@ def check_policy(policy: Policy, *, source: str, observation: np.ndarray | None 
 
 
 def check_size(tree: Any, *, source: str, largest: float = LARGEST) -> None:
-    """Check that all real numbers of a tree are finite and not larger than weights can be.
+    """Check that all real numbers of a tree are finite and not too large for weights.
 
     Args:
         tree: A pytree of arrays.
-        source: Where it comes from; the message begins with it.
-        largest: Of their absolute values.
+        source: Origin of the tree; error messages begin with it.
+        largest: Largest absolute value.
 
     Raises:
-        CheckpointError: One is larger.
+        CheckpointError: A number is not finite, or larger.
     """
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
         if np.asarray(leaf).dtype.kind != "f" or not np.size(leaf):

@@ -1,4 +1,4 @@
-"""Policies with the preset that says how to fly them, and what a flight has learnt, as files."""
+"""Files of policies with their presets, and of the learned state of a flight."""
 
 import logging
 from collections.abc import Collection
@@ -30,16 +30,16 @@ from .releases import newer_release, this_release
 from .sanity import check_policy, check_size
 
 LOG = logging.getLogger(__name__)
-MOST = 1e12  # of a number that a learner goes on with
+MOST = 1e12  # largest number in the state of a resumed learner
 
 
 def save_policy(path: str | Path, policy: Policy, preset: Preset) -> None:
     """Write a policy and the preset that it was trained with.
 
     Args:
-        path: The file; its folder is made if need be.
-        policy: What to write.
-        preset: It says how to fly the policy.
+        path: The file; its folder is created if necessary.
+        policy: Policy to write.
+        preset: Preset with which the policy is flown.
 
     Raises:
         OSError: The file cannot be written.
@@ -52,7 +52,7 @@ def load_policy(path: str | Path, *, trust: Collection[str] = ()) -> tuple[Polic
 
     Args:
         path: The file.
-        trust: Python names that its preset may hold, as ``mine:task``; they are imported.
+        trust: Python names that its preset may refer to, for example ``mine:task``; they are imported.
 
     Raises:
         CheckpointError: The file is missing, truncated, damaged or of another kind, its weights are not finite, or
@@ -65,11 +65,11 @@ def load_policy(path: str | Path, *, trust: Collection[str] = ()) -> tuple[Polic
 
 
 def save_learnt(path: str | Path, state: LearnerState, preset: Preset) -> None:
-    """Write what a flight has learnt: policy, residual and optimiser states, with the preset.
+    """Write the learned state of a flight: policy, residual and optimiser states, with the preset.
 
     Args:
-        path: The file; its folder is made if need be.
-        state: As ``pilot.state`` of an adaptive pilot.
+        path: The file; its folder is created if necessary.
+        state: State of the learner, for example ``pilot.state`` of an adaptive pilot.
         preset: Preset of the flight.
 
     Raises:
@@ -83,15 +83,15 @@ def save_learnt(path: str | Path, state: LearnerState, preset: Preset) -> None:
 
 
 def load_learnt(path: str | Path, *, trust: Collection[str] = ()) -> tuple[LearnerState, Preset]:
-    """Read what a flight has learnt, to go on from it.
+    """Read the learned state of a flight, to continue from it.
 
     Args:
         path: The file.
-        trust: Python names that its preset may hold, as ``mine:task``; they are imported.
+        trust: Python names that its preset may refer to, for example ``mine:task``; they are imported.
 
     Raises:
         CheckpointError: The file is missing, truncated, damaged or of another kind, or its preset cannot be used, does
-            not fit what was learnt, or names Python code that is not trusted.
+            not fit the learned state, or names Python code that is not trusted.
     """
     path = Path(path)
     data = read_bounded(path, "`retrim fly --out DIR` makes a learnt.safetensors")
@@ -112,7 +112,7 @@ def load_learnt(path: str | Path, *, trust: Collection[str] = ()) -> tuple[Learn
 
 
 def _setup(header: dict[str, str], sizes: str, source: str, trust: Collection[str]) -> Setup:
-    """The set-up of a header's preset, checked against the architecture of the weights."""
+    """Return the set-up of a header's preset, checked against the architecture of the weights."""
     try:
         preset = parse(header.get("preset", ""), source=f"{source}, header, preset")
         check_trust(preset, trust, source=source)
@@ -134,7 +134,7 @@ def _setup(header: dict[str, str], sizes: str, source: str, trust: Collection[st
 
 
 def _seen_at_rest(setup: Setup) -> Float[Array, " o"]:
-    """What a policy sees of a vehicle that has rested at home."""
+    """Return the observation of a vehicle that has rested at home."""
     seen: Float[Array, " o"] = _observed(setup.env.task.observation, setup.env.task.home())
     return seen
 

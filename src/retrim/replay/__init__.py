@@ -1,4 +1,4 @@
-"""Flight logs flown again: what the nominal model missed, how well that is foretold, and what the vehicle is."""
+"""Replay of flight logs: error of the nominal model, prediction of that error, and identification of the vehicle."""
 
 from .foretelling import Foretold as Foretold
 from .foretelling import Protocol as Protocol

@@ -1,4 +1,4 @@
-"""A policy that is re-trained in the model that a log has corrected."""
+"""Re-trains a policy in the model that is corrected by a log."""
 
 from typing import Any, NamedTuple
 
@@ -21,7 +21,7 @@ from ..learn.window import Window
 from ..physics.state import Command
 from .predictors import refitted
 
-SETTLED = 5  # refused updates in a row after which nothing more is to be gained
+SETTLED = 5  # refused updates in a row after which no further improvement is expected
 ENOUGH = 0.5  # share of a window that must be valid
 
 
@@ -30,12 +30,12 @@ class Adapted(NamedTuple):
 
     state: LearnerState
     admitted: int
-    """Updates that the gate let through."""
+    """Number of updates that the gate admitted."""
     tried: int
     before: float
-    """Error of the policy as it was, in the corrected model [m]."""
+    """Error of the policy before the adaptation, in the corrected model [m]."""
     after: float
-    """Error of the policy as it is."""
+    """Error of the policy after the adaptation, in the corrected model [m]."""
 
 
 def adapt_to(
@@ -43,19 +43,20 @@ def adapt_to(
 ) -> Adapted:
     """Fit the residual to a log, window by window as in flight, and re-train the policy in the corrected model.
 
-    Updates start where the task says: a log's places are not those of the task. Each passes the gate, or is dropped.
+    The updates start from states of the task, because the positions of a log are not those of the task. The gate admits
+    or rejects each update.
 
     Args:
-        rows: Of the log, one tick of the preset apart.
-        setup: Of the policy.
-        policy: What is re-trained.
-        low_rank: Whether only a low-rank delta is.
-        updates: How many updates at most.
-        seed: Of the learners.
+        rows: Rows of the log, with the tick of the preset.
+        setup: Set-up of the policy.
+        policy: Policy to re-train.
+        low_rank: Whether to train only a low-rank delta.
+        updates: Maximum number of updates.
+        seed: Seed of the learners.
         reporter: Receives the progress.
 
     Raises:
-        LogError: No window of the log has enough of a flight.
+        LogError: No window of the log contains enough of a flight.
     """
     k_init, k_delta, k_starts, k_learn = random.split(random.key(seed), 4)
     learner = setup.learner
@@ -79,7 +80,7 @@ def adapt_to(
 
 
 def _fitted(rows: Targets, setup: Setup, state: Any) -> Any:
-    """Return the state of the residual model after the last whole window."""
+    """Return the state of the residual model after the last complete window."""
     a, dt = setup.preset.adapt, setup.preset.dt
     fitted = 0
     for last in range(a.window, rows.valid.shape[0] + 1, max(1, round(a.fit_every / dt))):
@@ -95,7 +96,7 @@ def _fitted(rows: Targets, setup: Setup, state: Any) -> Any:
 
 
 def _starts(setup: Setup, key: Key[Array, ""]) -> Window:
-    """Return starts of the task in the place of states of the flight."""
+    """Return start states of the task, which replace the states of the flight."""
     n = setup.preset.adapt.window
     starts = jax.vmap(setup.learner.env.task.reset)(random.split(key, n))
     hover = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n, *leaf.shape)), Command.hover(starts.x.p.dtype))

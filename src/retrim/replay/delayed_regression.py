@@ -1,37 +1,37 @@
-"""Linear least squares on commands that come late and act behind a lag, for a grid of both, block by block."""
+"""Linear least squares with delayed and lagged commands, for a grid of delays and lags, block by block."""
 
 from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
-DELAYS = np.arange(0.0, 0.1601, 0.005)  # [s]
-LAGS = np.concatenate([[0.0], np.geomspace(0.005, 1.0, 33)])  # [s]
-EXPLAINED = 0.6  # share that commands must explain; see Channel.told
-POOLS = (1, 5)  # rows of which the mean is explained
-PIECES = 3.0  # blocks, at least, from which it comes
+DELAYS = np.arange(0.0, 0.1601, 0.005)  # grid of delays [s]
+LAGS = np.concatenate([[0.0], np.geomspace(0.005, 1.0, 33)])  # grid of lags [s]
+EXPLAINED = 0.6  # share that the commands must explain; see Channel.told
+POOLS = (1, 5)  # number of rows whose mean is explained
+PIECES = 3.0  # minimum number of blocks that contribute to the explained share
 
 Features = Callable[[float, float], np.ndarray]
-"""From a delay and a lag [s] to the features of each row, (n, outputs, k)."""
+"""Maps a delay and a lag [s] to the features of each row, (n, outputs, k)."""
 
 
 class Sums(NamedTuple):
     """Sums of squares of each block, for every pair of delay and lag."""
 
     xx: np.ndarray
-    """(delays, lags, blocks, k, k)"""
+    """Sums of products of features, (delays, lags, blocks, k, k)."""
     xy: np.ndarray
-    """(delays, lags, blocks, k)"""
+    """Sums of products of features and outputs, (delays, lags, blocks, k)."""
     yy: np.ndarray
-    """(blocks,)"""
+    """Sums of squares of outputs, (blocks,)."""
     n: np.ndarray
-    """(blocks,)"""
+    """Numbers of output values, (blocks,)."""
 
     @classmethod
     def of(
         cls, features: Features, y: np.ndarray, blocks: np.ndarray, delays: np.ndarray, lags: np.ndarray, pool: int
     ) -> "Sums":
-        """Add up ``y`` (n, outputs) and its features over the rows of each block, in means of ``pool`` of them."""
+        """Sum ``y`` (n, outputs) and its features over the rows of each block, in means of ``pool`` rows."""
 
         def pooled(rows: np.ndarray) -> np.ndarray:
             parts = rows[blocks.reshape(len(blocks), -1, pool)].mean(axis=2)
@@ -51,7 +51,7 @@ class Sums(NamedTuple):
         return cls(np.reshape(xx, (*shape, k, k)), np.reshape(xy, (*shape, k)), squares, count)
 
     def fit(self, draw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the misfit of each pair, n log(mean square), and its parameters, where blocks count so often."""
+        """Return the misfit n log(mean square) and the parameters of each pair; ``draw`` counts the uses of blocks."""
         xx, xy = np.einsum("dlbij,b->dlij", self.xx, draw), np.einsum("dlbi,b->dli", self.xy, draw)
         size = np.sqrt(np.einsum("dlii->dli", xx) + 1e-12)
         scaled = xx / size[..., :, None] / size[..., None, :] + 1e-9 * np.eye(xx.shape[-1])
@@ -61,7 +61,7 @@ class Sums(NamedTuple):
         return count * np.log(left / count), theta
 
     def left(self) -> np.ndarray:
-        """Return what the best pair leaves of each block."""
+        """Return the residual sum of squares of each block for the best pair."""
         misfit, theta = self.fit(np.ones(len(self.yy)))
         best = np.unravel_index(np.argmin(misfit), misfit.shape)
         t, xx, xy = theta[best], self.xx[best], self.xy[best]
@@ -69,11 +69,11 @@ class Sums(NamedTuple):
 
 
 class Channel(NamedTuple):
-    """One output of a vehicle behind its command."""
+    """One output of a vehicle and the command that it follows."""
 
     sums: Sums
     still: Sums
-    """With the command at its mean."""
+    """Sums with the command at its mean."""
 
     @classmethod
     def of(
@@ -83,12 +83,12 @@ class Channel(NamedTuple):
         y: np.ndarray,
         blocks: np.ndarray,
     ) -> "Channel":
-        """Build a channel; where single rows are too noisy to tell, of means of a few.
+        """Build a channel; if single rows are too noisy, use means of a few rows.
 
         Args:
-            features: From the acting command to the features of each row.
-            acting: From a delay and a lag to the acting command.
-            y: What is explained, (n, outputs).
+            features: Maps the acting command to the features of each row.
+            acting: Maps a delay and a lag to the acting command.
+            y: Explained output, (n, outputs).
             blocks: Rows of each block, a multiple of ten.
         """
         rest, none = acting(0.0, 0.0), np.zeros(1)
@@ -103,10 +103,11 @@ class Channel(NamedTuple):
         return made
 
     def told(self) -> bool:
-        """Whether the log says how the output follows: its changes are explained by those of the command.
+        """Return whether changes of the command explain the changes of the output.
 
-        Where a controller answers the noise of a measurement, the noise of the next difference of measurements looks
-        as if it followed at once, and up to half of it is explained by that. So more than half must be.
+        If a controller reacts to measurement noise, the noise of the next difference of measurements looks like an
+        immediate response to the command. This explains up to half of that noise. The threshold is therefore above
+        one half.
         """
         before, after = self.still.left(), self.sums.left()
         won = np.clip(before - after, 0.0, None)

@@ -1,4 +1,4 @@
-"""The vehicle of a flight that retrim has flown, as a vehicle file."""
+"""Writes the vehicle of a flight of retrim as a vehicle file."""
 
 import jax
 import jax.numpy as jnp
@@ -12,20 +12,20 @@ from ..runtime.flight import Log
 from .identification import Estimate, Identified
 from .vehicle import vehicle_toml
 
-MEMORY = 1e4  # [s]: the vehicle of a flight is one vehicle
-LEAST = 1.0  # [s] of flight
+MEMORY = 1e4  # [s]: the vehicle does not change during a flight
+LEAST = 1.0  # shortest flight [s]
 
 
 def flight_vehicle_toml(log: Log, setup: Setup, name: str) -> str:
-    """Return the vehicle of a flight as TOML: delay, lags and damping that it shows, the rest from the preset.
+    """Return the vehicle of a flight as TOML, with identified delay, lags and damping; other values are the preset's.
 
     Args:
         log: The flight.
-        setup: Set-up of the policy that flew.
+        setup: Set-up of the policy of the flight.
         name: Name of the flight, for the comment.
 
     Raises:
-        LogError: The flight is too short, or says nothing of its vehicle.
+        LogError: The flight is too short, or does not move enough to identify its vehicle.
     """
     ticks = len(log.t) - 1
     if ticks * log.dt < LEAST:

@@ -1,4 +1,4 @@
-"""How well the next seconds of a log are foretold from the last ones."""
+"""Measures how well the last seconds of a log predict the next ones."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -16,35 +16,35 @@ ENOUGH = 0.5  # share of a buffer or a horizon that must be valid
 
 @dataclass(frozen=True)
 class Foretold:
-    """One predictor on one log."""
+    """Prediction errors of one predictor on one log."""
 
     name: str
     rmse: float
     """Root of the sum over axes of the mean over windows of the mean squared error [m/s^2]."""
     per_axis: tuple[float, float, float]
-    """World x, y, z [m/s^2]."""
+    """Error along the world axes x, y, z [m/s^2]."""
     per_window: tuple[float, ...]
-    """Root of the sum over axes of each window [m/s^2]."""
+    """Root of the sum over axes of the mean squared error of each window [m/s^2]."""
     times: tuple[float, ...]
-    """When each was foretold, since the beginning of the log [s]."""
+    """Time of each prediction since the beginning of the log [s]."""
 
 
 @dataclass(frozen=True)
 class Protocol:
-    """What is fitted and foretold."""
+    """Lengths of the fitted and the predicted windows."""
 
     buffer: float = 5.0
-    """[s]"""
+    """Length of the fitted window [s]."""
     horizon: float = 5.0
-    """[s]"""
+    """Length of the predicted window [s]."""
     every: float = EVERY
     """Time between fits [s]."""
 
     def windows(self, valid: np.ndarray, dt: float) -> list[tuple[int, int, int]]:
-        """Return first tick, fit and last tick of each window that has enough of a flight.
+        """Return first tick, tick of the fit and last tick of each window that contains enough of a flight.
 
         Raises:
-            LogError: There is none.
+            LogError: There is no such window.
         """
         buffer, horizon, every = (max(1, round(x / dt)) for x in (self.buffer, self.horizon, self.every))
         found = []
@@ -63,13 +63,13 @@ class Protocol:
 def foretell(
     rows: Targets, dt: float, predictors: Mapping[str, Callable[[], Predictor]], protocol: Protocol
 ) -> Iterator[Foretold]:
-    """Fit and foretell window by window, predictor by predictor.
+    """Fit and predict window by window, for each predictor in turn.
 
     Args:
-        rows: Of the whole log.
+        rows: Rows of the whole log.
         dt: Tick [s].
-        predictors: How to begin each anew.
-        protocol: Buffer, horizon, time between fits.
+        predictors: Factory of each predictor, by name.
+        protocol: Buffer, horizon and time between fits.
 
     Raises:
         LogError: The log is too short.

@@ -1,9 +1,9 @@
-"""What a log says of the vehicle: thrust map, drag, command delay, and the lags of thrust and body rates.
+"""Identifies the vehicle from a log: thrust map, drag, command delay, and the lags of thrust and body rates.
 
-Over each tick the mean acceleration is the difference of velocities, and the mean body rate that of attitudes; both are
-compared with commands that come late and act behind a first-order lag, for a grid of delays and lags. Given these, the
-rest is linear least squares. Intervals are those of a bootstrap over blocks of two seconds, since what one tick misses
-the next one misses too.
+The mean acceleration over a tick is the difference of velocities, and the mean body rate is the difference of
+attitudes. Both are compared with delayed commands behind a first-order lag, for a grid of delays and lags. For a given
+delay and lag, the other parameters follow from linear least squares. The intervals come from a bootstrap over blocks of
+two seconds, because the errors of successive ticks are correlated.
 """
 
 from dataclasses import dataclass, replace
@@ -20,57 +20,57 @@ from .delayed_regression import DELAYS, LAGS, Channel, lowest
 from .path_of_log import path_of_log
 from .rows import acting_commands
 
-BLOCK, DRAWS = 2.0, 200  # [s] of a block, and how many samples the bootstrap draws
+BLOCK, DRAWS = 2.0, 200  # length of a block [s], and number of samples of the bootstrap
 INSIDE = (5.0, 95.0)  # percentiles of an interval
-WARM = 0.3  # [s] at the beginning of a piece of flight in which a lag remembers what was not seen
-SLOW = 0.3  # [m/s], root mean square of the velocity along an axis, below which drag is not seen
+WARM = 0.3  # [s] at the beginning of a piece of flight in which a lag depends on commands before the piece
+SLOW = 0.3  # [m/s], root mean square of the velocity along an axis, below which drag is not observable
 
 
 class Estimate(NamedTuple):
-    """A number, and the interval that holds it with 90 %."""
+    """A value and its 90 % interval."""
 
     value: float
     low: float
     high: float
 
     def text(self, unit: str, scale: float = 1.0) -> str:
-        """Return it in words."""
+        """Return the estimate as text."""
         value, low, high = (scale * x for x in self)
         return f"{value:.3g}{unit and ' '}{unit} ({low:.3g} to {high:.3g})"
 
 
 @dataclass(frozen=True)
 class Identified:
-    """What is known of a vehicle. None: the log does not say."""
+    """Identified parameters of a vehicle; None if the log does not determine a parameter."""
 
     delay: Estimate | None
-    """Of commands [s]."""
+    """Delay of commands [s]."""
     thrust_gain: Estimate | None
     """Thrust per commanded thrust [-]."""
     thrust_offset: Estimate | None
-    """Acceleration upwards that is there without a command [m/s^2]."""
+    """Upward acceleration without a command [m/s^2]."""
     full_thrust: Estimate | None
-    """For a thrust that is a share: what all of it gives [m/s^2]."""
+    """Acceleration at full thrust, if commanded thrust is a share of it [m/s^2]."""
     thrust_lag: Estimate | None
-    """[s]"""
+    """Lag of the thrust [s]."""
     rate_lag: Estimate | None
-    """Of roll and pitch, which have one [s]."""
+    """Lag of roll and pitch rate, which share one value [s]."""
     rate_gain: Estimate | None
     """Body rate per commanded body rate [-]."""
     yaw_lag: Estimate | None
-    """[s]"""
+    """Lag of the yaw rate [s]."""
     yaw_gain: Estimate | None
     drag: tuple[Estimate | None, Estimate | None, Estimate | None]
     """Linear drag along the body axes [1/s]."""
     unexplained: float
-    """Root mean square of the acceleration that is left, three axes [m/s^2]."""
+    """Root mean square of the unexplained acceleration, three axes [m/s^2]."""
 
     rate_damping: Estimate | None = None
-    """Damping ratio of roll and pitch rate; None: the rate loop is described as one of first order."""
+    """Damping ratio of roll and pitch rate; None if the rate loop is modelled as first order."""
 
     @property
     def known(self) -> bool:
-        """Whether the log says anything of the vehicle."""
+        """Whether the log determines any parameter of the vehicle."""
         return any(isinstance(value, Estimate) for value in (*vars(self).values(), *self.drag))
 
 
@@ -78,8 +78,8 @@ def identify(log: FlightLog, *, seed: int = 0) -> Identified:
     """Identify a vehicle from a flight.
 
     Args:
-        log: The flight; the more it moves and turns the more is known.
-        seed: Of the bootstrap.
+        log: The flight; more movement and rotation determine more parameters.
+        seed: Seed of the bootstrap.
 
     Raises:
         LogError: The flight is too short.
@@ -116,11 +116,11 @@ def identify(log: FlightLog, *, seed: int = 0) -> Identified:
 
 
 def _with_path(found: Identified, path: PathEstimate) -> Identified:
-    """Return what was identified, with the delay and the lags of the estimator that flies where they are excited.
+    """Return the identified vehicle, with delay and lags of the in-flight estimator where they are excited.
 
-    Its model has a damping and the noise of differences. A vehicle file has a first-order lag, so that delay and lag
-    are those of the nearest first-order path. The thrust map and the drag stay those of the regression: they need the
-    offset and the three drags at once.
+    The model of that estimator has a damping and the noise of differences. A vehicle file has a first-order lag.
+    Delay and lag are therefore those of the nearest first-order path. The thrust map and the drag remain those of the
+    regression, because they need the offset and the three drags at once.
     """
     if not (bool(path.delay.excited) and bool(path.rate_lag.excited)):
         return found
@@ -140,7 +140,7 @@ def _scaled(each: PathParameter, scale: float = 1.0) -> Estimate:
 
 
 def _solved(told: dict[str, Channel], thrust: Channel, draw: np.ndarray) -> dict[str, float]:
-    """Return the delay that all channels have, and each one's lag and parameters, between the points of the grid."""
+    """Return the common delay of all channels and each channel's lag and parameters, interpolated on the grid."""
     fits = {name: channel.sums.fit(draw) for name, channel in told.items()}
     late = np.sum([misfit.min(axis=1) for misfit, _ in fits.values()], axis=0) if fits else np.zeros(len(DELAYS))
     d = int(np.argmin(late))
@@ -159,7 +159,7 @@ def _solved(told: dict[str, Channel], thrust: Channel, draw: np.ndarray) -> dict
 
 
 def _blocks(log: FlightLog) -> np.ndarray:
-    """Return the ticks of each block that is whole: two seconds of flight, after some to settle."""
+    """Return the ticks of each complete block: two seconds of flight after a settling time."""
     size, warm = 10 * max(1, round(0.1 * BLOCK / log.dt)), round(WARM / log.dt)
     good = log.valid[:-1] & log.valid[1:]
     settled = np.convolve(good, np.ones(warm + 1), mode="full")[: len(good)] > warm
@@ -173,7 +173,7 @@ def _blocks(log: FlightLog) -> np.ndarray:
 
 
 def _thrust(log: FlightLog, blocks: np.ndarray) -> Channel:
-    """a + g e3 = k c R e3 - R D R^T v + d, over each tick."""
+    """Return the thrust channel: a + g e3 = k c R e3 - R D R^T v + d, over each tick."""
     R, v = log.R[:-1], 0.5 * (log.v[1:] + log.v[:-1])
     axis = 0.5 * (log.R[1:] + log.R[:-1])[:, :, 2]
     drag = -R * np.einsum("nji,nj->ni", R, v)[:, None, :]
@@ -187,8 +187,8 @@ def _thrust(log: FlightLog, blocks: np.ndarray) -> Channel:
 
 
 def _rates(log: FlightLog, command: np.ndarray, blocks: np.ndarray, axes: list[int]) -> Channel:
-    """omega = k omega_cmd + bias, over each tick; the axes share the lag and the gain."""
-    from scipy.spatial.transform import Rotation  # here: it takes as long to import as all of retrim
+    """Return the channel of some axes: omega = k omega_cmd + bias, over each tick; the axes share lag and gain."""
+    from scipy.spatial.transform import Rotation  # local, because it takes as long to import as all of retrim
 
     turned = Rotation.from_matrix(np.swapaxes(log.R[:-1], 1, 2) @ log.R[1:]).as_rotvec() / log.dt
     bias = np.broadcast_to(np.eye(len(axes)), (len(turned), len(axes), len(axes)))

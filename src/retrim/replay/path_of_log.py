@@ -1,4 +1,4 @@
-"""The command path that a log shows, by the estimator that flies."""
+"""Identifies the command path of a log with the in-flight estimator."""
 
 import equinox as eqx
 import jax
@@ -9,21 +9,21 @@ from ..estimation.command_path import PathEstimate, PathEstimator, PathState
 from ..io.logs import FlightLog
 from ..physics.state import STANDARD_GRAVITY, Command, State
 
-MEMORY = 1e4  # [s]: the vehicle of a log is one vehicle
-BATCH = 5  # ticks from one estimate to the next: each one says how noisy the next measurements are
+MEMORY = 1e4  # [s]: the vehicle does not change during a log
+BATCH = 5  # ticks between two estimates: each estimate sets the noise level of the next measurements
 
 
 def path_of_log(log: FlightLog) -> PathEstimate:
-    """Return what attitudes and velocities of a log say of the command path.
+    """Return the command path estimated from the attitudes and velocities of a log.
 
-    The body rates of a log are not used: they are often those that the attitude filter of the autopilot has smoothed.
+    The body rates of a log are not used, because the attitude filter of the autopilot has often smoothed them.
 
     Args:
-        log: A flight. Without commanded body rates only the thrust is known.
+        log: A flight. Without commanded body rates only the thrust is identified.
     """
     n = BATCH * (len(log.t) // BATCH)
     omega = np.zeros_like(log.v) if log.command is None else log.command
-    # A tick that is not part of the flight has a time that does not follow the one before it.
+    # Ticks outside the flight receive a time that does not continue the previous one.
     t = np.where(log.valid, log.t, log.t + 0.5 * log.dt)
     columns = (t, log.p, log.R, log.v, np.nan_to_num(log.c, nan=STANDARD_GRAVITY), np.nan_to_num(omega))
     rows = tuple(jnp.asarray(x[:n].reshape(-1, BATCH, *x.shape[1:]), jnp.float32) for x in columns)

@@ -1,4 +1,4 @@
-"""What foretells the residual acceleration of the next seconds: yardsticks, and residual models of every name."""
+"""Predictors of the residual acceleration of the next seconds: baselines, and residual models by name."""
 
 from collections.abc import Callable
 from typing import Any
@@ -20,18 +20,18 @@ from ..physics.vehicle import Vehicle
 
 Predict = Callable[[Targets], np.ndarray]
 Predictor = Callable[[Targets], Predict]
-"""Fits to the rows of the last seconds, the newest last; returns the prediction at further rows [m/s^2]."""
-RIDGE = 10.0  # penalty of the sum of squares
-STEEP = 3.0  # [m/s^2] of thrust that count as one
+"""Fits to the rows of the last seconds, in order of time; returns the predictor of further rows [m/s^2]."""
+RIDGE = 10.0  # penalty, added to the sums of squares
+STEEP = 3.0  # [m/s^2] of thrust that correspond to one unit of the regression input
 
 
 def zero(rows: Targets) -> Predict:
-    """Foretell nothing."""
+    """Predict zero."""
     return lambda more: np.zeros(more.a_res.shape)
 
 
 def mean_of(rows: Targets, ticks: int | None = None) -> Predict:
-    """Foretell the mean of the last ticks, or of all."""
+    """Predict the mean of the last ``ticks``, or of all rows."""
     chosen = jax.tree.map(lambda leaf: leaf[-ticks:] if ticks else leaf, rows)
     valid = np.asarray(chosen.valid)
     mean = np.asarray(chosen.a_res)[valid].mean(axis=0) if valid.any() else np.zeros(3)
@@ -39,7 +39,7 @@ def mean_of(rows: Targets, ticks: int | None = None) -> Predict:
 
 
 def ridge(rows: Targets) -> Predict:
-    """Foretell by ridge regression of this window alone on velocity, attitude, thrust and body rates."""
+    """Predict by ridge regression on velocity, attitude, thrust and body rates of this window only."""
     valid = np.asarray(rows.valid)
     X, Y = _inputs(rows)[valid], np.asarray(rows.a_res, dtype=float)[valid]
     mean, level = X.mean(axis=0), Y.mean(axis=0)
@@ -56,7 +56,7 @@ def _inputs(rows: Targets) -> np.ndarray:
 
 
 class Learnt:
-    """A residual model, refitted from where the last fit ended, as in flight."""
+    """A residual model; each fit starts from the result of the previous one, as in flight."""
 
     def __init__(self, model: ResidualModel, seed: int) -> None:
         self._model, self._state = model, model.init(random.key(seed))
@@ -64,7 +64,7 @@ class Learnt:
     def __call__(self, rows: Targets) -> Predict:
         """Fit to a window."""
         state = refitted(self._model, self._state, rows)
-        if bool(all_finite(eqx.filter(state, eqx.is_inexact_array))):  # a fit that is not is refused in flight
+        if bool(all_finite(eqx.filter(state, eqx.is_inexact_array))):  # in flight, a fit that is not finite is refused
             self._state = state
         kept = self._state
         return lambda more: np.asarray(_predicted(self._model, kept, more))
@@ -72,7 +72,7 @@ class Learnt:
 
 @eqx.filter_jit
 def refitted(model: ResidualModel, state: Any, rows: Targets) -> Any:
-    """Return the state of a residual model after a fit, by a program that models of one kind share."""
+    """Return the state of a residual model after a fit; models of one kind share the compiled program."""
     return model.fit(state, rows)[0]
 
 
@@ -83,7 +83,7 @@ def _predicted(model: ResidualModel, state: Any, rows: Targets) -> Float[Array, 
 
 
 def yardsticks(dt: float) -> dict[str, Callable[[], Predictor]]:
-    """Return what learning is measured by."""
+    """Return the baselines for residual models."""
     second = max(1, round(1.0 / dt))
     return {
         "zero": lambda: zero,
@@ -94,17 +94,17 @@ def yardsticks(dt: float) -> dict[str, Callable[[], Predictor]]:
 
 
 def learnt(name: str, preset: Preset, vehicle: Vehicle, seed: int, **adapt: Any) -> Callable[[], Predictor]:
-    """Return how to begin a residual model of a preset anew.
+    """Return a factory of a residual model of a preset.
 
     Args:
-        name: Of the residual model, or module:name.
-        preset: Its settings.
-        vehicle: Its limits.
-        seed: Of fresh networks.
-        **adapt: Values of the preset's table ``adapt``, on top of it.
+        name: Name of the residual model, or module:name.
+        preset: Settings of the model.
+        vehicle: Vehicle, whose limits apply.
+        seed: Seed of the initial networks.
+        **adapt: Values that override the preset's table ``adapt``.
 
     Raises:
-        ConfigError: There is none of that name, or a value cannot be.
+        ConfigError: There is no model of that name, or a value is invalid.
     """
     model = make_residual(ResidualRequest(changed(preset, adapt={"residual": name, **adapt}), vehicle))
     return lambda: Learnt(model, seed)

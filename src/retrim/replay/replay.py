@@ -1,4 +1,4 @@
-"""`retrim replay`: a log read, foretold, identified, adapted to; files in the folder of a run."""
+"""Implements `retrim replay`: reads a log, predicts, identifies and adapts, and writes files to the folder of a run."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -27,52 +27,52 @@ from .report import agreement_section, foretold_section, identified_section, pic
 from .rows import rows_of
 from .vehicle import vehicle_toml
 
-SHOWN = ("regression", "ensemble", "linear")  # residual models beside the yardsticks
-ENSEMBLE_RATE = 1e-3  # learning rate: with that of hover/paper an ensemble learns the noise of a real log
+SHOWN = ("regression", "ensemble", "linear")  # residual models that are compared with the baselines
+ENSEMBLE_RATE = 1e-3  # learning rate: with that of hover/paper, an ensemble fits the noise of a real log
 DEFAULT = "hover/retrim"
-SAMPLES = (12, 100_000)  # that a residual model can be fitted to; at least so many beside those of a command delay
-SLOWEST = 0.1  # [s]: the longest tick of a preset; a log may miss it by a little
-LOST = 0.5  # [m]: an error in a model that has nothing to do with a flight any more
-SPANS = {"buffer": (0.2, 600.0), "horizon": (0.1, 600.0), "delay": (0.0, 1.0), "lag": (0.0, 5.0)}  # [s]
+SAMPLES = (12, 100_000)  # samples that a residual model can be fitted to; the minimum is on top of the command delay
+SLOWEST = 0.1  # [s]: the longest tick of a preset; the tick of a log may differ slightly
+LOST = 0.5  # [m]: above this error, the corrected model no longer describes the flight
+SPANS = {"buffer": (0.2, 600.0), "horizon": (0.1, 600.0), "delay": (0.0, 1.0), "lag": (0.0, 5.0)}  # limits [s]
 
 
 @dataclass(frozen=True)
 class Replay:
-    """What is asked of a log."""
+    """Options of a replay."""
 
     map: str | None = None
-    """TOML file that says which field is what, in which unit and frame; or a name: px4, px4-1.9, px4-dds,
+    """TOML file with name, unit and frame of each field; or a name: px4, px4-1.9, px4-dds,
     px4-dds-1.13, mavros, mavros-pose, crazyflie, crazyflie-quaternion, crazyswarm, crazyswarm-quaternion,
-    crazyswarm-ros, retrim-csv, retrim-npz, retrim-mcap. By default the first of its format that has the fields."""
+    crazyswarm-ros, retrim-csv, retrim-npz, retrim-mcap. Default: the first map of the format whose fields exist."""
     buffer: float = 5.0
-    """Residual models are fitted to the last so many seconds."""
+    """Duration of the data to which residual models are fitted [s]."""
     horizon: float = 5.0
-    """They foretell so many seconds."""
+    """Duration of the following data that residual models predict [s]."""
     residual: str | None = None
-    """Residual model of --adapt, or module:name; by default that of the policy. It is shown beside regression, ensemble
-    and linear."""
+    """Residual model of --adapt, or module:name; by default that of the policy. It is compared with regression,
+    ensemble and linear."""
     delay: float = 0.0
-    """The thrust comes so much behind its command [s]; --identify finds it."""
+    """Delay of the thrust behind its command [s]; --identify estimates it."""
     lag: float = 0.0
-    """Time constant of the thrust after that [s]."""
+    """Time constant of the thrust after the delay [s]."""
     identify: bool = False
-    """Find thrust map, drag, command delay and lags, with intervals, and write a vehicle file."""
+    """Identify thrust map, drag, command delay and lags, with intervals, and write a vehicle file."""
     vehicle: str | None = None
-    """What is not identified is taken from this vehicle: small, large, kingfisher, a vehicle file or module:name; by
-    default that of the policy."""
+    """Vehicle that provides the values that are not identified: small, large, kingfisher, a vehicle file or
+    module:name; by default that of the policy."""
     policy: Path | None = None
-    """A policy to adapt, or the folder that holds one."""
+    """Policy to adapt, or the folder that holds one."""
     trust: tuple[str, ...] = ()
-    """Python names that the policy may hold, as mine:task; they are imported."""
+    """Python names that the policy may refer to, for example mine:task; they are imported."""
     adapt: str = "none"
-    """full, lora: re-train the policy in the model that the log corrects, all weights or a few; none."""
+    """Re-train the policy in the model that is corrected by the log: full (all weights), lora (low-rank) or none."""
     updates: int = 60
-    """How many updates at most."""
+    """Maximum number of updates."""
     seed: int = 0
-    """Of fresh networks, of updates and of the bootstrap."""
+    """Seed of initial networks, of updates and of the bootstrap."""
 
     def __post_init__(self) -> None:
-        """Raise ``ConfigError`` for what cannot be."""
+        """Raise ``ConfigError`` if a value is out of range or options contradict each other."""
         for name, (least, most) in SPANS.items():
             if not least <= getattr(self, name) <= most:
                 raise ConfigError(f"--{name} {getattr(self, name):g}: must be {least:g} to {most:g} s")
@@ -85,12 +85,12 @@ class Replay:
 
 
 def replay(path: Path, asked: Replay, run: Run, reporter: Reporter) -> Document:
-    """Report on a log, into ``replay.md``, ``replay.json`` and a picture; identify and adapt, if that is asked for.
+    """Report on a log in ``replay.md``, ``replay.json`` and a picture; identify and adapt if requested.
 
     Args:
         path: The log.
-        asked: What to do with it.
-        run: Where to.
+        asked: Options.
+        run: Run whose folder receives the files.
         reporter: Receives the tables and the progress.
 
     Raises:

@@ -1,4 +1,4 @@
-"""The report on a log: tables and a picture."""
+"""Builds the report on a log: tables and a picture."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,7 +12,7 @@ from ..learn.residuals.targets import Targets
 from .foretelling import Foretold, Protocol
 from .identification import Estimate, Identified
 
-SMOOTH = 0.3  # [s] over which curves of the picture are averaged
+SMOOTH = 0.3  # averaging time of the curves in the picture [s]
 WORDS = {
     "motion": "motion of the position, by the velocity",
     "lift": "sideways acceleration, by the attitude",
@@ -24,7 +24,7 @@ WORDS = {
 
 
 def warning_of(log: FlightLog) -> str:
-    """Return what a report on a doubtful log begins with; nothing for one that agrees with itself."""
+    """Return the introductory warning for a doubtful log; an empty string for a consistent one."""
     if not log.warnings:
         return ""
     said = "; ".join(log.warnings)
@@ -32,7 +32,7 @@ def warning_of(log: FlightLog) -> str:
 
 
 def agreement_section(log: FlightLog) -> TableSection:
-    """Return how well the quantities of a log agree with each other."""
+    """Return the table of agreement between the quantities of a log."""
     lines = tuple(
         (WORDS[name], f"{round(100 * score)} %", f"{round(100 * DOUBTFUL[name])} %")
         for name, score in log.agreement.items()
@@ -46,7 +46,7 @@ def agreement_section(log: FlightLog) -> TableSection:
 
 
 def residual_section(log: FlightLog, rows: Targets) -> TableSection:
-    """Return what the nominal model missed, axis by axis."""
+    """Return the table of the error of the nominal model, axis by axis."""
     missed = np.asarray(rows.a_res)[log.valid]
     slow = np.linalg.norm(log.v[log.valid], axis=1)
     parts = [("mean", missed.mean(axis=0)), ("standard deviation", missed.std(axis=0)),
@@ -61,7 +61,7 @@ def residual_section(log: FlightLog, rows: Targets) -> TableSection:
 
 
 def foretold_section(found: Sequence[Foretold], protocol: Protocol) -> TableSection:
-    """Return how well the next seconds were foretold."""
+    """Return the table of prediction errors over the next seconds."""
     least = min(each.rmse for each in found)
     none = next((each.rmse for each in found if each.name == "zero"), None)
     lines = []
@@ -80,7 +80,7 @@ def foretold_section(found: Sequence[Foretold], protocol: Protocol) -> TableSect
 
 
 def identified_section(found: Identified) -> TableSection:
-    """Return what the log says of the vehicle."""
+    """Return the table of identified parameters of the vehicle."""
 
     def line(name: str, what: Estimate | None, unit: str, scale: float = 1.0) -> tuple[str, str]:
         return name, "the log does not say" if what is None else what.text(unit, scale)

@@ -1,4 +1,4 @@
-"""What the nominal model missed at each tick of a log."""
+"""Computes the error of the nominal model at each tick of a log."""
 
 import jax
 import jax.numpy as jnp
@@ -11,21 +11,21 @@ from ..physics.state import Command, State
 
 
 def acting_commands(command: np.ndarray, dt: float, delay: float, lag: float) -> np.ndarray:
-    """Return the mean over each tick of a command as it acts: late, and behind a first-order lag.
+    """Return the mean over each tick of a command as it acts: delayed, then behind a first-order lag.
 
     Args:
-        command: At each tick, (n,) or (n, columns).
+        command: Command at each tick, (n,) or (n, columns).
         dt: Tick [s].
-        delay: [s], not negative.
-        lag: Time constant [s]; zero for none.
+        delay: Delay [s], not negative.
+        lag: Time constant [s]; zero for no lag.
     """
     late = int(np.ceil(delay / dt - 1e-6))
-    share = max(0.0, late - delay / dt)  # of a tick in which the newer command acts already
+    share = max(0.0, late - delay / dt)  # share of a tick in which the newer command already acts
     ticks = np.arange(len(command)) - late
     old, new = (command[np.clip(ticks + k, 0, len(command) - 1)] for k in (0, 1))
     if lag <= 0.0:
         return np.asarray((1.0 - share) * old + share * new)
-    from scipy.signal import lfilter  # here: it takes as long to import as all of retrim
+    from scipy.signal import lfilter  # local, because it takes as long to import as all of retrim
 
     first, second = np.exp(-(1.0 - share) * dt / lag), np.exp(-share * dt / lag)
     pulled = (1.0 - first) * second * old + (1.0 - second) * new
@@ -38,15 +38,15 @@ def acting_commands(command: np.ndarray, dt: float, delay: float, lag: float) ->
 
 
 def rows_of(log: FlightLog, *, delay: float = 0.0, lag: float = 0.0) -> Targets:
-    """Return the rows of a residual fit: a_res = a - (c R e3 - g e3), the acceleration that the point mass missed.
+    """Return the rows of a residual fit: a_res = a - (c R e3 - g e3), the acceleration error of the point mass.
 
     Args:
-        log: A flight. Without commanded body rates the measured ones stand for them.
-        delay: Of the thrust behind its command [s].
+        log: A flight. Without commanded body rates the measured ones are used.
+        delay: Delay of the thrust behind its command [s].
         lag: Time constant of the thrust after that [s].
 
     Returns:
-        One row for each tick.
+        One row per tick.
     """
     c = acting_commands(log.c, log.dt, delay, lag)
     told = log.rates if log.command is None else log.command

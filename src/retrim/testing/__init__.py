@@ -1,6 +1,6 @@
-"""Conformance suites: what every plant, task, controller and residual model must do, as functions for anyone's tests.
+"""Conformance suites for plants, tasks, controllers, residual models and vehicle links, for use in any test suite.
 
-Each function raises ``AssertionError`` with the law that is broken::
+Each function raises ``AssertionError`` with the broken law::
 
     def test_my_plant():
         retrim.testing.check_plant(lambda: MyPlant())

@@ -1,4 +1,4 @@
-"""What every controller must do."""
+"""Conformance suite of controllers."""
 
 from typing import Any
 
@@ -17,10 +17,10 @@ def check_controller(controller: AbstractController[Any], *, x0: State | None = 
 
     Args:
         controller: The controller.
-        x0: A state in which it can start.
+        x0: Start state for the controller.
 
     Raises:
-        AssertionError: A law does not hold.
+        AssertionError: A law is broken.
     """
     start = State.at(jnp.array([0.3, -0.2, 1.2])) if x0 is None else x0
     memory = controller.init(start)

@@ -1,8 +1,9 @@
-"""A peer that speaks CRTP as a Crazyflie does and flies the plant ``bem``: for tests, and to try a link without one.
+"""A peer that implements CRTP like a Crazyflie and simulates the plant ``bem``: for tests, and for trials of a link.
 
-``python -m retrim.testing.crazyflie_peer --disturbance large`` flies until Ctrl-C. It knows what :mod:`retrim` needs of
-the firmware (versions, its log, arming, its own commander, the manual setpoint, what it does where setpoints stop) and
-what a client asks before that, and nothing else. The vehicle is one of ours: only the language is a Crazyflie's.
+``python -m retrim.testing.crazyflie_peer --disturbance large`` runs until Ctrl-C. It implements only the part of the
+firmware that :mod:`retrim` needs (versions, the log, arming, the commander of the firmware, the manual setpoint, the
+reaction to missing setpoints) and the requests that a client makes before that. The vehicle is one of retrim's: only
+the protocol is that of a Crazyflie.
 """
 
 import argparse
@@ -19,24 +20,24 @@ from ..plants.bridges import crtp
 from ..plants.bridges.crtp import Packet
 from .peer_vehicle import GROUND, PeerVehicle, fly_until_interrupted
 
-VERSION = 12  # of the protocol
-LEVELS_S, STOPS_S = 0.5, 2.0  # [s] without a setpoint
-READY_S = 0.5  # [s] until it can be armed
-FULL = 65_535.0  # thrust
+VERSION = 12  # version of the protocol
+LEVELS_S, STOPS_S = 0.5, 2.0  # times without a setpoint until it levels, and until it stops the motors [s]
+READY_S = 0.5  # time after the start before arming is possible [s]
+FULL = 65_535.0  # full thrust
 VARIABLES = {**crtp.STATUS_LOG, "stateEstimate.x": "f", "stateEstimate.y": "f", **crtp.STATE_LOG}
-UNKNOWN = 2  # error of what is not there
+UNKNOWN = 2  # error code for an unknown block or variable
 
 
 class CrazyfliePeer:
-    """A Crazyflie. :meth:`step` is a hundredth of a second of it."""
+    """A simulated Crazyflie. :meth:`step` advances it by 0.01 s."""
 
     def __init__(self, scenario: Scenario, *, port: int = 19850, seed: int = 0) -> None:
-        """Build one that stands at the origin, its nose along x.
+        """Build a vehicle on the ground at the origin, with the nose along x.
 
         Args:
-            scenario: Plant, vehicle and what disturbs the flight.
-            port: Where it listens, on this machine.
-            seed: Of the disturbance.
+            scenario: Plant, vehicle and disturbance.
+            port: Local port on which it listens.
+            seed: Seed of the disturbance.
         """
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind(("127.0.0.1", port))
@@ -45,7 +46,7 @@ class CrazyfliePeer:
         self.vehicle = PeerVehicle(scenario, heading=0.0, seed=seed)
         self._began = time.monotonic()
         self.armed = self.locked = self.cut = False
-        """Whether it is; has locked itself; hears and says nothing."""
+        """State flags: armed; locked by its own supervisor; link cut, so that it neither receives nor sends."""
         self._place: np.ndarray | None = None
         self._yaw = 0.0
         self._lands = False
@@ -58,11 +59,11 @@ class CrazyfliePeer:
 
     @property
     def by_rates(self) -> bool:
-        """Whether it flies thrust and body rates that somebody else commands."""
+        """Whether it flies with externally commanded thrust and body rates."""
         return self.vehicle.flies and self._setpoint is not None
 
     def step(self) -> None:
-        """Read what came, fly for a tick, and say how it went."""
+        """Read packets, advance by a tick, and send the log."""
         self._read()
         vehicle, u = self.vehicle, self._commanded()
         self._thrust = 0.0 if u is None else float(u[0]) / vehicle.thrust_max * FULL
@@ -82,12 +83,12 @@ class CrazyfliePeer:
                 self._send(Packet(crtp.LOG, crtp.DATA, bytes([block]) + ms.to_bytes(3, "little") + values))
 
     def close(self) -> None:
-        """Give the port back."""
+        """Release the port."""
         self.vehicle.close()
         self._socket.close()
 
     def _commanded(self) -> np.ndarray | None:
-        """Return what flies; None: the motors stand."""
+        """Return the command that acts on the vehicle; None if the motors are off."""
         since = time.monotonic() - self._told
         if not self.armed or self.locked:
             return None
@@ -136,7 +137,7 @@ class CrazyfliePeer:
 
     def _take(self, packet: Packet) -> None:
         port, channel, body = packet
-        if (port, channel) in ((crtp.LINK, 0), (crtp.LINK, 3)):  # an echo; a question who is there
+        if (port, channel) in ((crtp.LINK, 0), (crtp.LINK, 3)):  # an echo; a scan for vehicles
             self._send(packet)
         elif (port, channel) == (crtp.LINK, 1):
             self._send(packet._replace(body=b"Bitcraze Crazyflie".ljust(30, b"\0")))
@@ -148,7 +149,7 @@ class CrazyfliePeer:
         elif (port, channel) == (crtp.SUPERVISOR, 0) and body[0] == 0x0C:
             self._send(packet._replace(body=b"\x8c" + struct.pack("<H", self._info())))
         elif (port, channel) in ((crtp.PARAMETERS, 0), (crtp.MEMORY, 0)):
-            self._send(packet._replace(body=body[:1] + bytes(6)))  # it has none
+            self._send(packet._replace(body=body[:1] + bytes(6)))  # it has no parameters and no memories
         elif port == crtp.LOG:
             self._log(packet)
         elif (port, channel) == (crtp.SETPOINT, 0) and body[0] == crtp.MANUAL:
@@ -193,11 +194,11 @@ class CrazyfliePeer:
             self._send(packet._replace(body=body[:2].ljust(2, b"\0") + bytes([self._ordered(body)])))
 
     def _ordered(self, body: bytes) -> int:
-        """Return the error of what is done about a block of the log; 0: none."""
+        """Execute a request about a log block; return its error code, 0 if it succeeded."""
         if body[0] == crtp.RESET:
             self._blocks, self._periods = {}, {}
         elif body[0] in (crtp.CREATE, crtp.APPEND):
-            whole = 2 + 3 * ((len(body) - 2) // 3)  # what is left over is left out, as the firmware does
+            whole = 2 + 3 * ((len(body) - 2) // 3)  # the firmware also ignores an incomplete entry
             numbers = [number for _, number in struct.iter_unpack("<BH", body[2:whole])]
             if max(numbers) >= len(VARIABLES) or (body[0] == crtp.APPEND and body[1] not in self._blocks):
                 return UNKNOWN
@@ -213,7 +214,7 @@ class CrazyfliePeer:
         if not self.cut and self._client is not None:
             try:
                 self._socket.sendto(packet.pack(), self._client)
-            except OSError:  # nobody listens any more
+            except OSError:  # the client no longer listens
                 return
 
 

@@ -1,4 +1,4 @@
-"""What the suites say of a law that is broken."""
+"""Assertions of the conformance suites, which report the broken law."""
 
 from typing import Any
 
@@ -19,7 +19,7 @@ def require(holds: bool, law: str) -> None:
 
 
 def close(found: Any, expected: Any, tolerance: float, law: str) -> None:
-    """Raise ``AssertionError`` with the law if an element is further away than the tolerance, or not a number."""
+    """Raise ``AssertionError`` with the law if an error is larger than the tolerance, or not a number."""
     away = float(np.max(np.abs(np.asarray(found) - np.asarray(expected))))
     if not away <= tolerance:
         raise AssertionError(f"broken law: {law}; found {np.asarray(found)}, expected {np.asarray(expected)}")

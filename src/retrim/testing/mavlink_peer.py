@@ -1,7 +1,7 @@
-"""A peer that speaks MAVLink as PX4 does and flies the plant ``bem``: for tests, and to try a link without a vehicle.
+"""A peer that implements MAVLink like PX4 and simulates the plant ``bem``: for tests, and for trials of a link.
 
-``python -m retrim.testing.mavlink_peer --disturbance large`` flies until Ctrl-C. It knows what :mod:`retrim` needs of
-PX4 (arming, offboard mode, both kinds of setpoints, landing, the failsafe where setpoints stop) and nothing else.
+``python -m retrim.testing.mavlink_peer --disturbance large`` runs until Ctrl-C. It implements only the part of PX4 that
+:mod:`retrim` needs: arming, offboard mode, both kinds of setpoints, landing, and the failsafe for missing setpoints.
 """
 
 import argparse
@@ -19,20 +19,20 @@ from ..plants.extras import import_extra
 from .peer_vehicle import GROUND, PeerVehicle, fly_until_interrupted
 
 OFFBOARD, HOLD, LAND = (6, 0), (4, 3), (4, 6)
-FAILSAFE_S = 1.0  # [s] without a setpoint
+FAILSAFE_S = 1.0  # time without a setpoint until the failsafe [s]
 QUADROTOR, PX4, ACTIVE = 2, 12, 4
 
 
 class MavlinkPeer:
-    """An autopilot and its vehicle. :meth:`step` is a hundredth of a second of both."""
+    """An autopilot and its vehicle. :meth:`step` advances both by 0.01 s."""
 
     def __init__(self, scenario: Scenario, *, port: int = 14540, seed: int = 0) -> None:
-        """Build one that stands at the origin, its nose to the north.
+        """Build a vehicle on the ground at the origin, with the nose to the north.
 
         Args:
-            scenario: Plant, vehicle and what disturbs the flight.
-            port: Where it sends to, on this machine.
-            seed: Of the disturbance.
+            scenario: Plant, vehicle and disturbance.
+            port: Local port to which it sends.
+            seed: Seed of the disturbance.
         """
         self._dialect: Any = import_extra("pymavlink.dialects.v20.common", "mavlink", package="pymavlink")
         self._out = self._dialect.MAVLink(None, srcSystem=1, srcComponent=1)
@@ -43,19 +43,19 @@ class MavlinkPeer:
         self.vehicle = PeerVehicle(scenario, heading=math.pi / 2, seed=seed)
         self.mode, self.armed = HOLD, False
         self.cut = False
-        """Nothing comes and nothing goes."""
+        """Whether the link is cut, in both directions."""
         self._rates: np.ndarray | None = None
         self._place, self._yaw = np.zeros(3), math.pi / 2
         self._told, self._tick, self._thrust = -math.inf, 0, 0.0
         self.failsafes = 0
-        """How often setpoints stopped in offboard mode."""
+        """Number of times that setpoints stopped in offboard mode."""
         self._takes: dict[str, Callable[[Any], None]] = {
             "SET_ATTITUDE_TARGET": self._take_rates, "SET_POSITION_TARGET_LOCAL_NED": self._take_place,
             "COMMAND_LONG": self._take_command, "TIMESYNC": self._answer_time,
         }  # fmt: skip
 
     def step(self) -> None:
-        """Read what came, fly for a tick, and say how it went."""
+        """Read messages, advance by a tick, and send the state."""
         self._read()
         vehicle = self.vehicle
         if vehicle.flies:
@@ -71,16 +71,16 @@ class MavlinkPeer:
 
     @property
     def by_rates(self) -> bool:
-        """Whether it flies thrust and body rates that somebody else commands."""
+        """Whether it flies with externally commanded thrust and body rates."""
         return self.vehicle.flies and self.mode == OFFBOARD and self._rates is not None
 
     def close(self) -> None:
-        """Give the port back."""
+        """Release the port."""
         self.vehicle.close()
         self._socket.close()
 
     def _commanded(self) -> np.ndarray:
-        """Return what flies: the setpoint, or the autopilot itself."""
+        """Return the command that acts on the vehicle: the setpoint, or that of the autopilot's own controller."""
         stale = time.monotonic() - self._told > FAILSAFE_S
         if self.mode == OFFBOARD and stale:
             self.mode, self.failsafes, self._place, self._rates = HOLD, self.failsafes + 1, self.vehicle.p.copy(), None
@@ -117,7 +117,7 @@ class MavlinkPeer:
     def _setpoint(self, rates: np.ndarray | None) -> None:
         self._rates, self._told = rates, time.monotonic()
         if self.failsafes and self.mode == HOLD and self.armed:
-            self.mode = OFFBOARD  # as PX4 does, by itself
+            self.mode = OFFBOARD  # PX4 also returns to offboard mode automatically
 
     def _take_command(self, m: Any) -> None:
         fresh = time.monotonic() - self._told < FAILSAFE_S
@@ -133,7 +133,7 @@ class MavlinkPeer:
             self._send(self._out.timesync_encode(int(self._now() * 1e9), m.ts1))
 
     def _now(self) -> float:
-        """Its own clock: it began when it was built, and is slow."""
+        """Return the time of its own clock, which has another origin and runs slowly."""
         return 0.99 * (time.monotonic() % 1e5)
 
     def _say(self) -> None:
@@ -156,7 +156,7 @@ class MavlinkPeer:
         if not self.cut:
             try:
                 self._socket.sendto(data, self._to)
-            except OSError:  # nobody listens yet, or any more
+            except OSError:  # the receiver does not listen yet, or no longer
                 return
 
 

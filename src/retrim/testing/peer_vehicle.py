@@ -1,4 +1,4 @@
-"""A simulated vehicle with an autopilot's controller of its place: what a peer flies, whatever language it speaks."""
+"""A simulated vehicle with an autopilot's position controller, used by the peers of all protocols."""
 
 import math
 import os
@@ -17,20 +17,20 @@ from ..physics.state import STANDARD_GRAVITY, Command, State
 from ..plants.bridges import frames
 from ..plants.plant import as_numpy
 
-DT = 0.01  # [s]
-GROUND = 0.05  # [m]
+DT = 0.01  # tick [s]
+GROUND = 0.05  # height below which a vehicle touches the ground [m]
 
 
 class PeerVehicle:
-    """It stands at the origin until it lifts off. :meth:`step` is a hundredth of a second."""
+    """The vehicle; it is on the ground at the origin until it lifts off. :meth:`step` advances it by 0.01 s."""
 
     def __init__(self, scenario: Scenario, *, heading: float, seed: int = 0) -> None:
-        """Build one.
+        """Build a vehicle.
 
         Args:
-            scenario: Plant, vehicle and what disturbs the flight.
-            heading: Where its nose points, from east counter-clockwise [rad].
-            seed: Of the disturbance.
+            scenario: Plant, vehicle and disturbance.
+            heading: Heading of the nose, from east counter-clockwise [rad].
+            seed: Seed of the disturbance.
         """
         vehicle = scenario.make_vehicle("small")
         self._plant = scenario.make("small", dt=DT, seed=seed)
@@ -41,32 +41,32 @@ class PeerVehicle:
         fence = np.full(3, 1e3)
         self._hover = GeometricHover(Limits(-fence, fence, low, high), DT)
         self.thrust_max = float(vehicle.thrust_max / vehicle.mass)
-        """What all motors can give, per mass [m/s^2]."""
+        """Maximum total thrust per mass [m/s^2]."""
         self._place(0.0)
-        self._step_plant(np.array([STANDARD_GRAVITY, 0.0, 0.0, 0.0]))  # compiled before somebody waits for it
+        self._step_plant(np.array([STANDARD_GRAVITY, 0.0, 0.0, 0.0]))  # compile before the first real step
 
     @property
     def p(self) -> np.ndarray:
-        """Where it is [m]."""
+        """Position [m]."""
         return self.x[:3]
 
     @property
     def R(self) -> np.ndarray:
-        """Its attitude, body to world."""
+        """Attitude, body to world."""
         return self.x[3:12].reshape(3, 3)
 
     @property
     def v(self) -> np.ndarray:
-        """Its velocity [m/s]."""
+        """Velocity [m/s]."""
         return self.x[12:]
 
     def lift_off(self) -> None:
-        """Begin to fly, where it stands."""
+        """Begin to fly at the current position."""
         self.flies = True
         self._place(GROUND)
 
     def step(self, u: np.ndarray) -> None:
-        """Fly a command [c, omega] for a tick."""
+        """Apply a command [c, omega] for a tick."""
         x = self._step_plant(u)
         before, after = self.R, np.asarray(x.R, dtype=float)
         turned = (before.T @ after - after.T @ before) / (2 * DT)
@@ -74,19 +74,19 @@ class PeerVehicle:
         self.x = np.concatenate([np.asarray(leaf, dtype=float).ravel() for leaf in (x.p, x.R, x.v)])
 
     def stand(self) -> None:
-        """Be on the ground, upright, where it is."""
+        """Put the vehicle on the ground at the current position, upright."""
         self.flies, self.omega = False, np.zeros(3)
         self.x = _standing(self.p[0], self.p[1], frames.heading_of(self.R))
 
     def towards(self, place: np.ndarray, yaw: float) -> np.ndarray:
-        """Return the command [c, omega] that flies it to a place [m] and heading [rad]."""
+        """Return the command [c, omega] that flies to a position [m] and heading [rad]."""
         u = self._hover.command(self.x, place)
         wrong = yaw - frames.heading_of(self.R)
         u[3] += np.clip(2.0 * math.atan2(math.sin(wrong), math.cos(wrong)), -1.0, 1.0)
         return u
 
     def forget(self) -> None:
-        """Forget what the controller of its place has learnt of the disturbance."""
+        """Reset the integral of the position controller, which compensates the disturbance."""
         self._hover.integral[:] = 0.0
 
     def close(self) -> None:
@@ -103,17 +103,17 @@ class PeerVehicle:
 
 
 def _standing(x: float, y: float, yaw: float) -> np.ndarray:
-    """Return the state p, R, v of a vehicle that stands upright."""
+    """Return the state p, R, v of an upright vehicle on the ground."""
     R = np.asarray(rotz(jnp.asarray(yaw, jnp.result_type(float))), dtype=float)
     return np.concatenate([[x, y, 0.0], R.ravel(), np.zeros(3)])
 
 
 def fly_until_interrupted(step: Callable[[], None], address: str) -> None:
-    """Take a step every hundredth of a second, until Ctrl-C.
+    """Call a step function every 0.01 s, until Ctrl-C.
 
     Args:
-        step: What to do.
-        address: Where it is reached, to be said.
+        step: The function.
+        address: Description of the peer's address, for the printed message.
     """
     jax.config.update("jax_cpu_enable_async_dispatch", False)
     print(f"{address}; Ctrl-C ends it", flush=True)

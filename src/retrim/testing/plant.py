@@ -1,4 +1,4 @@
-"""What every plant must do."""
+"""Conformance suite of plants."""
 
 from collections.abc import Callable
 
@@ -18,11 +18,11 @@ def check_plant(make: Callable[[], Plant], *, x0: State | None = None, settle_s:
 
     Args:
         make: Builds a plant without disturbances.
-        x0: State in which it starts; by default 1.5 m above the ground.
-        settle_s: By when a body rate must have been reached, within a factor of two [s].
+        x0: Start state; by default 1.5 m above the ground.
+        settle_s: Time within which a body rate must be reached, to a factor of two [s].
 
     Raises:
-        AssertionError: A law does not hold.
+        AssertionError: A law is broken.
     """
     start = State.at(jnp.array([0.3, -0.2, 1.5])) if x0 is None else x0
     plant = make()

@@ -1,7 +1,7 @@
-"""PX4's own simulation on this machine, seen by motion capture: something to fly before there is a vehicle.
+"""Runs PX4's own simulation and a simulated motion capture on this machine, for flights without a vehicle.
 
-``python -m retrim.testing.px4 PACKAGE`` runs both until Ctrl-C, PACKAGE being a folder with ``bin/px4`` and ``etc``. It
-listens on every address of the machine; a network namespace keeps it to itself.
+``python -m retrim.testing.px4 PACKAGE`` runs both until Ctrl-C. PACKAGE is a folder with ``bin/px4`` and ``etc``. PX4
+listens on every address of the machine; a network namespace isolates it.
 """
 
 import os
@@ -17,28 +17,28 @@ from ..errors import PlantError
 from ..plants.bridges.endpoint import UdpEndpoint
 from ..plants.bridges.mavlink_link import MavlinkLink
 
-GROUND_STATION = 14550  # port that PX4 sends to beside the one for a companion computer
-PAYLOAD = 14030  # and another one
-SEEN = 50.0  # [Hz]
+GROUND_STATION = 14550  # port to which PX4 sends in addition to the one for a companion computer
+PAYLOAD = 14030  # a further port to which PX4 sends
+SEEN = 50.0  # rate of the motion capture [Hz]
 MOCAP = {
     "EKF2_EV_CTRL": 15, "EKF2_GPS_CTRL": 0, "EKF2_HGT_REF": 3, "EKF2_EV_DELAY": 8, "EKF2_EV_NOISE_MD": 1,
     "EKF2_EVP_NOISE": 0.02, "EKF2_EVV_NOISE": 0.05, "EKF2_EVA_NOISE": 0.05,
 }  # fmt: skip
-"""Parameters with which PX4 believes motion capture and no GPS."""
+"""Parameters with which PX4 uses motion capture and no GPS."""
 TIMING = {"IMU_INTEG_RATE": 400, "COM_OBL_RC_ACT": 5}
-"""States every 10 ms; and where setpoints stop coming, PX4 holds its place."""
+"""Parameters for states every 10 ms, and for position hold when setpoints stop."""
 
 
 class Px4Simulation:
-    """A process of PX4 with its own physics. A context: leaving it ends the process."""
+    """A process of PX4 with its own physics. It is a context manager: leaving it ends the process."""
 
     def __init__(self, package: Path, run: Path, **parameters: float) -> None:
-        """Plan it.
+        """Prepare the simulation without starting it.
 
         Args:
             package: Folder with ``bin/px4`` and ``etc``.
             run: An empty folder for its files.
-            parameters: Of PX4, on top of those that motion capture takes.
+            parameters: Parameters of PX4, in addition to those for motion capture.
 
         Raises:
             PlantError: There is no PX4 in the package.
@@ -81,20 +81,20 @@ class Px4Simulation:
 
     @property
     def ended(self) -> bool:
-        """Whether it has ended by itself."""
+        """Whether the process has ended by itself."""
         return self._process.poll() is not None
 
 
 class MotionCapture:
-    """Tells PX4 its own true state, as cameras at the walls would."""
+    """Sends PX4 its own true state, like a motion capture system."""
 
     def __init__(self, port: int = GROUND_STATION) -> None:
-        """Listen where PX4 sends to ground stations."""
+        """Listen on the port to which PX4 sends for ground stations."""
         self.link = MavlinkLink(UdpEndpoint("127.0.0.1", port))
         self._seen = self._asked = 0.0
 
     def step(self, until: float) -> None:
-        """Go on until an instant of the monotonic clock [s]."""
+        """Run until an instant of the monotonic clock [s]."""
         while time.monotonic() < until:
             self.link.pump(time.monotonic() + 2e-3)
             truth = self.link.truth

@@ -1,4 +1,4 @@
-"""What every residual model must do."""
+"""Conformance suite of residual models."""
 
 import equinox as eqx
 import jax
@@ -17,11 +17,11 @@ def check_residual(model: ResidualModel, *, fits: int = 5, tolerance: float = 0.
 
     Args:
         model: The model.
-        fits: Number of fits after which a constant acceleration must have been learnt.
-        tolerance: Largest error of its prediction then, as a share of the acceleration.
+        fits: Number of fits after which the model must have learned a constant acceleration.
+        tolerance: Largest error of its prediction after the fits, as a share of the acceleration.
 
     Raises:
-        AssertionError: A law does not hold.
+        AssertionError: A law is broken.
     """
     require(isinstance(model, ResidualModel), "it has init, fit, predict and spread")
     key, n = random.key(0), 60

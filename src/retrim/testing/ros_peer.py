@@ -1,7 +1,8 @@
-"""A peer behind ROS 1 that flies the plant ``bem``: for tests, and to try a node without a vehicle.
+"""A peer on ROS 1 that simulates the plant ``bem``: for tests, and for trials of a node without a vehicle.
 
-``python -m retrim.testing.ros_peer http://127.0.0.1:11311 --disturbance large`` flies until Ctrl-C: it goes to the
-start, publishes odometry, or poses alone, follows attitude targets while they come, and holds its place when they stop.
+``python -m retrim.testing.ros_peer http://127.0.0.1:11311 --disturbance large`` runs until Ctrl-C. It flies to the
+start and publishes odometry, or poses only. It follows attitude targets while it receives them, and holds its position
+when they stop.
 """
 
 import argparse
@@ -17,21 +18,21 @@ from ..plants.bridges.ros_link import ODOMETRY, POSE, TARGET, attitude_target
 from ..rospy_node import join, system_module
 from .peer_vehicle import PeerVehicle, fly_until_interrupted
 
-FRESH_S = 0.3  # [s] for which a target counts
+FRESH_S = 0.3  # time for which a target is valid [s]
 
 
 class RosPeer:
-    """A vehicle, and who flies it. :meth:`step` is a hundredth of a second of both."""
+    """A vehicle and its autopilot. :meth:`step` advances both by 0.01 s."""
 
     def __init__(self, master: str, scenario: Scenario, *, place: np.ndarray, yaw: float, poses: bool = False) -> None:
-        """Build one that is about to take off.
+        """Build a vehicle that is about to take off.
 
         Args:
-            master: Where the rosmaster is.
-            scenario: Plant, vehicle and what disturbs the flight.
-            place: Where it waits, world [m].
-            yaw: Its heading there [rad].
-            poses: Whether it publishes poses, and no odometry.
+            master: URI of the rosmaster.
+            scenario: Plant, vehicle and disturbance.
+            place: Position where it waits, world [m].
+            yaw: Heading where it waits [rad].
+            poses: Whether it publishes poses instead of odometry.
         """
         rospy = join(master)
         self._rospy, self._poses = rospy, poses
@@ -46,7 +47,7 @@ class RosPeer:
         self.vehicle.lift_off()
 
     def step(self) -> None:
-        """Fly for a tick, and say how it went."""
+        """Advance by a tick, and publish the state."""
         fresh = time.monotonic() - self._told < FRESH_S
         if self._by_rates and not fresh:
             self._place = self.vehicle.p.copy()
@@ -61,7 +62,7 @@ class RosPeer:
         self._told = time.monotonic()
 
     def _say(self) -> None:
-        from scipy.spatial.transform import Rotation  # here: it takes as long to import as all of retrim
+        from scipy.spatial.transform import Rotation  # local, because it takes as long to import as all of retrim
 
         x, message = self.vehicle, self._kind()
         message.header.stamp = self._rospy.Time.from_sec(time.time())

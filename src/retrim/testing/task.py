@@ -1,4 +1,4 @@
-"""What every task must do."""
+"""Conformance suite of tasks."""
 
 from typing import Any
 
@@ -19,10 +19,10 @@ def check_task(task: AbstractTask, *, starts: int = 16) -> None:
 
     Args:
         task: The task.
-        starts: Random starts to look at.
+        starts: Number of random starts to check.
 
     Raises:
-        AssertionError: A law does not hold.
+        AssertionError: A law is broken.
     """
     keys = random.split(random.key(0), starts)
     reset = jax.jit(jax.vmap(task.reset))

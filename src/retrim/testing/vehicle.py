@@ -1,4 +1,4 @@
-"""What every link to a vehicle must do, on a vehicle that is simulated: it is armed and flown."""
+"""Conformance suite of vehicle links. It arms and flies the vehicle, which must be a simulated one."""
 
 import functools
 import time
@@ -27,12 +27,12 @@ def check_vehicle(
     """Check a link in calm air, in real time.
 
     Args:
-        make: Builds a link to a vehicle that stands.
-        place: Where it shall be flown, world [m].
-        hover_s: How long it is hovered by thrust and body rates [s].
+        make: Builds a link to a vehicle on the ground.
+        place: Position of the flight, world [m].
+        hover_s: Duration of hover by thrust and body rates [s].
 
     Raises:
-        AssertionError: A law does not hold.
+        AssertionError: A law is broken.
     """
     plant = make()
     require(isinstance(plant, VehiclePlant), "it is a VehiclePlant")
@@ -70,10 +70,10 @@ def _check_flight(plant: VehiclePlant, first: Measurement, start: State, hover_s
             u = Command.of(jnp.asarray(hover.command(x, target), last.x.p.dtype))
             last, accepted = plant.step(u)
             close(as_numpy(accepted), as_numpy(u), 1e-3, "a command within the limits is accepted as it is")
-            ages.append(plant.read().age)  # of the news: a measurement is carried on
+            ages.append(plant.read().age)  # age of the last received state, because measurements are extrapolated
 
     held(hover_s)
-    # Half a second is for a machine that does other things, too.
+    # The tolerance of 0.5 s allows for other load on the machine.
     close(time.monotonic() - began, last.t - first.t, 0.5, "the time of a measurement is that of the flight")
     close(last.x.p, start.p, 0.5, "thrust and body rates hover it")
     require(float(np.median(ages)) < OLDEST, f"a state is younger than {OLDEST} s")

@@ -1,1 +1,1 @@
-"""Parameters as bytes, and the bus that carries them."""
+"""Serialises parameters to bytes, and provides the bus that carries them."""

@@ -1,4 +1,4 @@
-"""Carries topics between two buses, so that those who fly never touch a network."""
+"""Carries topics between two buses, so that control processes never access a network."""
 
 import time
 from collections.abc import Callable, Iterable, Mapping
@@ -6,11 +6,11 @@ from collections.abc import Callable, Iterable, Mapping
 from ..errors import MessageError
 from .bus import Bus
 
-EVERY = 0.05  # [s] between two messages of a topic that is carried now and then
+EVERY = 0.05  # shortest time between two messages of a throttled topic [s]
 
 
 class Bridge:
-    """Between a bus and another, one direction for each topic; only the last message counts, here as there."""
+    """Connects two buses, with one direction for each topic; both keep only the last message of a topic."""
 
     def __init__(
         self,
@@ -26,13 +26,14 @@ class Bridge:
         """Build a bridge.
 
         Args:
-            here: One bus.
-            there: The other one.
+            here: First bus.
+            there: Second bus.
             out: Topics from here to there.
             into: Topics from there to here.
-            slowly: Those of them that come more often than anybody needs; at most one in ``EVERY`` is carried.
-            known: Version of a topic up to which nothing is carried; None: whatever is there is carried.
-            clock: Monotonic [s].
+            slowly: Those topics that are published more often than necessary; at most one message in ``EVERY`` is
+                carried.
+            known: Version of each topic up to which messages are not carried; None: every message is carried.
+            clock: Monotonic clock [s].
         """
         self._routes = [(here, there, topic) for topic in out] + [(there, here, topic) for topic in into]
         self._slowly, self._clock = frozenset(slowly), clock
@@ -40,10 +41,10 @@ class Bridge:
         """Version of each topic up to which it is carried."""
         self._carried = dict.fromkeys(self._slowly, float("-inf"))
         self.refused = 0
-        """Messages that did not fit."""
+        """Number of messages that the other bus rejected."""
 
     def step(self) -> int:
-        """Carry what is new; return how many messages that were."""
+        """Carry new messages; return their number."""
         carried = 0
         for source, target, topic in self._routes:
             if topic in self._slowly and self._clock() - self._carried[topic] < EVERY:

@@ -5,24 +5,24 @@ from typing import NamedTuple
 
 
 class Message(NamedTuple):
-    """What was published last."""
+    """The last published message of a topic."""
 
     version: int
-    """It rises with every message of its topic, from 1."""
+    """Version; it increases with every message of the topic, from 1."""
     data: bytes
 
 
 class Bus(abc.ABC):
-    """Topics with one writer each and any number of readers, none of which ever waits for another."""
+    """Topics with one writer each and any number of readers, which never wait for each other."""
 
     @property
     def refused(self) -> int:
-        """Messages from outside that were not taken."""
+        """Number of rejected messages from outside."""
         return 0
 
     @property
     def fault(self) -> str:
-        """Why another end is not heard; empty if nothing is known against it."""
+        """Reason why the other end is not received; empty if no fault is known."""
         return ""
 
     @abc.abstractmethod
@@ -35,7 +35,7 @@ class Bus(abc.ABC):
 
     @abc.abstractmethod
     def latest(self, topic: str, after: int = 0) -> Message | None:
-        """Return the last message of ``topic``, whole and as it was published.
+        """Return the last message of ``topic``, complete and unchanged.
 
         Args:
             topic: Name.
@@ -50,4 +50,4 @@ class Bus(abc.ABC):
 
     @abc.abstractmethod
     def close(self) -> None:
-        """Let go of the bus; others go on."""
+        """Leave the bus; other processes continue to use it."""

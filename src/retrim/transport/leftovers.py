@@ -1,7 +1,7 @@
-"""Buses in shared memory that nobody uses any more, since all who did were killed.
+"""Removes buses in shared memory that are no longer in use because all of their processes were killed.
 
-Each process that has joined a bus holds a lock on a file beside the topics, which the operating system releases when
-the process ends, in whichever way. A bus whose lock nobody holds is left over.
+Each process that has joined a bus holds a lock on a file in the folder of the topics. The operating system releases it
+when the process ends for any reason. A bus without a held lock is left over.
 """
 
 import contextlib
@@ -14,7 +14,7 @@ LOCK = "lock"
 
 
 def begin(folder: Path) -> int:
-    """Make the lock of a new bus and hold it; return its descriptor. It appears when it is held, never before."""
+    """Create the lock of a new bus and hold it; return its descriptor. The lock file appears only once it is held."""
     made = folder / f"{LOCK}.new"
     descriptor = os.open(made, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
     fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
@@ -26,7 +26,7 @@ def hold(folder: Path) -> int:
     """Hold the lock of a bus until the descriptor is closed.
 
     Raises:
-        OSError: There is no such bus, or it is being taken away.
+        OSError: There is no such bus, or it is being removed.
     """
     descriptor = os.open(folder / LOCK, os.O_RDWR)
     try:
@@ -41,8 +41,8 @@ def clear(base: Path, prefix: str) -> list[Path]:
     """Remove the buses of this user that are left over; return their folders.
 
     Args:
-        base: Where the folders of buses are.
-        prefix: How their names begin. A folder without a lock is somebody else's, or is just being made.
+        base: Parent folder of the buses.
+        prefix: Prefix of their names. A folder without a lock has another owner, or is just being created.
     """
     cleared = []
     for folder in base.glob(f"{prefix}*"):
@@ -51,7 +51,7 @@ def clear(base: Path, prefix: str) -> list[Path]:
                 continue
             descriptor = os.open(folder / LOCK, os.O_RDWR | os.O_NOFOLLOW)
             try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)  # somebody who holds it lives
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)  # fails while a live process holds the lock
                 shutil.rmtree(folder, ignore_errors=True)
                 cleared.append(folder)
             finally:

@@ -1,7 +1,7 @@
-"""Named arrays as bytes: one format for files and messages. Nothing in it is ever executed.
+"""Named arrays as bytes: one format for files and messages. Its content is never executed.
 
-A message is a safetensors file whose header says what it is: format, kind, and a checksum of the tensors. Reading
-validates names, shapes, types and finiteness against what is expected before anything is built.
+A message is a safetensors file. Its header holds the format, the kind, and a checksum of the tensors. Reading
+validates names, shapes, types and finiteness against the expected arrays before any object is built.
 """
 
 import hashlib
@@ -23,25 +23,25 @@ UNNAMED = "nothing"
 
 @runtime_checkable
 class ArrayLike(Protocol):
-    """What is expected of an array: any array of that shape and type will do."""
+    """Expected shape and type of an array: any array of that shape and type is accepted."""
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Its shape."""
+        """Shape of the array."""
         ...
 
     @property
     def dtype(self) -> Any:
-        """Type of its numbers."""
+        """Type of its elements."""
         ...
 
 
 def pack_arrays(arrays: Mapping[str, Any], *, kind: str, about: Mapping[str, str]) -> bytes:
-    """Return the bytes of a message; the inverse of :func:`unpack_arrays`. The same content has the same bytes.
+    """Return the bytes of a message; the inverse of :func:`unpack_arrays`. Equal content has equal bytes.
 
     Args:
         arrays: Arrays by name.
-        kind: What it is, as ``policy``.
+        kind: Kind of the content, for example ``policy``.
         about: Header fields; the checksum covers them and the arrays.
     """
     tensors = {name: np.array(array, order="C") for name, array in arrays.items()}
@@ -53,7 +53,7 @@ def describe(data: bytes, *, kind: str, source: str) -> dict[str, str]:
     """Return the header of a message.
 
     Raises:
-        MessageError: It is not a whole message of this format and ``kind``.
+        MessageError: It is not a complete message of this format and ``kind``.
     """
     header = _header(data, source)
     if (found := header.get("kind", UNNAMED)) != kind:
@@ -62,10 +62,10 @@ def describe(data: bytes, *, kind: str, source: str) -> dict[str, str]:
 
 
 def kind_of(data: bytes, *, source: str) -> str:
-    """Return what a message holds.
+    """Return the kind of a message.
 
     Raises:
-        MessageError: It is not a whole message of this format.
+        MessageError: It is not a complete message of this format.
     """
     return _header(data, source).get("kind", UNNAMED)
 
@@ -76,8 +76,8 @@ def unpack_arrays(data: bytes, expected: Mapping[str, ArrayLike], *, kind: str, 
     Args:
         data: Bytes of the message.
         expected: Shape and type of each array, by name.
-        kind: What the message should hold.
-        source: Where the bytes come from, for messages of errors.
+        kind: Expected kind of the message.
+        source: Origin of the bytes, for error messages.
 
     Returns:
         The arrays, in the order of ``expected``.
@@ -114,7 +114,7 @@ def unpack_arrays(data: bytes, expected: Mapping[str, ArrayLike], *, kind: str, 
 
 
 def _in_order(data: bytes) -> bytes:
-    """Return a safetensors file whose header is sorted: the library's own order changes from call to call."""
+    """Return a safetensors file with a sorted header, because the library's own order changes from call to call."""
     end = 8 + int.from_bytes(data[:8], "little")
     text = json.dumps(json.loads(data[8:end]), sort_keys=True, separators=(",", ":"), ensure_ascii=False).encode()
     text += b" " * (-len(text) % 8)
@@ -122,7 +122,7 @@ def _in_order(data: bytes) -> bytes:
 
 
 def _header(data: bytes, source: str) -> dict[str, str]:
-    """Return the header of a whole message."""
+    """Return the header of a complete message."""
     if len(data) > MAX_BYTES:
         raise MessageError(f"{source}: {len(data)} bytes, more than the {MAX_BYTES} that are accepted")
     if MAX_HEADER < (size := int.from_bytes(data[:8], "little")) <= len(data):

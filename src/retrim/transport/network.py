@@ -1,9 +1,9 @@
-"""What buses between machines have in common: the last message of each topic, kept by everybody who listens.
+"""Common parts of the buses between machines: every listener keeps the last message of each topic.
 
-A message carries its version and a number of its writer. A writer that was started again, and does not know how far the
-one before it counted, is taken for what it is: versions go on rising for every reader. What comes from the same writer
-and is not newer is dropped. Ends that share a key sign their messages (:mod:`retrim.transport.session`) and take no
-others.
+A message carries its version and the number of its writer. A restarted writer does not know the last version of its
+predecessor. Readers recognise it by its new number, and versions continue to increase for every reader. A message from
+the same writer that is not newer is dropped. Ends that share a key sign their messages
+(:mod:`retrim.transport.session`) and reject all others.
 """
 
 import abc
@@ -20,20 +20,20 @@ from .session import MARK, MISSING, Session
 HEAD = struct.Struct("<QQ")
 """Writer and version, before each message."""
 OTHER = 0
-"""Writer of what a session has taken; no writer has that number."""
-DISTRUST = 5.0  # [s] for an end with the key to be heard, once one without it is
-FAREWELL = 0.3  # [s] for a message to leave the machine, after which a bus may be closed
+"""Writer of messages that a session has accepted; no writer has that number."""
+DISTRUST = 5.0  # time within which an end with the key must be received, after a message from one without it [s]
+FAREWELL = 0.3  # time for a message to leave the machine before a bus is closed [s]
 
 
 class NetworkBus(Bus):
-    """A bus whose members tell each other everything."""
+    """A bus whose members exchange all messages."""
 
     def __init__(self, capacities: Mapping[str, int], session: Session | None = None) -> None:
-        """Build one.
+        """Build a bus.
 
         Args:
-            capacities: Longest message of each topic [bytes].
-            session: Signs messages, and says which are taken; None: all are.
+            capacities: Maximum length of a message, by topic [bytes].
+            session: Signs messages and decides which are accepted; None: all are accepted.
         """
         self._refused, self._fault, self._talk = 0, "", session
         self._answering: threading.Thread | None = None
@@ -45,16 +45,16 @@ class NetworkBus(Bus):
 
     @abc.abstractmethod
     def _send(self, topic: str, frame: bytes) -> None:
-        """Hand a message to the network. It may wait for it, so nobody who must be on time holds such a bus."""
+        """Send a message to the network. This may block, so that a process with deadlines must not hold such a bus."""
 
     @property
     def refused(self) -> int:
-        """Messages from outside that were none, or nobody's who has the key."""
+        """Number of messages from outside that were malformed or not signed with the key."""
         return self._refused + (0 if self._talk is None else self._talk.refused)
 
     @property
     def fault(self) -> str:
-        """Why the other end is not heard; empty if nothing is known against it."""
+        """Reason why the other end is not received; empty if no fault is known."""
         return self._fault if self._talk is None else self._talk.fault
 
     def publish(self, topic: str, data: bytes) -> None:
@@ -73,7 +73,7 @@ class NetworkBus(Bus):
         return found if found.version > after else None
 
     def _received(self, topic: str, frame: bytes) -> None:
-        """Take a message from the network, in any thread."""
+        """Receive a message from the network, in any thread."""
         head = (HEAD if self._talk is None else SEAL).size
         if self._talk is None and frame.startswith(MARK):
             self._refused, self._fault = self._refused + 1, MISSING
@@ -105,13 +105,13 @@ class NetworkBus(Bus):
             self._send(topic, self._talk.seal(topic, message.version, message.data))
 
     def _begin(self) -> None:
-        """Answer what the other end says of itself, in a thread: what receives must not wait for what is sent."""
+        """Start a thread that answers greetings of the other end: the receiving thread must not wait for a send."""
         if self._talk is not None:
             self._answering = threading.Thread(target=self._answer, daemon=True)
             self._answering.start()
 
     def _end(self) -> None:
-        """Answer no more."""
+        """Stop answering."""
         self._over = True
         if self._talk is not None and self._answering is not None:
             self._talk.pending.set()
@@ -123,7 +123,7 @@ class NetworkBus(Bus):
             self._attend()
 
     def _attend(self) -> None:
-        """Send what the session has to send: a greeting, and to a new end the last messages of this one."""
+        """Send the pending messages of the session: a greeting, and the last messages of this end to a new end."""
         if self._talk is None:
             return
         due = self._talk.due()

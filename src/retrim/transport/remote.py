@@ -1,4 +1,4 @@
-"""Buses between machines by name: ``zenoh:192.168.1.5:7447``, ``ros:192.168.1.5:11311/quad1``."""
+"""Opens buses between machines by address: ``zenoh:192.168.1.5:7447``, ``ros:192.168.1.5:11311/quad1``."""
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -17,15 +17,15 @@ ADDRESS = re.compile(r"(?P<kind>\w+):(?P<host>[^/]+):(?P<port>\d{1,5})(/(?P<key>
 
 @dataclass(frozen=True)
 class Address:
-    """Where a bus is."""
+    """Address of a bus."""
 
     kind: str
     host: str
     port: int
     key: str = ""
-    """Of one vehicle among several that share the place."""
+    """Key of one vehicle among several at the same address."""
     shared: SharedKey | None = field(default=None, repr=False, compare=False)
-    """Shared by those who may speak there; None: anybody may."""
+    """Shared key of all ends that may publish there; None: any end may."""
 
     def __str__(self) -> str:
         """Return the text that :meth:`of` reads."""
@@ -36,11 +36,11 @@ class Address:
         """Read an address.
 
         Args:
-            text: As ``zenoh:192.168.1.5:7447``.
-            shared: Key of those who may speak there.
+            text: For example ``zenoh:192.168.1.5:7447``.
+            shared: Key of all ends that may publish there.
 
         Raises:
-            ConfigError: It is none.
+            ConfigError: It is not an address.
         """
         found = ADDRESS.fullmatch(text)
         if not found or found["kind"] not in KINDS or not 1 <= int(found["port"]) <= 65_535:
@@ -52,11 +52,11 @@ class Address:
 
     @property
     def loopback(self) -> bool:
-        """Whether it is on this machine only."""
+        """Whether the address is on this machine only."""
         return self.host in LOOPBACK
 
     def check_shared(self) -> None:
-        """Raise :class:`ConfigError` if the address is beyond this machine, and there is no shared key."""
+        """Raise :class:`ConfigError` if the address is on another machine and there is no shared key."""
         if self.shared is None and not self.loopback:
             raise ConfigError(
                 f"{self}: learners beyond this machine need a shared key: --key FILE or the variable {VARIABLE}, the "
@@ -67,10 +67,10 @@ class Address:
         """Join the bus.
 
         Args:
-            capacities: Longest message of each topic [bytes].
-            listen: Wait for others there; ROS 1 has a master who does.
-            writes: Topics that this end writes. Readers are connected to them at once, and not with the first message,
-                which may be the last one, too.
+            capacities: Maximum length of a message, by topic [bytes].
+            listen: Wait there for other ends; for ROS 1, the master does so.
+            writes: Topics that this end writes. Readers are connected to them immediately. Otherwise they would be
+                connected with the first message, which may also be the last one.
 
         Raises:
             ConfigError: It cannot be joined.
@@ -88,19 +88,19 @@ class Address:
 
             bus = RosBus(capacities, f"http://{where}", key=self.key, writes=writes, session=session)
         if session is None:
-            bus.publish(greeting, b"")  # so that an end with a key knows that this one has none
+            bus.publish(greeting, b"")  # so that an end with a key detects that this one has no key
         return bus
 
 
 def flights_at(texts: Sequence[str], key: Path | None) -> list[Address]:
-    """Return where flights are to learn for.
+    """Return the addresses of the flights to learn for.
 
     Args:
-        texts: As ``zenoh:192.168.1.5:7447``.
-        key: File with the key that the flights have, too; None: that of ``RETRIM_KEY``, if there is one.
+        texts: For example ``zenoh:192.168.1.5:7447``.
+        key: File with the key that the flights also have; None: the key of ``RETRIM_KEY``, if it is set.
 
     Raises:
-        ConfigError: There is none, one of them is no address, or the key cannot be read.
+        ConfigError: There is no address, an address is invalid, or the key cannot be read.
     """
     if not texts:
         raise ConfigError("no address; one is zenoh:HOST:PORT or ros:HOST:PORT")

@@ -1,4 +1,4 @@
-"""A bus by ROS 1, the paper's transport: latched topics of bytes, and a rosmaster that knows who is where."""
+"""A bus over ROS 1, the paper's transport: latched topics of bytes, and a rosmaster that connects the ends."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -11,7 +11,7 @@ PREFIX = "/retrim"
 
 
 class RosBus(NetworkBus):
-    """One end of the bus. Ends in one process share its node, which lives as long as the process."""
+    """One end of the bus. Ends in one process share its node, which exists as long as the process."""
 
     def __init__(
         self,
@@ -25,11 +25,11 @@ class RosBus(NetworkBus):
         """Join a bus.
 
         Args:
-            capacities: Longest message of each topic [bytes].
-            master: Where the rosmaster is, as ``http://127.0.0.1:11311``.
-            key: Of one vehicle among several.
+            capacities: Maximum length of a message, by topic [bytes].
+            master: URI of the rosmaster, for example ``http://127.0.0.1:11311``.
+            key: Key of one vehicle among several.
             writes: Topics that are written here; others are declared with their first message.
-            session: Signs messages; None: nobody does.
+            session: Signs messages; None: messages are not signed.
 
         Raises:
             ConfigError: rospy is not installed, or there is no master.

@@ -1,10 +1,11 @@
-"""A conversation of two ends that share a key: whose messages are taken, and whose are not.
+"""Authenticates the messages between two ends that share a key.
 
-Each end draws a random number when it starts. A message names the number of its sender, that of the end that it is for,
-and a count; HMAC-SHA256 covers all of them, the topic, the vehicle and the payload. An end takes a message only if it
-names this end's own number and is newer than those before it. So neither a message of an earlier session nor one that
-was taken already is taken again, even by an end that has just been started, and no clocks have to agree. Whoever hears
-an end for the first time greets it with its number, and the last message of each topic is sent once more, for it.
+Each end draws a random number when it starts. A message contains the number of its sender, the number of its receiver,
+and a count. HMAC-SHA256 covers all of them, the topic, the vehicle and the payload. An end accepts a message only if it
+contains this end's own number and is newer than the previous ones. Messages of an earlier session and repeated messages
+are therefore rejected, even by an end that has just been started, and clocks need not be synchronised. An end that
+receives from another end for the first time sends it a greeting with its own number. The last message of each topic is
+then sent once more, to the new end.
 """
 
 import hmac
@@ -16,44 +17,44 @@ from typing import NamedTuple
 from .shared_key import SharedKey
 
 MARK = b"signed1\xff"
-"""Beginning of every signed message: form and version. No unsigned one begins so."""
+"""Beginning of every signed message: format and version. Unsigned messages never begin with it."""
 HEAD = struct.Struct("<8s16s16sQ32s")
 """Mark, sender, receiver, count, code."""
 NOBODY = bytes(16)
 GREETINGS = "greeting.flight", "greeting.ground"
-"""Topics of those who listen, and of those who join them."""
+"""Greeting topics of the end that listens and of the end that connects."""
 UNSIGNED = "the other end has no key; start it with --key FILE or RETRIM_KEY, the same as here"
 FOREIGN = "the other end has another key; --key FILE or RETRIM_KEY must be the same at both ends"
 MISSING = "the other end has a key, and this one has none; start it with --key FILE or RETRIM_KEY"
 
 
 class Due(NamedTuple):
-    """What an end has to send."""
+    """Messages that an end has to send."""
 
     greeting: bytes | None
-    """A signed greeting; None for none."""
+    """Signed greeting; None if no greeting is due."""
     again: bool
-    """Whether the last message of each topic is sent once more."""
+    """Whether to send the last message of each topic once more."""
 
 
 class Session:
-    """One end of the conversation; it may be used by several threads."""
+    """One end of the session; several threads may use it."""
 
     def __init__(self, key: SharedKey, vehicle: str, greeting: str) -> None:
-        """Begin one.
+        """Begin a session.
 
         Args:
-            key: Shared with the other end.
-            vehicle: Whose conversation it is, where several share a place.
+            key: Key that is shared with the other end.
+            vehicle: Name of the vehicle, if several share an address.
             greeting: Topic in which this end greets the other one.
         """
         self.greeting = greeting
         self.fault = ""
-        """Why messages are refused, while the other end has not been heard; empty once it is."""
+        """Reason why messages are refused before the other end is accepted; empty afterwards."""
         self.refused = 0
-        """Messages that were not taken: forged, or taken before."""
+        """Number of refused messages: forged or repeated."""
         self.pending = threading.Event()
-        """Set while anything is due."""
+        """Set while a message is due."""
         self.pending.set()
         self._key, self._vehicle, self._me = key, vehicle.encode(), secrets.token_bytes(16)
         self._peer, self._former = NOBODY, set[bytes]()
@@ -64,11 +65,11 @@ class Session:
         self._lock = threading.RLock()
 
     def seal(self, topic: str, count: int, data: bytes) -> bytes:
-        """Return a message for the other end; counts of a topic rise."""
+        """Return a signed message for the other end; counts of a topic must increase."""
         return self._sealed(topic, self._peer, count, data)
 
     def open(self, topic: str, frame: bytes) -> tuple[int, bytes] | None:
-        """Return count and payload of a message, if it is a new one of the other end for this one."""
+        """Return count and payload of a message if it is new, from the other end, and addressed to this end."""
         if not frame.startswith(MARK) or len(frame) < HEAD.size:
             self._refuse(UNSIGNED)
             return None
@@ -83,7 +84,7 @@ class Session:
             if sender in self._former:
                 self._refuse("")
                 return None
-            if receiver != self._me:  # it may be old: its sender has to prove that it lives
+            if receiver != self._me:  # it may be an old message: its sender has to prove that it is running
                 if self._greeted != sender:
                     self._greet = sender
                     self.pending.set()
@@ -97,7 +98,7 @@ class Session:
         return None if topic in GREETINGS else (count, data)
 
     def due(self) -> Due:
-        """Return what has to be sent now, once."""
+        """Return the due messages and clear them."""
         with self._lock:
             greet, again = self._greet, self._again
             self._greet, self._again = None, False
@@ -108,7 +109,7 @@ class Session:
             return Due(self._sealed(self.greeting, greet, self._greetings, b""), again)
 
     def _meet(self, sender: bytes) -> None:
-        """Talk to an end that has named this one's number: it lives, and the one before it does not count any more."""
+        """Accept an end that has sent this end's number: it is running, and replaces the previous one."""
         if self._peer != NOBODY:
             self._former.add(self._peer)
         self._peer, self._newest, self.fault = sender, {}, ""

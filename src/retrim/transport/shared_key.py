@@ -1,4 +1,4 @@
-"""A key that two machines share, by which each knows that a message is the other's."""
+"""A key that is shared by two machines and authenticates their messages."""
 
 import hashlib
 import hmac
@@ -15,12 +15,12 @@ MAKING = "openssl rand -hex 32 > FILE makes one"
 
 @dataclass(frozen=True)
 class SharedKey:
-    """The key; it is shown nowhere."""
+    """The key; it is never displayed."""
 
     secret: bytes = field(repr=False)
 
     def sign(self, *parts: bytes) -> bytes:
-        """Return HMAC-SHA256 over parts, each with its length: 32 bytes."""
+        """Return HMAC-SHA256 over the parts, each preceded by its length: 32 bytes."""
         code = hmac.new(self.secret, digestmod=hashlib.sha256)
         for part in parts:
             code.update(len(part).to_bytes(8, "little"))
@@ -31,7 +31,7 @@ class SharedKey:
 def read_key(file: Path | None) -> SharedKey | None:
     """Return the key of a file, or that of the variable ``RETRIM_KEY``; None if there is neither.
 
-    The variable is taken out of the environment, so that no process that is started later has it.
+    The variable is removed from the environment, so that processes that are started later do not inherit it.
 
     Raises:
         ConfigError: The file cannot be read, or the key is too short or too long.

@@ -1,8 +1,9 @@
-"""A bus in shared memory: processes of one machine, no broker, nothing that blocks.
+"""A bus in shared memory, for processes of one machine: without a broker and without blocking.
 
-Each topic is a file that is mapped into memory, with two slots. A writer fills the slot that is not the last one, and
-only then says that it is: a writer that is killed on the way leaves the last message whole. A reader takes a copy and
-checks that its version and its checksum belong together; if the writer came by twice in that time, it tries again.
+Each topic is a file that is mapped into memory, with two slots. A writer fills the slot that does not hold the last
+message, and then publishes its version. If the writer is killed before that, the last message remains intact. A reader
+copies a message and compares its version and its checksum. If the writer has published twice in that time, the reader
+tries again.
 """
 
 import json
@@ -28,7 +29,7 @@ PREFIX = "retrim-"
 
 
 class SharedMemoryBus(Bus):
-    """One end of the bus. :meth:`create` makes a bus, and its folder lets other processes join it."""
+    """One end of the bus. :meth:`create` makes a bus; other processes join it by its folder."""
 
     def __init__(self, folder: Path) -> None:
         """Join a bus.
@@ -52,15 +53,15 @@ class SharedMemoryBus(Bus):
 
     @classmethod
     def create(cls, capacities: Mapping[str, int]) -> "SharedMemoryBus":
-        """Make a bus in a new folder that only this user can read; :meth:`remove` takes it away.
+        """Create a bus in a new folder that only this user can read; :meth:`remove` removes it.
 
         Buses that are left over from processes that were killed are removed.
 
         Args:
-            capacities: Longest message of each topic [bytes].
+            capacities: Maximum length of a message, by topic [bytes].
 
         Raises:
-            OSError: There is no room for it.
+            OSError: There is not enough space for the bus.
         """
         base = Path("/dev/shm") if os.access("/dev/shm", os.W_OK) else Path(tempfile.gettempdir())
         clear(base, PREFIX)
@@ -72,7 +73,7 @@ class SharedMemoryBus(Bus):
             raise
         try:
             for topic, capacity in capacities.items():
-                with (folder / topic).open("wb") as file:  # all of it now: memory that is missing in flight is a signal
+                with (folder / topic).open("wb") as file:  # allocate all now: missing memory in flight raises a signal
                     os.posix_fallocate(file.fileno(), 0, HEADER + 2 * _room(capacity))
             (folder / PLAN).write_text(json.dumps(dict(capacities)))
             return cls(folder)
@@ -83,10 +84,10 @@ class SharedMemoryBus(Bus):
             os.close(lock)
 
     def take_in(self, file: Path) -> Path:
-        """Copy a file beside the topics, where it stays as long as they do; return the copy.
+        """Copy a file to the folder of the topics, where it exists as long as they do; return the copy.
 
         Raises:
-            OSError: It cannot be read, or there is no room for it; the bus is taken away.
+            OSError: It cannot be read, or there is not enough space; the bus is then removed.
         """
         try:
             return Path(shutil.copy(file, self.folder / file.name))
@@ -100,7 +101,7 @@ class SharedMemoryBus(Bus):
         memory, words = self._maps[topic]
         version = words[VERSION] + 1
         at, slot = self._slot(topic, version)
-        words[slot] = 0  # nobody takes a message that is half old
+        words[slot] = 0  # so that readers do not accept a partly overwritten message
         memory[at : at + len(data)] = data
         words[slot + 1], words[slot + 2] = len(data), zlib.crc32(data)
         words[slot] = version
@@ -133,12 +134,12 @@ class SharedMemoryBus(Bus):
             self._lock = None
 
     def remove(self) -> None:
-        """Take the bus away; processes that have joined keep what they have mapped."""
+        """Remove the bus; processes that have joined keep their mappings."""
         shutil.rmtree(self.folder, ignore_errors=True)
         self.close()
 
     def _slot(self, topic: str, version: int) -> tuple[int, int]:
-        """Where the bytes of a version begin, and which word its slot begins with."""
+        """Return the offset of the bytes of a version, and the first word of its slot."""
         which = version % 2
         return HEADER + which * _room(self._capacities[topic]), SLOTS[which]
 

@@ -14,7 +14,7 @@ T = TypeVar("T")
 
 
 def names(tree: Any) -> dict[str, Any]:
-    """Return leaves by their dotted path, as in ``layers.0.weight``."""
+    """Return leaves by their dotted path, for example ``layers.0.weight``."""
     paths = jax.tree_util.tree_leaves_with_path(tree)
     return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in paths}
 
@@ -24,7 +24,7 @@ def pack(tree: Any, *, kind: str, about: Mapping[str, str]) -> bytes:
 
     Args:
         tree: A pytree of arrays.
-        kind: What it is, as ``policy``.
+        kind: Kind of the content, for example ``policy``.
         about: Header fields; the checksum covers them and the arrays.
     """
     return pack_arrays(names(tree), kind=kind, about=about)
@@ -35,9 +35,9 @@ def unpack(data: bytes, like: T, *, kind: str, source: str) -> T:
 
     Args:
         data: Bytes of the message.
-        like: A pytree of the structure, shapes and types that are expected.
-        kind: What the message should hold.
-        source: Where the bytes come from, for messages of errors.
+        like: A pytree with the expected structure, shapes and types.
+        kind: Expected kind of the message.
+        source: Origin of the bytes, for error messages.
 
     Returns:
         The pytree.

@@ -1,4 +1,4 @@
-"""A bus between machines by zenoh: peers, no broker. It finds nobody by itself; one end listens, others connect.
+"""A bus between machines over zenoh: peers without a broker or discovery. One end listens, others connect.
 
 Needs the extra ``zenoh``.
 """
@@ -12,7 +12,7 @@ from .network import NetworkBus
 from .session import Session
 
 PREFIX = "retrim"
-BUFFER = 1  # messages of a topic that its writer keeps for those who join late
+BUFFER = 1  # messages of a topic that its writer keeps for late subscribers
 
 
 class ZenohBus(NetworkBus):
@@ -31,15 +31,15 @@ class ZenohBus(NetworkBus):
         """Join a bus.
 
         Args:
-            capacities: Longest message of each topic [bytes].
-            endpoint: As ``tcp/192.168.1.5:7447``.
-            listen: Wait there for others; if not, look for who does, for as long as it takes.
-            key: Of one vehicle among several.
+            capacities: Maximum length of a message, by topic [bytes].
+            endpoint: For example ``tcp/192.168.1.5:7447``.
+            listen: Wait there for other ends; otherwise, try to connect to a listening end without a time limit.
+            key: Key of one vehicle among several.
             writes: Topics that are written here; others are declared with their first message.
-            session: Signs messages; None: nobody does.
+            session: Signs messages; None: messages are not signed.
 
         Raises:
-            ConfigError: zenoh is not installed, or nobody can listen there.
+            ConfigError: zenoh is not installed, or it is not possible to listen there.
         """
         try:
             import zenoh
@@ -52,12 +52,12 @@ class ZenohBus(NetworkBus):
         for name, value in {
             "mode": "peer",
             "scouting/multicast/enabled": False,
-            "timestamping/enabled": True,  # the history that late joiners ask for needs it
+            "timestamping/enabled": True,  # required by the history for late subscribers
             "listen/endpoints": [endpoint] if listen else [],
             "connect/endpoints": [] if listen else [endpoint],
             "connect/timeout_ms": -1,
             "connect/exit_on_failure": False,
-            # A peer that is back is found again at once.
+            # These times reconnect a returning peer quickly.
             "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
         }.items():
             config.insert_json5(name, json.dumps(value))
@@ -68,7 +68,7 @@ class ZenohBus(NetworkBus):
             raise ConfigError(f"zenoh: cannot join at {endpoint!r} ({reason})") from error
         cache = ext.CacheConfig(BUFFER)
         history = ext.HistoryConfig(detect_late_publishers=True, max_samples=BUFFER)
-        # Nothing is dropped where the network is slow: some topics have a single message.
+        # Messages are not dropped if the network is slow, because some topics have a single message.
         block, remote = zenoh.CongestionControl.BLOCK, zenoh.Locality.REMOTE
         prefix = f"{PREFIX}/{key}" if key else PREFIX
         self._declare: Any = lambda topic: ext.declare_advanced_publisher(
@@ -90,7 +90,7 @@ class ZenohBus(NetworkBus):
         self._session.close()
 
     def _send(self, topic: str, frame: bytes) -> None:
-        if topic not in self._publishers:  # only its writer declares one
+        if topic not in self._publishers:  # only the writer of a topic declares a publisher
             self._publishers[topic] = self._declare(topic)
         self._publishers[topic].put(frame)
 

@@ -1,1 +1,1 @@
-"""Pictures; nothing else imports this but the command line."""
+"""Draws pictures; only the command line imports this package."""

@@ -1,4 +1,4 @@
-"""Plain panels of curves, for pictures of a model."""
+"""Draws plain panels of curves, for pictures of a model."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ COLORS = (ADAPTED, BASE, UPDATE, PUSH, "#CC79A7", "#56B4E9")
 
 @dataclass(frozen=True)
 class Curve:
-    """One line, or with ``marks`` only points."""
+    """One line, or points only with ``marks``."""
 
     x: np.ndarray
     y: np.ndarray
@@ -26,7 +26,7 @@ class Curve:
     dashed: bool = False
     marks: bool = False
     color: int | None = None
-    """Which of the colours; the next by default."""
+    """Index of the colour; the next one by default."""
 
 
 @dataclass(frozen=True)
@@ -38,13 +38,13 @@ class Panel:
     y: str
     curves: Sequence[Curve]
     columns: int = 1
-    """Of the legend."""
+    """Number of columns of the legend."""
     log: bool = False
-    """Both axes."""
+    """Whether both axes are logarithmic."""
 
 
 def panel_figure(title: str, panels: Sequence[Panel], *, across: int = 3) -> "matplotlib.figure.Figure":
-    """Panels in rows of ``across``."""
+    """Draw panels in rows of ``across``."""
     down = -(-len(panels) // across)
     with sheet((4.6 * across, 3.7 * down), 10.0) as figure:
         grid = figure.subplots(down, across, squeeze=False)
@@ -61,7 +61,7 @@ def panel_figure(title: str, panels: Sequence[Panel], *, across: int = 3) -> "ma
             if panel.log:
                 axes.set(xscale="log", yscale="log")
                 for label in (*axes.get_xticklabels(which="both"), *axes.get_yticklabels(which="both")):
-                    label.set_parse_math(True)  # powers of ten; names of others are text
+                    label.set_parse_math(True)  # for powers of ten; other names are plain text
             axes.set_title(panel.title, fontsize=11, color=INK)
             axes.grid(alpha=0.25)
             axes.legend(fontsize=8, frameon=False, ncols=panel.columns)
@@ -73,12 +73,12 @@ def panel_figure(title: str, panels: Sequence[Panel], *, across: int = 3) -> "ma
 def heat_map(
     titles: Sequence[str], rows: Sequence[str], columns: Sequence[str], values: np.ndarray
 ) -> "matplotlib.figure.Figure":
-    """Draw tables of figures as colours, one beside the other; dark is large, each on its own logarithmic scale.
+    """Draw tables of figures as colours, next to each other; dark is large, each on its own logarithmic scale.
 
     Args:
-        titles: One for each table.
-        rows: Labels.
-        columns: Labels.
+        titles: Title of each table.
+        rows: Labels of the rows.
+        columns: Labels of the columns.
         values: Tables x rows x columns, not negative; infinity is written as such, NaN is left white.
     """
     size = (2.6 + len(titles) * (0.6 + 0.75 * len(columns)), 1.2 + 0.3 * len(rows))
@@ -103,7 +103,7 @@ def heat_map(
 def bars(title: str, groups: dict[str, dict[str, list[float]]]) -> "matplotlib.figure.Figure":
     """Draw one group of bars per label and one bar per method: the mean, and a dot for each flight.
 
-    An infinite value is a flight that crashed; the number of these stands below the bar's place.
+    An infinite value is a crashed flight; the number of crashes is written at the bar's position.
     """
     methods = list(dict.fromkeys(method for group in groups.values() for method in group))
     with sheet((max(6.0, 1.1 * len(groups) * len(methods)), 4.5), 10.0) as figure:

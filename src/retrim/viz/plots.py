@@ -1,4 +1,4 @@
-"""Pictures of flights."""
+"""Draws pictures of flights."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -18,28 +18,28 @@ T = TypeVar("T")
 # Okabe and Ito's colours, distinguishable with any colour vision.
 BASE, ADAPTED, UPDATE, PUSH, INK = "#D55E00", "#0072B2", "#009E73", "#E69F00", "#333333"
 GROUPS = (BASE, ADAPTED, "#CC79A7", "#56B4E9")
-LAPS_S = 10.0  # [s] at the end of a flight that its path from above shows
-MOST_WORDS = 8  # marks that have their words beside them
-ASPECT = 720 / 1280  # of a camera's image, whose axes both run from -1 to 1
+LAPS_S = 10.0  # time at the end of a flight for which its path is drawn from above [s]
+MOST_WORDS = 8  # maximum number of marks with text
+ASPECT = 720 / 1280  # aspect ratio of a camera's image, whose axes both run from -1 to 1
 
 
 @dataclass(frozen=True)
 class Track:
-    """One flight, as it is drawn."""
+    """One flight to draw."""
 
     t: np.ndarray
-    """[s]"""
+    """Times [s]."""
     p: np.ndarray
-    """World [m], ticks x 3."""
+    """Positions, world [m], ticks x 3."""
     error: np.ndarray
-    """[m]"""
+    """Error [m]."""
     swaps: tuple[float, ...] = ()
-    """When a new policy took over [s]."""
+    """Times of policy swaps [s]."""
     crashed: bool = False
     last_s: float = 2.0
-    """The flight is scored over this long at its end [s]."""
+    """Duration at the end of the flight over which it is scored [s]."""
     marks: tuple[tuple[float, str], ...] = ()
-    """What a person did, and when [s]."""
+    """Time [s] and text of each action of a person."""
 
 
 @dataclass(frozen=True)
@@ -49,29 +49,29 @@ class Group(Generic[T]):
     name: str
     tracks: Sequence[T]
     colour: int = 0
-    """Which of :data:`GROUPS`."""
+    """Index in :data:`GROUPS`."""
 
 
 @dataclass(frozen=True)
 class ImageTrack:
-    """What the camera saw in one flight."""
+    """Image points in the camera during one flight."""
 
     pixel: np.ndarray
-    """Ticks x 7 x 2; the image is [-1, 1] x [-1, 1]."""
+    """Image coordinates, ticks x 7 x 2; the image is [-1, 1] x [-1, 1]."""
     visible: np.ndarray
-    """Ticks x 7."""
+    """Visibility of the points, ticks x 7."""
 
 
 @dataclass(frozen=True)
 class Span:
-    """A disturbance while it lasts."""
+    """A disturbance and its duration."""
 
     start: float
-    """[s]"""
+    """Start [s]."""
     end: float
     label: str
     strong: bool
-    """Drawn darker: to tell a push from its reverse."""
+    """Whether it is drawn darker, which distinguishes a push from its reverse."""
 
 
 def flight_figure(
@@ -80,7 +80,7 @@ def flight_figure(
     spans: Sequence[Span],
     beside: Callable[["matplotlib.axes.Axes"], None],
 ) -> "matplotlib.figure.Figure":
-    """Error over time, group against group, one thin line a flight, the mean thick; ``beside`` draws what is right."""
+    """Draw the error over time of all groups, with a thick line for the mean; ``beside`` draws the right panel."""
     with sheet((13.0, 5.4), 11.0) as figure:
         left, right = figure.subplots(1, 2, width_ratios=(1.9, 1))
         figure.suptitle(title, fontsize=14, fontweight="bold", color=INK)
@@ -91,24 +91,24 @@ def flight_figure(
 
 
 def save(figure: "matplotlib.figure.Figure", folder: Path, name: str) -> list[Path]:
-    """Write PNG and SVG; returns their paths."""
+    """Write PNG and SVG; return their paths."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / f"{name}.{kind}" for kind in ("png", "svg")]
     for path in paths:
         figure.savefig(path, dpi=130, metadata={"Date": None} if path.suffix == ".svg" else None)
-        figure.set_layout_engine("none")  # what was laid out once stays where it is
+        figure.set_layout_engine("none")  # keeps the layout of the first file
     return paths
 
 
 def _coloured(groups: Sequence[Group[T]]) -> Iterator[tuple[Sequence[T], str, str]]:
-    """Tracks, colour and name of each group."""
+    """Return tracks, colour and name of each group."""
     for group in groups:
         yield group.tracks, GROUPS[group.colour % len(GROUPS)], group.name
 
 
 def _errors(axes: "matplotlib.axes.Axes", groups: Sequence[Group[Track]], spans: Sequence[Span]) -> None:
     every = [track for group in groups for track in group.tracks]
-    finite = [track.error[np.isfinite(track.error)] for track in every]  # a flight may end where nothing is a number
+    finite = [track.error[np.isfinite(track.error)] for track in every]  # a flight may end with errors that are NaN
     top = 1.15 * max((float(error.max()) for error in finite if len(error)), default=1.0)
     for span in spans:
         axes.axvspan(span.start, span.end, color=PUSH, alpha=0.28 if span.strong else 0.13, linewidth=0)
@@ -118,7 +118,7 @@ def _errors(axes: "matplotlib.axes.Axes", groups: Sequence[Group[Track]], spans:
             bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 2},
         )  # fmt: skip
     swaps = sorted({round(t, 2) for track in every for t in track.swaps})
-    few = len(swaps) <= 12  # many would hide the flights: they are marked along the axis of time
+    few = len(swaps) <= 12  # many lines would hide the flights: they are then marked along the time axis
     for i, t in enumerate(swaps):
         axes.axvline(
             t, ymax=1.0 if few else 0.03, color=UPDATE, linestyle="--" if few else "-", linewidth=1.2,
@@ -147,7 +147,7 @@ def _errors(axes: "matplotlib.axes.Axes", groups: Sequence[Group[Track]], spans:
 
 
 def _marks(axes: "matplotlib.axes.Axes", marks: Sequence[tuple[float, str]], top: float) -> None:
-    """Draw what a person did: a line each, with its words where there are few."""
+    """Draw the actions of a person: a line for each, with text if there are few."""
     for i, (t, words) in enumerate(marks):
         axes.axvline(t, color=INK, linestyle=":", linewidth=1.2, label=None if i else "somebody acts")
         if len(marks) <= MOST_WORDS:
@@ -156,7 +156,7 @@ def _marks(axes: "matplotlib.axes.Axes", marks: Sequence[tuple[float, str]], top
 
 
 def paths(axes: "matplotlib.axes.Axes", groups: Sequence[Group[Track]], goal: tuple[float, float, float]) -> None:
-    """The paths from above, to the goal."""
+    """Draw the paths from above, to the goal."""
     for tracks, color, name in _coloured(groups):
         for i, track in enumerate(tracks):
             axes.plot(track.p[:, 0], track.p[:, 1], color=color, alpha=0.35, linewidth=0.9)
@@ -178,7 +178,7 @@ def paths(axes: "matplotlib.axes.Axes", groups: Sequence[Group[Track]], goal: tu
 
 
 def laps(axes: "matplotlib.axes.Axes", groups: Sequence[Group[Track]], lap: np.ndarray) -> None:
-    """The paths of the last ten seconds from above, over the lap (points x 3)."""
+    """Draw the paths of the last ten seconds from above, on top of the lap (points x 3)."""
     axes.plot(lap[:, 0], lap[:, 1], color="#BBBBBB", linewidth=5, label="reference", zorder=1)
     for tracks, color, name in _coloured(groups):
         for i, track in enumerate(track for track in tracks if not track.crashed):
@@ -192,7 +192,7 @@ def laps(axes: "matplotlib.axes.Axes", groups: Sequence[Group[Track]], lap: np.n
 
 
 def camera(axes: "matplotlib.axes.Axes", groups: Sequence[Group[ImageTrack]], wanted: np.ndarray) -> None:
-    """What the camera saw in the first flight of each kind; ``wanted`` (7 x 2): where the points are at the goal."""
+    """Draw image points in the first flight of each group; ``wanted`` (7 x 2): their positions at the goal."""
     for sightings, color, name in _coloured(groups):
         for sighting in sightings[:1]:
             seen = np.where(sighting.visible[:, :, None], sighting.pixel, np.nan)

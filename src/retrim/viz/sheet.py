@@ -1,5 +1,5 @@
-"""A blank figure. It is no global state of pyplot, and matplotlib is imported when the first one is drawn: a command
-begins the sooner."""
+"""A blank figure, without the global state of pyplot. matplotlib is imported only when the first figure is drawn, so
+that commands start faster."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,12 +11,12 @@ if TYPE_CHECKING:
 
 @contextmanager
 def sheet(size: tuple[float, float], font_size: float, *, boxed: bool = False) -> Iterator["matplotlib.figure.Figure"]:
-    """Give a white figure, whose style holds while it is drawn.
+    """Yield a white figure; its style applies while it is drawn.
 
     Args:
         size: Width and height [inch].
-        font_size: [pt]
-        boxed: Axes have a line on all four sides; else below and on the left.
+        font_size: Size of the font [pt].
+        boxed: Whether axes have a line on all four sides, or only below and on the left.
     """
     import matplotlib
     from matplotlib.figure import Figure
@@ -27,7 +27,7 @@ def sheet(size: tuple[float, float], font_size: float, *, boxed: bool = False) -
             "axes.spines.top": boxed,
             "axes.spines.right": boxed,
             "svg.fonttype": "none",
-            "text.parse_math": False,  # a name with dollar signs is a name
+            "text.parse_math": False,  # dollar signs in names are plain text
             "text.usetex": False,
         }
     ):

@@ -1,4 +1,4 @@
-"""Maps of vehicles: lag across, delay up, and how well each vehicle was flown."""
+"""Draws maps of vehicles: lag across, delay up, and the error of each vehicle in colour."""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     import matplotlib.figure
 
 SMALLEST, LARGEST = 1e-3, 1.0  # [m], ends of the colour scale
-ACROSS = 4  # panels in a row
+ACROSS = 4  # panels per row
 LOST = "#D55E00"
 
 
@@ -25,7 +25,7 @@ def vehicle_map(
         title: Title of the figure.
         lag: Time constant of the body rates of each vehicle [s].
         delay: Command delay of each vehicle [s].
-        errors: Error of each vehicle by method [m]; infinite for a vehicle that was lost.
+        errors: Error of each vehicle [m], by method; infinite for a lost vehicle.
         colour: Label of the colour scale.
     """
     from matplotlib.colors import LogNorm

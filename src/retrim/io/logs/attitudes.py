@@ -1,4 +1,4 @@
-"""Attitudes of a log as rotation matrices."""
+"""Converts the attitudes of a log to rotation matrices."""
 
 from pathlib import Path
 
@@ -8,17 +8,17 @@ from ...errors import LogError
 from .log_map import ANGLES, Attitude
 
 COLUMNS = {"xyzw": 4, "wxyz": 4, "matrix": 9, "roll pitch yaw": 3, "rotation vector": 3}
-OFF = 0.05  # by which the norm of a quaternion, or a product of columns, may miss its value
-RARE = 0.01  # share of samples that may miss it by more: these are left out
+OFF = 0.05  # tolerance of the norm of a quaternion, or of a product of columns
+RARE = 0.01  # accepted share of samples outside the tolerance; these are left out
 
 
 def attitudes(values: np.ndarray, spec: Attitude, path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Return rotation matrices, (n, 3, 3), body to world in the frames of the log, and which samples are rotations.
+    """Return rotation matrices, (n, 3, 3), body to world in the frames of the log, and a mask of valid rotations.
 
     Raises:
         LogError: The numbers cannot be attitudes of this form.
     """
-    from scipy.spatial.transform import Rotation  # here: it takes as long to import as all of retrim
+    from scipy.spatial.transform import Rotation  # local, because it takes as long to import as all of retrim
 
     if values.shape[1] != COLUMNS[spec.form]:
         raise LogError(

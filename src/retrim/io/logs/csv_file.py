@@ -1,4 +1,4 @@
-"""Logs as CSV: a header and one line per sample; a cell may hold a list, as ``"[0.1, 0.2, 0.3]"``."""
+"""Reads CSV logs: a header and one line per sample; a cell may hold a list, for example ``"[0.1, 0.2, 0.3]"``."""
 
 import csv
 import json
@@ -18,8 +18,7 @@ def read_csv(
 ) -> tuple[dict[str, Series], list[str]]:
     """Read the columns of a CSV file; see :class:`~retrim.io.logs.series.LogReader`.
 
-    ``p[0]`` and ``p[0:3]`` are numbers of a column of lists. Where no name has the same letters, small and capital ones
-    are alike.
+    ``p[0]`` and ``p[0:3]`` select numbers from a column of lists. If a name has no exact match, letter case is ignored.
     """
     if time is None:
         raise LogError(f'{path}: a CSV file needs a table [time] in the map, as field = "t" and unit = "s"')
@@ -56,7 +55,7 @@ def read_csv(
 
 
 def _lines(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """Return the header, and each other line that is not empty with its number."""
+    """Return the header, and all other non-empty lines with their numbers."""
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             first = file.readline()
@@ -78,7 +77,7 @@ def _lines(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
 
 
 def _place(path: Path, name: str, header: list[str]) -> tuple[int, slice]:
-    """Return which column a field is, and which of its numbers."""
+    """Return the column of a field, and the slice of the numbers in it."""
     alike = [each.lower() for each in header]
     if name in header:
         return header.index(name), slice(None)
@@ -106,7 +105,7 @@ def _is_number(cell: str) -> bool:
 
 
 def _numbers(cell: str, where: str) -> list[float]:
-    """Return the numbers of a cell; an empty one is not a number."""
+    """Return the numbers of a cell; NaN for an empty one."""
     text = cell.strip()
     if not text:
         return [np.nan]
@@ -117,7 +116,7 @@ def _numbers(cell: str, where: str) -> list[float]:
 
 
 def _array(path: Path, name: str, rows: list[list[float]]) -> np.ndarray:
-    """Return a column as an array; samples that miss it are not a number."""
+    """Return a column as an array; missing samples are NaN."""
     width = max(map(len, rows))
     for i, row in enumerate(rows):
         if len(row) != width:

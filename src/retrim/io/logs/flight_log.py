@@ -1,4 +1,4 @@
-"""A flight from a log: states and commands on one clock, in the frames and units of this package."""
+"""Reads a flight from a log: states and commands on one clock, in the frames and units of retrim."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -23,11 +23,11 @@ class FlightLog:
     t: np.ndarray
     """Times since the beginning [s], (n,), one tick apart."""
     p: np.ndarray
-    """World [m], (n, 3)."""
+    """Position, world [m], (n, 3)."""
     R: np.ndarray
-    """Body to world, (n, 3, 3)."""
+    """Attitude, body to world, (n, 3, 3)."""
     v: np.ndarray
-    """World [m/s], (n, 3)."""
+    """Velocity, world [m/s], (n, 3)."""
     a: np.ndarray
     """Acceleration, the derivative of v, world [m/s^2], (n, 3)."""
     c: np.ndarray
@@ -35,40 +35,40 @@ class FlightLog:
     rates: np.ndarray
     """Measured body rates [rad/s], (n, 3)."""
     command: np.ndarray | None
-    """Commanded body rates [rad/s], (n, 3); None if the log has none."""
+    """Commanded body rates [rad/s], (n, 3); None if the log does not contain them."""
     valid: np.ndarray
-    """Where the vehicle flies and all of these are known, (n,)."""
+    """Ticks at which the vehicle flies and all of these quantities are known, (n,)."""
     dt: float
     """Tick [s]."""
     full_thrust: float | None
-    """For a thrust that is a share: what all of it gives [m/s^2]."""
+    """Acceleration at full thrust, if commanded thrust is a share of it [m/s^2]."""
     notes: tuple[str, ...]
-    """What was left out or found; what is doubtful comes first."""
+    """Notes on findings and on excluded parts; doubtful findings come first."""
     agreement: Mapping[str, float] = field(default_factory=dict)
-    """How well the log agrees with itself, 1 for entirely; see :data:`retrim.io.logs.agreement.CLAIMS`."""
+    """Agreement of the log's quantities, 1 for complete agreement; see :data:`retrim.io.logs.agreement.CLAIMS`."""
     warnings: tuple[str, ...] = ()
-    """Where it agrees so badly that nothing that follows from it can be relied on."""
+    """Warnings about agreement so low that results from the log are unreliable."""
 
     @property
     def seconds(self) -> float:
-        """Length of the flight without what was left out [s]."""
+        """Length of the flight without the excluded parts [s]."""
         return float(np.sum(self.valid) * self.dt)
 
 
-@np.errstate(all="ignore")  # numbers that overflow are no part of a flight, and left out as such
+@np.errstate(all="ignore")  # ticks with numbers that overflow are excluded later
 def read_flight_log(path: Path, log_map: LogMap | None = None, *, dt: float = 0.02) -> FlightLog:
     """Read a flight.
 
-    A log whose states come about every ``dt`` is taken sample by sample; one that is faster is interpolated; of one
-    that is slower the tick is the log's.
+    If the states come about every ``dt``, the log is read sample by sample. A faster log is interpolated. A slower log
+    determines the tick.
 
     Args:
         path: CSV, NPZ, ULog, bag of ROS 1 or 2, or MCAP.
-        log_map: What is where in it; by default what this package or the usual autopilot of the format writes.
+        log_map: Map of the log's fields; by default a map for the output of retrim or of a usual autopilot.
         dt: Control tick [s].
 
     Raises:
-        LogError: The file cannot be read, a field is not there, or the columns cannot be what the map says.
+        LogError: The file cannot be read, a field is missing, or the columns contradict the map.
     """
     series, chosen, notes = read_quantities(path, log_map)
     grid = grid_of(path, series, chosen.part, dt)

@@ -1,4 +1,4 @@
-"""Selection of the ticks of a log that are flight with complete data, and the reasons for excluding the others."""
+"""Selects the ticks of a log that are flight with complete data, and reports the reasons for excluding others."""
 
 from pathlib import Path
 
@@ -11,23 +11,23 @@ from .marks import Marks
 from .on_one_clock import Ticks
 from .resampling import around, runs
 
-LEAST = 1.0  # [s] of flight
-JUMP = 15.0  # [m/s] beyond the speed of the vehicle: a position that moves faster has jumped
-ENDS = 2  # ticks at each end, and beside a jump, that have no derivative
-FROZEN = 0.3  # [s] for which the position of a vehicle in the air has not changed
+LEAST = 1.0  # shortest flight [s]
+JUMP = 15.0  # [m/s] above the speed of the vehicle: a position that moves faster has jumped
+ENDS = 2  # ticks at each end, and next to a jump, without a derivative
+FROZEN = 0.3  # time after which the constant position of a vehicle in the air counts as frozen [s]
 
 
 def flight_part(path: Path, ticks: Ticks, marks: Marks, *, measured_position: bool) -> tuple[np.ndarray, list[str]]:
     """Return the ticks at which the vehicle flies with complete data, and notes on the excluded ones.
 
     Args:
-        path: For messages.
+        path: File of the log, for messages.
         ticks: The log on one clock.
-        marks: What its autopilot says.
+        marks: Marks of its autopilot.
         measured_position: Whether the log has positions.
 
     Raises:
-        LogError: Hardly anything is left.
+        LogError: Too little flight remains.
     """
     notes, dt, valid = list[str](), ticks.dt, ticks.known & _finite(ticks)
     most, least = ticks.thrust[ticks.known].max(initial=-np.inf), ticks.thrust[ticks.known].min(initial=np.inf)
@@ -64,7 +64,7 @@ def flight_part(path: Path, ticks: Ticks, marks: Marks, *, measured_position: bo
 
 
 def _finite(ticks: Ticks) -> np.ndarray:
-    """Return where all quantities are finite: differences of damaged times need not be."""
+    """Return where all quantities are finite; differences of damaged times may not be."""
     columns = [ticks.p, ticks.v, ticks.a, ticks.rates, ticks.thrust[:, None], ticks.R.reshape(-1, 9)]
     if ticks.command is not None:
         columns.append(ticks.command)

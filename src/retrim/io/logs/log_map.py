@@ -1,7 +1,7 @@
-"""Which field of a log is what, in which unit and frame: a small TOML file.
+"""Maps the fields of a log to quantities, units and frames: a small TOML file.
 
-A field may have a sign, as ``-pitch``, and alternatives, as ``stabilizer.thrust|controller.cmd_thrust``: the first that
-the log has.
+A field may have a sign, for example ``-pitch``. It may have alternatives, for example
+``stabilizer.thrust|controller.cmd_thrust``; the first one in the log is used.
 """
 
 from typing import Annotated, Literal
@@ -15,7 +15,7 @@ STRICT = ConfigDict(extra="forbid")
 
 
 def check_flag(name: str) -> str:
-    """Return a flag, a field that is not zero or ``field==number``, if its number is one."""
+    """Return a flag, a field that is not zero or ``field==number``, if its number is valid."""
     _, sign, number = name.partition("==")
     if sign:
         try:
@@ -43,29 +43,29 @@ ACCELERATIONS = {"m/s^2": 1.0, "g": 9.80665}
 
 @dataclass(frozen=True, config=STRICT)
 class Time:
-    """Of CSV and NPZ files; for ULogs and bags the field of each topic that is its time, where it has that field."""
+    """Time of CSV and NPZ files; for ULogs and bags, the field of a topic with its time, if the topic has the field."""
 
     field: Name
     unit: Literal["s", "ms", "us", "ns"] = "s"
     age: str | None = None
-    """The field that says how old position, velocity and attitude were then, in the same unit."""
+    """Field with the age of position, velocity and attitude at that time, in the same unit."""
 
 
 @dataclass(frozen=True, config=STRICT)
 class Position:
-    """Of the vehicle in the world."""
+    """Position of the vehicle in the world."""
 
     fields: Fields
     unit: Literal["m", "cm", "mm"] = "m"
     valid: Flags = ()
-    """Fields that are not zero where the samples hold, if the log has them."""
+    """Fields that are not zero while the samples are valid, if the log contains them."""
     resets: Flags = ()
-    """Counters that change where the estimator resets, if the log has them."""
+    """Counters that change when the estimator resets, if the log contains them."""
 
 
 @dataclass(frozen=True, config=STRICT)
 class Velocity:
-    """Of the vehicle."""
+    """Velocity of the vehicle."""
 
     fields: Fields
     unit: Literal["m/s", "cm/s", "mm/s", "km/h"] = "m/s"
@@ -76,19 +76,19 @@ class Velocity:
 
 @dataclass(frozen=True, config=STRICT)
 class Attitude:
-    """Of the vehicle in the world."""
+    """Attitude of the vehicle in the world."""
 
     fields: Fields
     form: Literal["xyzw", "wxyz", "matrix", "roll pitch yaw", "rotation vector"]
     """Order of a quaternion; a rotation matrix row by row; angles about the axes x, y, z; or an axis times an angle."""
     unit: Literal["rad", "deg"] = "rad"
-    """Of angles."""
+    """Unit of angles."""
     turns: Literal["body to world", "world to body"] = "body to world"
     world: World | None = None
-    """Axes of the world that the attitude refers to, if they are not those of [frames]."""
+    """Axes of the world to which the attitude refers, if they are not those of [frames]."""
     body: Body | None = None
     heading: Annotated[float, Field(ge=-360.0, le=360.0, strict=True)] = 0.0
-    """By which it is turned about the vertical, counter-clockwise from above, to agree with the positions [deg]."""
+    """Rotation about the vertical that aligns the attitudes with the positions, counter-clockwise from above [deg]."""
     valid: Flags = ()
     resets: Flags = ()
 
@@ -99,18 +99,18 @@ class Thrust:
 
     fields: Fields
     unit: Literal["m/s^2", "g", "N", "share"]
-    """Mass-normalised; in newtons; or a share of the autopilot's own scale."""
+    """Mass-normalised (m/s^2, g); in newtons; or a share of the autopilot's own scale."""
     positive: Literal["up", "down"] = "up"
     mass: Positive | None = None
-    """[kg], for newtons."""
+    """Mass for the unit N [kg]."""
     hover: Positive | Name | None = None
-    """For a share: the share at hover, or the field that holds it; by default it is found from the flight."""
+    """For a share: the share at hover, or the field that holds it; by default it is estimated from the flight."""
     full: Positive = 1.0
-    """For a share: the number that stands for all of the thrust, as 65535."""
+    """For a share: the number for full thrust, for example 65535."""
 
     @property
     def scale(self) -> float | None:
-        """Mass-normalised thrust of one unit [m/s^2]; None for a share, which the flight or ``hover`` tells."""
+        """Mass-normalised thrust of one unit [m/s^2]; None for a share: the flight or ``hover`` gives its scale."""
         return {"m/s^2": 1.0, "g": ACCELERATIONS["g"], "N": 1.0 / (self.mass or 1.0)}.get(self.unit)
 
     @property
@@ -131,12 +131,12 @@ class Thrust:
 
 @dataclass(frozen=True, config=STRICT)
 class BodyRates:
-    """Commanded or measured."""
+    """Commanded or measured body rates."""
 
     fields: Fields
     unit: Literal["rad/s", "deg/s", "mrad/s"] = "rad/s"
     optional: bool = False
-    """Whether the log is read without them if it has no such field."""
+    """Whether the log may be read without them if it does not contain the field."""
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -147,22 +147,22 @@ class Acceleration:
     unit: Literal["m/s^2", "g"] = "m/s^2"
     axes: Literal["world", "body"] = "body"
     gravity: Literal["felt", "removed"] = "felt"
-    """Felt, as by an accelerometer, which shows one g upwards at rest; or removed, the derivative of the velocity."""
+    """Specific force of an accelerometer (felt), one g upwards at rest; or the derivative of the velocity (removed)."""
 
 
 @dataclass(frozen=True, config=STRICT)
 class Landed:
-    """Fields that are not zero while the vehicle is on the ground, if the log has them."""
+    """Fields that are not zero while the vehicle is on the ground, if the log contains them."""
 
     fields: Flags
 
 
 @dataclass(frozen=True, config=STRICT)
 class Frames:
-    """Axes of the log, each by the first letter of where x, y and z point."""
+    """Axes of the log; three letters for the directions of x, y and z."""
 
     world: World = "ENU"
-    """East, north, up; NED; NWU; EUS for y upwards; which way is north does not matter."""
+    """East, north, up; NED; NWU; EUS for y upwards; the direction of north is arbitrary."""
     body: Body = "FLU"
     """Forward, left, up; FRD: forward, right, down; RFU; and so on."""
 
@@ -175,7 +175,7 @@ class Frames:
 
 @dataclass(frozen=True, config=STRICT)
 class Part:
-    """Which part of the log is used [s] since its beginning."""
+    """Part of the log that is used, since its beginning [s]."""
 
     start: Seconds = 0.0
     end: Seconds | None = None
@@ -183,7 +183,7 @@ class Part:
 
 @dataclass(frozen=True, config=STRICT)
 class LogMap:
-    """Which field of a log is what."""
+    """Map of a log's fields to quantities."""
 
     attitude: Attitude
     thrust: Thrust
@@ -194,7 +194,7 @@ class LogMap:
     rates: BodyRates | None = None
     """Commanded body rates."""
     measured_rates: BodyRates | None = None
-    """From a gyroscope; by default they follow from the attitudes."""
+    """Rates of a gyroscope; by default they are derived from the attitudes."""
     acceleration: Acceleration | None = None
     landed: Landed | None = None
     time: Time | None = None

@@ -1,4 +1,4 @@
-"""Marks of an autopilot in its log: validity of the estimates, resets of the estimator, and landing."""
+"""Reads the marks of an autopilot in its log: validity of estimates, resets of the estimator, and landing."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,14 +13,14 @@ QUANTITIES = ("position", "velocity", "attitude")
 
 @dataclass(frozen=True)
 class Marks:
-    """On the ticks of a grid."""
+    """Marks on the ticks of a grid."""
 
     holds: Mapping[str, np.ndarray]
-    """Where a quantity holds, (n,); quantities without flags are not in it."""
+    """Ticks at which a quantity is valid, (n,); quantities without flags are absent."""
     resets: Mapping[str, np.ndarray]
-    """Where a quantity was reset since the tick before, (n,)."""
+    """Ticks at which a quantity was reset since the previous tick, (n,)."""
     landed: np.ndarray
-    """Where the vehicle is on the ground, (n,); nowhere if the log does not say."""
+    """Ticks at which the vehicle is on the ground, (n,); all false if the log has no such field."""
 
 
 def marks_of(log_map: LogMap, series: Mapping[str, Series], t: np.ndarray) -> Marks:
@@ -47,7 +47,7 @@ def marks_of(log_map: LogMap, series: Mapping[str, Series], t: np.ndarray) -> Ma
 
 
 def _around(series: Series, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the values of the samples before, or at, each time and after, or at, it."""
+    """Return the values of the samples at or before each time, and at or after it."""
     last = len(series.t) - 1
     before = np.clip(np.searchsorted(series.t, t, side="right") - 1, 0, last)
     after = np.clip(np.searchsorted(series.t, t, side="left"), 0, last)
@@ -55,6 +55,6 @@ def _around(series: Series, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _true(values: np.ndarray, field: str) -> np.ndarray:
-    """Return where a flag is set: not zero, or the number that its field is compared with, as ``state==1``."""
+    """Return where a flag is set: not zero, or equal to the number in its field, for example ``state==1``."""
     number = field.partition("==")[2]
     return np.asarray(values == float(number) if number else values != 0.0)

@@ -1,4 +1,4 @@
-"""Times of the messages of a bag: their own stamps where they have some, all on one clock."""
+"""Determines the times of the messages of a bag, on one clock; their own stamps are used if they exist."""
 
 from collections.abc import Mapping
 from operator import attrgetter
@@ -9,19 +9,19 @@ import numpy as np
 from .series import Clock
 
 MICROSECOND, NANOSECOND = 1e-6, 1e-9
-APART = 1.0  # [s] between clocks that are not the same
-FEWEST, AROUND = 50, 0.5  # messages, and [s] around each, that tell how late it was
+APART = 1.0  # difference above which two clocks are not the same [s]
+FEWEST, AROUND = 50, 0.5  # minimum number of messages, and time around each [s], from which its delay is estimated
 EVEN, LOST = (
     3.0,
     0.5,
-)  # turns by which messages of an even rate are late at most, and the promptest ones if none is lost
-EARLY = 5.0  # percentile of delays that counts as the delay of a message that is not held up
+)  # upper limits in periods, for an even rate: delay of messages, and of the earliest ones if no message is lost
+EARLY = 5.0  # percentile of delays that counts as the delay of a message without a wait
 
 
 def stamp_of(message: Any, time: Clock | None) -> float:
-    """Return the time of a message by itself [s]: of the map's field, of the header, of PX4.
+    """Return the message's own time [s]: from the map's field, the header or the stamps of PX4.
 
-    Zero is a stamp that was not set, or the beginning of a simulation; NaN is that of a message without a stamp.
+    Zero is an unset stamp, or the beginning of a simulation; NaN means that the message has no stamp.
     """
     found = float("nan")
     stamps = [] if time is None else [(time.field, time.scale)]
@@ -45,11 +45,11 @@ def stamp_of(message: Any, time: Clock | None) -> float:
 def on_one_time(stamps: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray], list[str]]:
     """Return the times of each topic on one clock, and notes.
 
-    A topic whose messages have no stamp has the times of reception. Where others are stamped by another clock, as that
-    of an autopilot since it started, they are brought to the clock of the recorder by the messages that came first.
+    A topic whose messages have no stamp gets the times of reception. If other topics are stamped by another clock, for
+    example the uptime of an autopilot, they are shifted to the clock of the recorder by their earliest messages.
 
     Args:
-        stamps: Of each topic, stamp (NaN without one) and reception of each message [s], (n, 2).
+        stamps: Stamp (NaN if absent) and reception of each message [s], (n, 2), by topic.
     """
     times, notes, ahead = dict[str, np.ndarray](), list[str](), dict[str, float]()
     for topic, both in stamps.items():
@@ -72,10 +72,10 @@ def on_one_time(stamps: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray]
 
 
 def evenly(received: np.ndarray) -> tuple[np.ndarray, bool]:
-    """Return when messages of an even rate were sent, but for the shortest delay, and whether their rate is even.
+    """Return the send times of messages with an even rate, up to the shortest delay, and whether the rate is even.
 
-    A message is held up, but never early: of those around it, the one that came first for its turn tells when each was
-    sent. Where the rate is not even, or messages are lost, the times of reception are returned.
+    A message may be late but never early. The neighbour with the smallest delay therefore determines the send times of
+    the messages around it. If the rate is not even, or messages are lost, the times of reception are returned.
     """
     n = len(received)
     if n < FEWEST:
@@ -86,7 +86,7 @@ def evenly(received: np.ndarray) -> tuple[np.ndarray, bool]:
     reach = max(1, round(AROUND / slope)) if slope > 0.0 else n
     if reach >= n or np.ptp(late) > EVEN * slope:
         return received, False
-    from scipy.ndimage import minimum_filter1d, uniform_filter1d  # here: they take as long to import as all of retrim
+    from scipy.ndimage import minimum_filter1d, uniform_filter1d  # local: they take as long to import as all of retrim
 
     least = minimum_filter1d(late, 2 * reach + 1, mode="nearest")
     if np.ptp(least) > LOST * slope:

@@ -1,4 +1,4 @@
-"""Maps by name, TOML files beside this one: of what retrim and usual autopilots write."""
+"""Maps by name, TOML files in the folder ``maps``, for logs of retrim and of usual autopilots."""
 
 import tomllib
 from functools import cache
@@ -15,7 +15,7 @@ USUAL: dict[str, tuple[str, ...]] = {
     ".bag": ("mavros", "mavros-pose", "crazyswarm-ros"),
     ".mcap": ("retrim-mcap", "px4-dds", "px4-dds-1.13", "mavros", "mavros-pose", "crazyswarm-ros"),
 }
-"""What a log is taken for without a map, by the end of its name: the first that it has the fields of."""
+"""Default maps by file suffix; the first one whose fields exist in the log is used."""
 USUAL |= {".ulog": USUAL[".ulg"], ".db3": USUAL[".mcap"], "": USUAL[".mcap"]}
 
 

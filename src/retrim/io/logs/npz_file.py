@@ -1,4 +1,4 @@
-"""Logs as NPZ: arrays whose first axis is time, as `retrim fly` writes them."""
+"""Reads NPZ logs: arrays whose first axis is time, as written by `retrim fly`."""
 
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
@@ -13,7 +13,7 @@ from .series import Clock, Series, first_of, missing_field, sign_of
 def read_npz(
     path: Path, wanted: Mapping[str, Sequence[str]], time: Clock | None, optional: Collection[str] = ()
 ) -> tuple[dict[str, Series], list[str]]:
-    """Read the arrays of an NPZ file; ``u[1:4]`` are columns of one. See :class:`~retrim.io.logs.series.LogReader`."""
+    """Read the arrays of an NPZ file; ``u[1:4]`` selects columns. See :class:`~retrim.io.logs.series.LogReader`."""
     if time is None:
         raise LogError(f'{path}: an NPZ file needs a table [time] in the map, as field = "t" and unit = "s"')
     arrays = NpzMembers(path)
@@ -34,7 +34,7 @@ def read_npz(
 
 
 def _flat(path: Path, name: str, arrays: NpzMembers) -> np.ndarray:
-    """Return an array as samples x columns."""
+    """Return an array of samples x columns."""
     base, _, part = name.partition("[")
     if base not in arrays:
         raise missing_field(path, base, list(arrays))

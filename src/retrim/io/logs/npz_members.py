@@ -1,4 +1,4 @@
-"""Arrays of an NPZ file, each read when it is looked up, and its size before that."""
+"""Arrays of an NPZ file; each is read when it is accessed, after a check of its size."""
 
 import math
 import zipfile
@@ -12,31 +12,31 @@ from numpy.lib import format as npy
 from ...errors import LogError, excerpt
 
 MAX_MEMBER = 512 * 2**20
-"""Bytes of an array, unpacked: 45 minutes at 1 kHz of an attitude's nine numbers are 200 MB."""
+"""Maximum unpacked size of an array [bytes]: 45 minutes at 1 kHz of an attitude's nine numbers are 200 MB."""
 SUFFIX = ".npy"
 
 
 class NpzMembers(Mapping[str, Any]):
-    """The arrays of a file by name. A member that nobody looks up is not unpacked, however large it is."""
+    """The arrays of a file by name. A member that is not accessed is not unpacked, whatever its size."""
 
     def __init__(self, path: Path) -> None:
         """Read the table of members.
 
         Raises:
-            LogError: The file is no NPZ file.
+            LogError: The file is not an NPZ file.
         """
         self._path = path
         try:
             with zipfile.ZipFile(path) as archive:
                 self._members = {each.filename.removesuffix(SUFFIX): each for each in archive.infolist()}
-        except Exception as error:  # whatever its parser meets in bytes that are no archive
+        except Exception as error:  # the parser raises various errors for bytes that are not an archive
             raise self._unreadable(error) from error
 
     def __getitem__(self, name: str) -> np.ndarray:
         """Return an array.
 
         Raises:
-            LogError: It is larger than accepted, damaged, or no array of numbers.
+            LogError: It is too large, damaged, or not an array of numbers.
         """
         member = self._members[name]
         if member.file_size > MAX_MEMBER:
@@ -63,7 +63,7 @@ class NpzMembers(Mapping[str, Any]):
 
 
 def _array(file: Any, size: int) -> np.ndarray:
-    """Read an array whose head may say anything of its shape."""
+    """Read an array; its header may contain an arbitrary shape, which is validated."""
     read = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
     version = npy.read_magic(file)
     if version not in read:

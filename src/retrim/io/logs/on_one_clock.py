@@ -1,4 +1,4 @@
-"""What a map says of series: states and commands on one clock, in the frames and units of this package."""
+"""Applies a map to series: states and commands on one clock, in the frames and units of retrim."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,11 +16,11 @@ from .series import Series
 
 UP = np.array([0.0, 0.0, STANDARD_GRAVITY])
 STATES = ("position", "velocity", "attitude")
-SLOWEST = 0.1  # [s]: states that come more rarely say nothing of accelerations, and no preset has such a tick
-SHORTEST = 2e-5  # [s]: no state comes so often
-ROUNDING = 0.045  # share by which a logger that is set to ten samples a second may miss them
-LONGEST = 5_000_000  # ticks of a log: times that are this far apart are no times of one flight
-ALIKE = 0.02  # share by which the periods of a log and of the control differ that count as the same
+SLOWEST = 0.1  # [s]: slower states do not determine accelerations, and presets have no such tick
+SHORTEST = 2e-5  # [s]: states never come that often
+ROUNDING = 0.045  # relative deviation of a logger that is set to ten samples a second
+LONGEST = 5_000_000  # maximum number of ticks: times with a larger span do not belong to one flight
+ALIKE = 0.02  # relative difference of the periods of log and control up to which they count as equal
 COMMAND_HELD = 0.5  # [s]: some autopilots publish a command only when it changes
 
 
@@ -35,31 +35,31 @@ class Ticks:
     a: np.ndarray
     rates: np.ndarray
     thrust: np.ndarray
-    """In the unit of the map; a share is still one; upwards."""
+    """Thrust in the unit of the map, upwards; a share is not converted."""
     command: np.ndarray | None
     known: np.ndarray
-    """Where all of these are."""
+    """Ticks at which all of these quantities are known."""
     hover: np.ndarray | None
     dt: float
     gyroscope: bool
-    """Whether the rates are measured, not those of the attitudes."""
+    """Whether the rates are measured instead of derived from the attitudes."""
 
 
 @dataclass(frozen=True)
 class Grid:
-    """The clock."""
+    """The common clock of a log."""
 
     t: np.ndarray
     dt: float
     sampled: bool
-    """Whether these are the times of the states themselves."""
+    """Whether these are the original times of the states."""
 
 
 def grid_of(path: Path, series: dict[str, Series], part: maps.Part, dt: float) -> Grid:
     """Return the clock on which a log is read.
 
     Raises:
-        LogError: States come too rarely, or the quantities have no time in common.
+        LogError: States come too rarely, or the quantities do not overlap in time.
     """
     states = [name for name in STATES if name in series]
     own = max(period(series[name]) for name in states)
@@ -72,7 +72,7 @@ def grid_of(path: Path, series: dict[str, Series], part: maps.Part, dt: float) -
         )
     if own < SHORTEST:
         raise LogError(f"{path}: {slowest} comes every {own:.3g} s; is time in ms, us or ns?")
-    needed = {name: each for name, each in series.items() if " " not in name}  # marks hold before and after
+    needed = {name: each for name, each in series.items() if " " not in name}  # marks also hold before and after
     zero = min(each.t[0] for each in needed.values())
     first = max(max(each.t[0] for each in needed.values()), zero + part.start)
     last = min(min(series[name].t[-1] for name in states), np.inf if part.end is None else zero + part.end)
@@ -91,10 +91,10 @@ def grid_of(path: Path, series: dict[str, Series], part: maps.Part, dt: float) -
 
 
 def on_one_clock(path: Path, log_map: LogMap, series: dict[str, Series], grid: Grid) -> Ticks:
-    """Return what the map says of the series.
+    """Return the series on a grid, converted by the map.
 
     Raises:
-        LogError: A quantity has the wrong number of columns, or is no attitude.
+        LogError: A quantity has the wrong number of columns, or is not an attitude.
     """
     W, B = to_world(log_map.frames.world), to_body(log_map.frames.body)
     t, dt = grid.t, grid.dt
@@ -142,21 +142,21 @@ def on_one_clock(path: Path, log_map: LogMap, series: dict[str, Series], grid: G
 
 
 def _speed(log_map: LogMap) -> float:
-    """Return how many m/s a unit of velocity is; a velocity that is not in the log is in the unit of the position."""
+    """Return the m/s per unit of velocity; a velocity that is not in the log is in the unit of the position."""
     if log_map.velocity is not None:
         return maps.SPEEDS[log_map.velocity.unit]
     return 1.0 if log_map.position is None else maps.METRES[log_map.position.unit]
 
 
 def _told(command: Series, grid: Grid) -> np.ndarray:
-    """Return a command at each tick: its sample, or if it has times of its own the mean over the tick."""
+    """Return a command at each tick: its sample, or the mean over the tick if the command has times of its own."""
     sampled = grid.sampled and np.array_equal(np.intersect1d(command.t, grid.t), grid.t)
     return held(command, grid.t) if sampled else held_mean(command, grid.t, grid.dt)
 
 
 def turning(R: np.ndarray, dt: float) -> np.ndarray:
-    """Return the body rates between attitudes on a grid, central, [rad/s]."""
-    from scipy.spatial.transform import Rotation  # here: it takes as long to import as all of retrim
+    """Return the body rates from central differences of attitudes on a grid [rad/s]."""
+    from scipy.spatial.transform import Rotation  # local, because it takes as long to import as all of retrim
 
     before, after = np.concatenate([R[:1], R[:-1]]), np.concatenate([R[1:], R[-1:]])
     span = np.full(len(R), 2.0 * dt)
@@ -166,7 +166,7 @@ def turning(R: np.ndarray, dt: float) -> np.ndarray:
 
 
 def _columns(path: Path, name: str, series: dict[str, Series]) -> Series:
-    """Return a series after a look at how many columns it has."""
+    """Return a series after a check of its number of columns."""
     wanted, found = {"thrust": 1, "hover": 1}.get(name, 3), series[name].values.shape[1]
     if name != "attitude" and found != wanted:
         hint = "; add the motors' thrusts up into one column" if name == "thrust" and found == 4 else ""

@@ -1,4 +1,4 @@
-"""Maps that differ from one in one statement, in words: what may have been meant."""
+"""Generates maps that differ from a given one in one statement, with text: candidates for the intended map."""
 
 import dataclasses
 import math
@@ -20,16 +20,16 @@ STATEMENTS = (
 
 
 class Other(NamedTuple):
-    """Another way to read a log."""
+    """An alternative map of a log."""
 
     words: str
-    """The statement of the map that says so."""
+    """Text of the map's changed statement."""
     log_map: LogMap
     turns: Mapping[str, np.ndarray]
-    """By which the columns of quantities are multiplied from the right."""
+    """Matrices that multiply the columns of quantities from the right."""
 
     def applied(self, series: Mapping[str, Series]) -> dict[str, Series]:
-        """Return the series as they are then."""
+        """Return the series after multiplication with ``turns``."""
         return {
             name: Series(each.t, each.values @ self.turns[name]) if name in self.turns else each
             for name, each in series.items()
@@ -53,7 +53,7 @@ def others(chosen: LogMap) -> Iterator[Other]:
 
 
 def with_heading(chosen: LogMap, degrees: float) -> Other:
-    """Return a map whose attitudes are turned further about the vertical."""
+    """Return a map with an additional rotation of the attitudes about the vertical."""
     heading = math.remainder(chosen.attitude.heading + round(degrees), 360.0)
     attitude = dataclasses.replace(chosen.attitude, heading=heading)
     return Other(f"attitude.heading = {heading:.0f}", dataclasses.replace(chosen, attitude=attitude), {})
@@ -81,14 +81,14 @@ def _frames(chosen: LogMap) -> Iterator[Other]:
 
 
 def _differences(table: str, old: tuple[str, str], new: tuple[str, str]) -> str:
-    """Return the axes that differ, as a map writes them."""
+    """Return the axes that differ, in the syntax of a map."""
     names = ("world", "body")
     said = [f'{table}.{name} = "{b}"' for name, a, b in zip(names, old, new, strict=True) if a != b]
     return " and ".join(said)
 
 
 def turned_about_z(name: str, letters: str) -> list[str]:
-    """Return the other axes that point upwards, or downwards, as the last of some do, and have the same hand."""
+    """Return other axes with the same vertical last axis and the same handedness."""
     if name[2] not in "UD":
         return []
     around = [letters[k] + letters[(k + step) % 4] + name[2] for k in range(4) for step in (1, 3)]
@@ -96,17 +96,17 @@ def turned_about_z(name: str, letters: str) -> list[str]:
 
 
 def other_world(name: str) -> str:
-    """Return the usual world whose z points the other way."""
+    """Return the usual world with the opposite direction of z."""
     return "NED" if "U" in name else "ENU"
 
 
 def other_body(name: str) -> str:
-    """Return the usual body whose z points the other way."""
+    """Return the usual body with the opposite direction of z."""
     return "FRD" if "U" in name else "FLU"
 
 
 def _signs(chosen: LogMap) -> Iterator[Other]:
-    """Other signs of the numbers of a quantity; and x and y in each other's place."""
+    """Return maps with other signs of a quantity's numbers, and with x and y exchanged."""
     for table in ("position", "velocity", "attitude", "rates", "measured_rates"):
         spec: Any = getattr(chosen, table)
         if spec is None or (table == "attitude" and spec.form in ("matrix", "rotation vector")):
@@ -114,7 +114,7 @@ def _signs(chosen: LogMap) -> Iterator[Other]:
         quaternion = table == "attitude" and spec.form in ("xyzw", "wxyz")
         for signs in SIGNS:
             if quaternion and signs == (-1, -1, -1):
-                continue  # the inverse, which `turns` says
+                continue  # this is the inverse, which `turns` covers
             row = signs if not quaternion else (*signs, 1) if spec.form == "xyzw" else (1, *signs)
             yield _arranged(chosen, table, range(len(row)), row)
         if table == "attitude" and not quaternion:
@@ -126,7 +126,7 @@ def _signs(chosen: LogMap) -> Iterator[Other]:
 
 
 def _arranged(chosen: LogMap, table: str, order: Sequence[int], signs: Sequence[int]) -> Other:
-    """Return a map whose fields stand in another order, each with a sign."""
+    """Return a map with the fields in another order, each with a sign."""
     spec: Any = getattr(chosen, table)
     turn = np.zeros((len(order), len(order)))
     for column, (row, sign) in enumerate(zip(order, signs, strict=True)):
@@ -149,5 +149,5 @@ def _values(spec: Any, key: str) -> tuple[Any, ...]:
 def _with(chosen: LogMap, table: str, key: str, value: Any) -> LogMap:
     changes = {key: value} | (
         {"mass": None, "hover": None, "full": 1.0} if table == "thrust" else {}
-    )  # what goes with one unit only
+    )  # these belong to one unit only
     return dataclasses.replace(chosen, **{table: dataclasses.replace(getattr(chosen, table), **changes)})

@@ -1,8 +1,8 @@
-"""Does a log agree with itself? Mistakes of units, frames and signs are told by the map with which it would.
+"""Checks the consistency of a log, and finds mistakes of units, frames and signs in its map.
 
-Where figures of :mod:`retrim.io.logs.agreement` are low, every map that differs in one statement is tried, and one with
-which the log agrees far better is named. A log that contradicts itself with every map is refused; one that agrees badly
-is read with a warning.
+If figures of :mod:`retrim.io.logs.agreement` are low, every map that differs in one statement is tried. If the log
+agrees far better with one of them, the error names that map. A log that is inconsistent with every map is refused. A
+log with low agreement is read with a warning.
 """
 
 from collections.abc import Callable
@@ -16,13 +16,13 @@ from .log_map import LogMap
 from .on_one_clock import Ticks
 from .other_maps import Other, others, with_heading
 
-SUSPECT = 0.05  # share that is not explained above which other maps are tried
-BETTER, AGREES = 5.0, 0.75  # one of them must leave so much less, and explain at least that
-PART = 3000  # ticks of a long log with which other maps are tried
+SUSPECT = 0.05  # unexplained share above which other maps are tried
+BETTER, AGREES = 5.0, 0.75  # required of another map: factor of the reduced remainder, and least agreement
+PART = 3000  # number of ticks of a long log that are used to try other maps
 REFUSED = {"motion": 0.0, "lift": 0.0, "thrust": 0.0, "turning": -0.3, "gyroscope": -0.3}
-"""Below these a log is refused."""
+"""Agreement below which a log is refused."""
 DOUBTFUL = {"motion": 0.75, "lift": 0.5, "thrust": 0.65, "climb": 0.25, "turning": 0.5, "gyroscope": 0.75}
-"""Below these a report begins with a warning."""
+"""Agreement below which a report begins with a warning."""
 
 
 def check_plausible(
@@ -31,17 +31,17 @@ def check_plausible(
     """Check that the quantities of a log agree with each other.
 
     Args:
-        path: For messages.
+        path: File of the log, for messages.
         chosen: The map.
-        ticks: The log, read with it.
+        ticks: The log, read with the map.
         read: Reads a part of the log with another map.
-        valid: Which ticks count.
+        valid: Mask of the ticks that are used.
 
     Returns:
-        The figures, 1 for entire agreement, and a warning for each that is low.
+        The figures of agreement, 1 for complete agreement, and a warning for each low one.
 
     Raises:
-        LogError: They do not; the message names the statement of the map that is wrong, if one is.
+        LogError: The quantities do not agree; the message names the wrong statement of the map, if there is one.
     """
     scores = agreement(chosen, ticks, valid)
     wrong = {name: score for name, score in scores.items() if score < 1.0 - SUSPECT and name != "climb"}
@@ -61,7 +61,7 @@ def check_plausible(
 
 
 def _mended(chosen: LogMap, read: Callable[[Other, slice], Ticks], valid: np.ndarray) -> str:
-    """Return what is wrong and the statement of the map that mends it best; nothing if none does."""
+    """Return the error and the statement of the map that corrects it best; an empty string if no statement does."""
     part = _part(valid)
     ticks = read(Other("", chosen, {}), part)
     scores = agreement(chosen, ticks, valid[part])
@@ -84,7 +84,7 @@ def _mended(chosen: LogMap, read: Callable[[Other, slice], Ticks], valid: np.nda
 
 
 def _part(valid: np.ndarray) -> slice:
-    """Return the part of a long log with the most flight: it tells as much of a map as all of it."""
+    """Return the part of a long log with the most flight, which is sufficient to check a map."""
     if len(valid) <= PART:
         return slice(0, len(valid))
     flight = np.concatenate([[0], np.cumsum(valid)])

@@ -1,4 +1,4 @@
-"""The quantities that a map names, as they are in the file: series in order, and which map that was."""
+"""Reads the quantities that a map names from a file: series in order of time, and the map that was used."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -21,9 +21,9 @@ READERS: dict[str, LogReader] = {
     ".csv": read_csv, ".tsv": read_csv, ".txt": read_csv, ".npz": read_npz, ".ulg": read_ulog, ".ulog": read_ulog,
     ".bag": read_bag, ".mcap": read_bag, ".db3": read_bag,
 }  # fmt: skip
-"""By the end of the name; a folder is a bag of ROS 2."""
+"""Readers by file suffix; a folder is a bag of ROS 2."""
 MOST_BYTES = 2 * 2**30, 256 * 2**20
-"""Of a log, and of one that is text."""
+"""Maximum size of a log, and of a text log [bytes]."""
 CONVERTERS = {
     ".bbl": "blackbox_decode of blackbox-tools makes a CSV of it",
     ".bfl": "blackbox_decode of blackbox-tools makes a CSV of it",
@@ -41,16 +41,16 @@ FLAGS = ("valid", "resets")
 def read_quantities(path: Path, log_map: LogMap | None) -> tuple[dict[str, Series], LogMap, list[str]]:
     """Return the series of a log, the map that it was read with, and notes.
 
-    Beside the quantities there are ``<quantity> valid <k>``, ``<quantity> resets <k>`` and ``landed <k>``, and a
-    velocity without one in the log.
+    In addition to the quantities, the series contain ``<quantity> valid <k>``, ``<quantity> resets <k>`` and
+    ``landed <k>``, and a derived velocity if the log has none.
 
     Raises:
-        LogError: The file cannot be read, or a field is not there.
+        LogError: The file cannot be read, or a field is missing.
     """
     reader = _reader(path)
     raw, chosen, notes = _read(path, reader, log_map)
     age, clock = raw.pop("age", None), _clock(chosen)
-    if age is not None and clock is not None:  # as old as the log says, they were true earlier
+    if age is not None and clock is not None:  # the states were measured earlier, by the logged age
         for name in ("position", "velocity", "attitude"):
             if name in raw:
                 raw[name] = Series(raw[name].t - clock.scale * age.values[:, 0], raw[name].values)
@@ -61,7 +61,7 @@ def read_quantities(path: Path, log_map: LogMap | None) -> tuple[dict[str, Serie
             notes.append(f"{name} are {what} throughout, and are not used")
     series = dict[str, Series]()
     for name, each in raw.items():
-        if " " in name:  # a mark, which may have been told once
+        if " " in name:  # a mark, which may have a single sample
             order = np.argsort(each.t, kind="stable")
             series[name] = Series(each.t[order], each.values[order])
             continue
@@ -76,7 +76,7 @@ def read_quantities(path: Path, log_map: LogMap | None) -> tuple[dict[str, Serie
             path, _valid(series, "position"), METRES[getattr(chosen.position, "unit", "m")]
         )
         notes.append(said)
-        for name in ("position", "attitude"):  # the ends have no velocity
+        for name in ("position", "attitude"):  # the derivative does not exist at the ends
             there = np.isin(series[name].t, series["velocity"].t)
             if np.sum(there) == len(series["velocity"].t):
                 series[name] = Series(series[name].t[there], series[name].values[there])
@@ -102,7 +102,7 @@ def _read(path: Path, reader: LogReader, log_map: LogMap | None) -> tuple[dict[s
 
 
 def _wanted(chosen: LogMap) -> tuple[dict[str, tuple[str, ...]], set[str]]:
-    """Return the fields of each quantity and mark, and which of these may be missing."""
+    """Return the fields of each quantity and mark, and the set of optional ones."""
     wanted, optional = dict[str, tuple[str, ...]](), set[str]()
     marks = dict[str, tuple[str, ...]]()
     for name in QUANTITIES:
@@ -130,7 +130,7 @@ def _clock(chosen: LogMap) -> Clock | None:
 
 
 def _valid(series: dict[str, Series], name: str) -> Series:
-    """Return the samples of a quantity that its flags at the same times do not call invalid."""
+    """Return the samples of a quantity without those that its flags mark as invalid at the same time."""
     found = series[name]
     keep = np.ones(len(found.t), dtype=bool)
     for other, flag in series.items():

@@ -1,6 +1,6 @@
-"""A flight as files for others: MCAP with messages of ROS 2, and the same as NPZ.
+"""Writes a flight as files for other programs: MCAP with messages of ROS 2, and NPZ with the same data.
 
-Foxglove, PlotJuggler, rerun and ``ros2 bag`` open MCAP; it needs the extra ``mcap``. ``retrim replay`` reads both.
+Foxglove, PlotJuggler, rerun and ``ros2 bag`` open MCAP. It needs the extra ``mcap``. ``retrim replay`` reads both.
 """
 
 import tempfile
@@ -19,32 +19,32 @@ FRAME = "world"
 
 @dataclass(frozen=True)
 class Recording:
-    """Ticks and events of a flight; states are p [m], R by rows, v [m/s], world."""
+    """Ticks and events of a flight; states are p [m], R row by row, v [m/s], world."""
 
     t: np.ndarray
     """Times since the start [s], (n,)."""
     measured: np.ndarray
-    """What the pilot was shown, (n, 15)."""
+    """States that the pilot received, (n, 15)."""
     true: np.ndarray
-    """(n, 15)"""
+    """True states, (n, 15)."""
     age: np.ndarray
-    """How old what was shown is [s], (n,)."""
+    """Age of the received states [s], (n,)."""
     command: np.ndarray
-    """The command that follows: c [m/s^2], omega [rad/s], (n, 4)."""
+    """Resulting command: c [m/s^2], omega [rad/s], (n, 4)."""
     error: np.ndarray
     """The task's error [m], (n,)."""
     target: np.ndarray | None = None
-    """Where the vehicle should have been, world [m], (n, 3)."""
+    """Target position of the vehicle, world [m], (n, 3)."""
     flown_by: Sequence[str] | None = None
-    """Who flew, (n,)."""
+    """Controller that commanded the vehicle, (n,)."""
     policy_age: np.ndarray | None = None
-    """How old the flight is that the policy was learnt from [s], (n,)."""
+    """Age of the flight data from which the policy was learned [s], (n,)."""
     events: Sequence[Event] = ()
     terminated: bool = False
 
 
 def write_npz(path: Path, flight: Recording) -> None:
-    """Write arrays over time; the file appears when it is whole."""
+    """Write arrays over time; the file appears once it is complete."""
     arrays = {"t": flight.t, "u": flight.command, "age": flight.age, "error": flight.error}
     for end, x in (("", flight.true), ("_measured", flight.measured)):
         arrays |= {f"p{end}": x[:, :3], f"R{end}": x[:, 3:12].reshape(-1, 3, 3), f"v{end}": x[:, 12:15]}
@@ -54,10 +54,10 @@ def write_npz(path: Path, flight: Recording) -> None:
 
 
 def write_mcap(path: Path, flight: Recording) -> None:
-    """Write messages of ROS 2; the file appears when it is whole.
+    """Write messages of ROS 2; the file appears once it is complete.
 
-    Times are those of the flight. Where the first states were true before it began, all are later, so that no stamp is
-    before zero; nor at zero, which to readers of ROS is no stamp.
+    Times are those of the flight. If the first states were measured before its beginning, all times are shifted to
+    later ones. Stamps are then not negative, and not zero, which readers of ROS treat as a missing stamp.
     """
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
@@ -79,7 +79,7 @@ def write_mcap(path: Path, flight: Recording) -> None:
             later = 0.0 if first == 0.0 else 1e-9 - first
             for k, t in enumerate((flight.t + later).tolist()):
                 x, truth, u = flight.measured[k], flight.true[k], flight.command[k]
-                seen = t - float(flight.age[k])  # the header says when a state was true, the log when it came
+                seen = t - float(flight.age[k])  # the header has the time of the state, the log that of its arrival
                 add("/measured/pose", t, make.pose(seen, x, turned[0][k]))
                 add("/measured/velocity", t, make.twist(seen, x[12:15], np.zeros(3)))
                 add("/true/pose", t, make.pose(t, truth, turned[1][k]))
@@ -99,14 +99,14 @@ def write_mcap(path: Path, flight: Recording) -> None:
 
 def quaternions(x: np.ndarray) -> np.ndarray:
     """Return the attitudes of states as quaternions x, y, z, w, (n, 4)."""
-    from scipy.spatial.transform import Rotation  # here: it takes as long to import as all of retrim
+    from scipy.spatial.transform import Rotation  # local, because it takes as long to import as all of retrim
 
     found: np.ndarray = Rotation.from_matrix(x[:, 3:12].reshape(-1, 3, 3)).as_quat()
     return found
 
 
 class _Messages:
-    """Messages of ROS 2; thrust is in linear.z of a command [m/s^2], body rates are its angular part [rad/s]."""
+    """Builds messages of ROS 2; a command has the thrust in linear.z [m/s^2] and body rates in angular [rad/s]."""
 
     def __init__(self, types: Any) -> None:
         self._types = types

@@ -1,6 +1,6 @@
-"""A flight as a file of the rerun viewer: the vehicle in 3-D beside its error, commands and events.
+"""Writes a flight as a file of the rerun viewer: the vehicle in 3-D, and plots of error, commands and events.
 
-It needs the extra ``rerun``. All data lie on one timeline, ``flight``, in seconds since its start.
+It needs the extra ``rerun``. All data are on one timeline, ``flight``, in seconds since its start.
 """
 
 import tempfile
@@ -13,12 +13,12 @@ import numpy as np
 
 from .recording import Recording, quaternions
 
-ARM = 0.1  # [m], of the cross that is drawn as the vehicle
+ARM = 0.1  # size of the cross that represents the vehicle [m]
 AXES = ("x", "y", "z")
 
 
 def write_rrd(path: Path, flight: Recording) -> None:
-    """Write a flight for rerun; the file appears when it is whole."""
+    """Write a flight for rerun; the file appears once it is complete."""
     import rerun as rr
     from rerun import blueprint as rrb
 
@@ -69,7 +69,7 @@ def _write(rr: Any, stream: Any, flight: Recording) -> None:
 
 
 def _told(flight: Recording) -> list[tuple[float, str]]:
-    """What happened, and each change of who flew, in the order of time [s]."""
+    """Return the events, and each change of the active controller, in order of time [s]."""
     told = [(event.t, f"{event.kind}: {event.note}") for event in flight.events]
     flown_by = flight.flown_by or ()
     before: str | None = None

@@ -1,4 +1,4 @@
-"""Series on one clock: states between samples by interpolation, commands held until the next."""
+"""Resamples series to one clock: states are interpolated, commands are held until the next sample."""
 
 import numpy as np
 
@@ -19,7 +19,7 @@ def known(series: Series, grid: np.ndarray, dt: float, *, held: float = 0.0) -> 
         series: Samples.
         grid: Times [s].
         dt: Period of the grid [s].
-        held: For a command: how long it holds at least without a new one [s].
+        held: For a command: minimum time for which it is held without a new sample [s].
     """
     longest = max(GAP * max(period(series), dt), held)
     after = np.searchsorted(series.t, grid, side="right")
@@ -41,7 +41,7 @@ def held(series: Series, grid: np.ndarray) -> np.ndarray:
 
 
 def held_mean(series: Series, grid: np.ndarray, dt: float) -> np.ndarray:
-    """Return the mean of a command over each tick that begins at a time of a grid; each value holds until the next."""
+    """Return the mean of a command over each tick that begins at a grid time; each value is held until the next."""
     steps = np.diff(series.t)[:, None]
     total = np.concatenate([np.zeros((1, series.values.shape[1])), np.cumsum(series.values[:-1] * steps, axis=0)])
     end = series.t[-1] + 2.0 * dt
@@ -52,21 +52,21 @@ def held_mean(series: Series, grid: np.ndarray, dt: float) -> np.ndarray:
 
 
 def turned(t: np.ndarray, R: np.ndarray, grid: np.ndarray) -> np.ndarray:
-    """Return attitudes at the times of a grid, on the shortest way between samples."""
-    from scipy.spatial.transform import Rotation, Slerp  # here: it takes as long to import as all of retrim
+    """Return attitudes at the times of a grid, interpolated along the shortest rotation between samples."""
+    from scipy.spatial.transform import Rotation, Slerp  # local, because it takes as long to import as all of retrim
 
     inside = np.clip(grid, t[0], t[-1])
     return np.asarray(Slerp(t, Rotation.from_matrix(R))(inside).as_matrix())
 
 
 def derivative(values: np.ndarray, dt: float) -> np.ndarray:
-    """Return the derivative of columns on a grid, by five points; two rows at each end repeat their neighbour."""
+    """Return the derivative of columns on a grid, from five points; two rows at each end repeat their neighbour."""
     inner = (values[:-4] - 8.0 * values[1:-3] + 8.0 * values[3:-1] - values[4:]) / (12.0 * dt)
     return np.concatenate([inner[:1], inner[:1], inner, inner[-1:], inner[-1:]])
 
 
 def smoothed(x: np.ndarray, rows: int) -> np.ndarray:
-    """Return the mean of a column over about ``rows`` rows around each; fewer at the ends."""
+    """Return the centred mean of a column over about ``rows`` rows; fewer at the ends."""
     kernel = np.ones(min(rows, len(x)))
     return np.asarray(np.convolve(x, kernel, mode="same") / np.convolve(np.ones(len(x)), kernel, mode="same"))
 
@@ -78,7 +78,7 @@ def around(valid: np.ndarray, reach: int) -> np.ndarray:
 
 
 def runs(flags: np.ndarray, length: int) -> np.ndarray:
-    """Return where flags are part of a run of at least that length."""
+    """Return where flags belong to a run of at least that length."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(int), [0]])))
     found = np.zeros(len(flags), dtype=bool)
     for first, last in zip(edges[::2], edges[1::2], strict=True):

@@ -1,7 +1,7 @@
-"""Bags of ROS 1 and ROS 2, and MCAP files with messages of ROS. Needs the extra ``logs``.
+"""Reads bags of ROS 1 and ROS 2, and MCAP files with messages of ROS. Needs the extra ``logs``.
 
-A field is a topic and a path in its messages, as ``/odom.pose.pose.position``; vectors and quaternions are read whole,
-and ``[0]`` is an element of an array. ``*`` in a topic stands for any letters.
+A field is a topic and a path in its messages, for example ``/odom.pose.pose.position``. Vectors and quaternions are
+read as a whole; ``[0]`` selects an element of an array. ``*`` in a topic matches any characters.
 """
 
 import re
@@ -23,7 +23,7 @@ ORDER = ("x", "y", "z", "w")
 
 
 class Place(NamedTuple):
-    """Where a field is."""
+    """Location of a field."""
 
     topic: str
     inner: str
@@ -34,7 +34,7 @@ def read_bag(
 ) -> tuple[dict[str, Series], list[str]]:
     """Read topics of a bag; see :class:`~retrim.io.logs.series.LogReader`.
 
-    Times are those of a field that the map names, of the header, of the messages of PX4, or else of the recording.
+    Times come from the map's time field, the header, the stamps of PX4 messages, or otherwise the recording.
     """
     if find_spec("rosbags") is None:
         raise LogError(f"{path}: a bag needs rosbags: pip install 'retrim[logs]'")
@@ -42,7 +42,7 @@ def read_bag(
         return _read(path, wanted, time, optional)
     except LogError:
         raise
-    except Exception as error:  # whatever its parsers meet in bytes that are no bag
+    except Exception as error:  # the parsers raise various errors for bytes that are not a bag
         hint = "; `mcap recover` mends a file whose recorder was killed" if path.suffix == ".mcap" else ""
         raise LogError(f"{path}: cannot be read as a bag ({type(error).__name__}: {str(error)[:200]}){hint}") from error
 
@@ -81,7 +81,7 @@ def _read(
 def _places(
     path: Path, wanted: Mapping[str, Sequence[str]], known: Sequence[str], optional: Collection[str]
 ) -> dict[str, list[Place]]:
-    """Return where the fields of each quantity are."""
+    """Return the locations of the fields of each quantity."""
     places = dict[str, list[Place]]()
     for what, fields in wanted.items():
         try:
@@ -115,7 +115,7 @@ def _check_fields(
     taken: dict[Place, list[list[float]]],
     optional: Collection[str],
 ) -> None:
-    """Leave out the optional quantities that the messages of a topic do not have."""
+    """Remove the optional quantities that the messages of a topic do not contain."""
     for what in [what for what, found in places.items() if what in optional and found[0].topic == topic]:
         try:
             for place in places[what]:
@@ -151,5 +151,5 @@ def _numbers(path: Path, place: Place, message: Any) -> list[float]:
 
 
 def _fields(message: Any) -> list[str]:
-    """Return the names in a message."""
+    """Return the names of the fields of a message."""
     return [name for name in getattr(message, "__dataclass_fields__", {}) if not name.startswith("__")]

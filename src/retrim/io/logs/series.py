@@ -1,4 +1,4 @@
-"""Columns of a log with their times, as they were recorded."""
+"""Columns of a log with their recorded times."""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from ...config.validation import suggestion
 from ...errors import LogError
 
 T = TypeVar("T")
-MANY = 30  # names that a message lists
+MANY = 30  # maximum number of names in an error message
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class Series:
     t: np.ndarray
     """Times [s], (n,)."""
     values: np.ndarray
-    """(n, columns)."""
+    """Values, (n, columns)."""
 
 
 @runtime_checkable
@@ -36,20 +36,20 @@ class LogReader(Protocol):
         time: "Clock | None",
         optional: Collection[str] = (),
     ) -> tuple[dict[str, Series], list[str]]:
-        """Read the quantities that are wanted.
+        """Read the requested quantities.
 
         Args:
             path: The file, or the folder of a bag.
-            wanted: Field names of each quantity, as the format names them; a field may hold several numbers. Before it
-                there may be a minus sign, and behind it alternatives; see :func:`first_of`.
-            time: Where times are; None for those of the format.
-            optional: Quantities that are left out if the log does not have them.
+            wanted: Field names of each quantity, in the notation of the format. A field may hold several numbers. A
+                minus sign may precede its name, and alternatives may follow it; see :func:`first_of`.
+            time: Field of times; None for the times of the format.
+            optional: Quantities that are left out if the log does not contain them.
 
         Returns:
-            Each quantity, and notes on what was left out.
+            Each quantity, and notes on excluded data.
 
         Raises:
-            LogError: The file cannot be read, or a field is not there.
+            LogError: The file cannot be read, or a field is missing.
         """
         ...
 
@@ -60,14 +60,14 @@ class Clock:
 
     field: str
     scale: float
-    """[s] of one unit."""
+    """Length of one unit [s]."""
 
 
 def first_of(name: str, look: Callable[[str], T]) -> T:
-    """Return what ``look`` finds for the first of the alternatives of a field, ``a|b``, that is there.
+    """Return the result of ``look`` for the first existing alternative of a field, ``a|b``.
 
     Raises:
-        LogError: None of them is; the message is that of the first.
+        LogError: No alternative exists; the message is that of the first.
     """
     errors = list[LogError]()
     for each in name.removeprefix("-").split("|"):
@@ -79,12 +79,12 @@ def first_of(name: str, look: Callable[[str], T]) -> T:
 
 
 def sign_of(name: str) -> float:
-    """Return minus one for a field with a minus sign before it, otherwise one."""
+    """Return minus one for a field with a leading minus sign, otherwise one."""
     return -1.0 if name.startswith("-") else 1.0
 
 
 def missing_field(path: Path, name: str, known: Sequence[str]) -> LogError:
-    """Return the error for a field that is not there."""
+    """Return the error for a missing field."""
     more = f", and {len(known) - MANY} more" if len(known) > MANY else ""
     near = get_close_matches(name, known, n=1)
     shown = ["".join(c if c.isprintable() else "\ufffd" for c in each[:80]) for each in dict.fromkeys([*near, *known])][

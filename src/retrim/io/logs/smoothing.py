@@ -1,4 +1,4 @@
-"""Velocities of a log of positions: local cubics, centred, so that they have no lag."""
+"""Differentiates positions of a log to velocities: local cubics in centred windows, without a lag."""
 
 from pathlib import Path
 
@@ -10,22 +10,22 @@ from .on_one_clock import SHORTEST
 from .resampling import GAP
 from .series import Series
 
-FEWEST, WIDEST = 2, 0.15  # samples, and seconds, on each side of a sample that its cubic is fitted to
-QUIET = 0.3  # [m/s^2]: noise of the second derivative up to which a window is wide enough
-PROBES, CHUNK = 2000, 4096  # samples that choose the window, and that are fitted at once
+FEWEST, WIDEST = 2, 0.15  # half width of a window: smallest number of samples, and largest time [s]
+QUIET = 0.3  # noise of the second derivative at which a window is wide enough [m/s^2]
+PROBES, CHUNK = 2000, 4096  # samples used to choose the window, and samples that are fitted at a time
 
 
 def slope_of(path: Path, position: Series, metres: float) -> tuple[Series, str]:
     """Return the derivative of positions and a note on its window and noise.
 
-    At each sample a cubic is fitted to those around it; the window is centred, so that the derivative is not late. It
-    is as short as the noise of the positions allows: that of the second derivative is at most ``QUIET``, or the window
-    reaches ``WIDEST`` to each side.
+    A cubic is fitted to the samples around each sample. The window is centred, so that the derivative has no lag. It is
+    as short as the noise of the positions permits: the noise of the second derivative is at most ``QUIET``, or the
+    window extends by ``WIDEST`` to each side.
 
     Args:
-        path: For messages.
+        path: File of the log, for messages.
         position: Positions in the unit of the log.
-        metres: Of one unit.
+        metres: Metres per unit.
 
     Raises:
         LogError: There are too few samples.
@@ -71,7 +71,7 @@ def _cubics(
     theta = inverse @ p[k]
     squares = np.sum((p[k] - X @ theta)[whole] ** 2, axis=(1, 2))
     freedom = (2 * half - 3) * p.shape[1]
-    middle = freedom * (1.0 - 2.0 / (9.0 * freedom)) ** 3  # the median of a sum of so many squares
+    middle = freedom * (1.0 - 2.0 / (9.0 * freedom)) ** 3  # the median of the sum of ``freedom`` squares
     sigma = float(np.sqrt(np.median(squares) / middle)) if squares.size else 0.0
     slope, bend = (float(np.median(np.linalg.norm(inverse[:, order], axis=1))) for order in (1, 2))
     noise, shake = sigma * slope / (half * tick), 2.0 * sigma * bend / (half * tick) ** 2

@@ -1,4 +1,4 @@
-"""From the thrust of a log to that of the model: mass-normalised, and what all of it gives."""
+"""Converts the thrust of a log to that of the model: mass-normalised, with the acceleration at full thrust."""
 
 from pathlib import Path
 
@@ -9,16 +9,16 @@ from ...physics.state import STANDARD_GRAVITY
 from .log_map import Thrust
 from .on_one_clock import UP, Ticks
 
-LEAST = 1e-9  # of any share: what is smaller is no command
+LEAST = 1e-9  # share of thrust below which a number is not a command
 
 
 def mass_normalised(
     path: Path, spec: Thrust, ticks: Ticks, valid: np.ndarray
 ) -> tuple[np.ndarray, float | None, list[str]]:
-    """Return the thrust [m/s^2], what all of it gives if it was a share, and notes.
+    """Return the thrust [m/s^2], the acceleration at full thrust if the thrust was a share, and notes.
 
     Raises:
-        LogError: The thrust at hover that the log tells is not positive.
+        LogError: The thrust at hover in the log is not positive.
     """
     if spec.scale is not None:
         return spec.scale * ticks.thrust, None, []

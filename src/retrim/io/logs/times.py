@@ -1,4 +1,4 @@
-"""Times of samples: impossible, late and repeated ones are left out; several flights in one file are named."""
+"""Checks times of samples: drops impossible, late and repeated ones, and reports several flights in one file."""
 
 import math
 from bisect import bisect_right
@@ -10,21 +10,21 @@ import numpy as np
 from ...errors import LogError
 from .series import Series
 
-LATE_S = 0.5  # [s] by which a sample may be older than the one before; more is of another flight
-LARGEST = 1e15  # of any unit: what is larger is damaged
-RARE = 0.05  # share of samples whose time may be impossible
-FAR_S, FAR = 60.0, 3.0  # [s], and lengths of the log, by which such a time is before or after all others at least
-FEWEST = 50  # samples, at least, of which one may be
+LATE_S = 0.5  # [s] by which a sample may be older than the previous one; a larger step indicates another flight
+LARGEST = 1e15  # in any unit: larger values are damaged
+RARE = 0.05  # largest share of samples with an impossible time
+FAR_S, FAR = 60.0, 3.0  # least distance of such a time from all others, in [s] and in lengths of the log
+FEWEST = 50  # least number of samples among which one time may be impossible
 
 
 def in_order(series: Series, what: str, path: Path) -> tuple[Series, list[str]]:
-    """Return a series whose times rise and whose values are finite, and notes on what was left out.
+    """Return a series with increasing times and finite values, and notes on excluded samples.
 
-    Messages are logged when they come. A state is logged again while nothing newer comes, and a clock that is read with
-    an error makes it older then; two threads overtake each other; a stamp is never set. Such samples are left out.
+    Messages are logged when they arrive. A state is logged again until a newer one arrives, and errors in reading the
+    clock can give it an older time. Two threads overtake each other; a stamp is never set. Such samples are left out.
 
     Raises:
-        LogError: Times go back or stand still, or nothing is left.
+        LogError: Times decrease or are constant, or no sample remains.
     """
     notes, count = list[str](), len(series.t)
     finite = np.isfinite(series.t) & np.all(np.abs(series.values) < LARGEST, axis=1)
@@ -54,7 +54,7 @@ def in_order(series: Series, what: str, path: Path) -> tuple[Series, list[str]]:
 
 
 def impossible(t: np.ndarray) -> np.ndarray:
-    """Return which times are far from those around them, as a stamp of zero in the middle: few, or none at all."""
+    """Return times that are far from their neighbours, for example a stamp of zero in the middle; few or none."""
     none, most = np.zeros(len(t), dtype=bool), math.ceil(RARE * len(t))
     if len(t) < FEWEST:
         return none
@@ -71,18 +71,18 @@ def impossible(t: np.ndarray) -> np.ndarray:
 
 
 def late(t: np.ndarray) -> np.ndarray:
-    """Return which times are older than one before, but not so much that they are of another flight."""
+    """Return times that are older than a previous one, but not old enough for another flight."""
     newest = np.concatenate([[-np.inf], np.fmax.accumulate(t)[:-1]])
     return np.asarray((t < newest) & (t > newest - LATE_S))
 
 
 def repeated(t: np.ndarray) -> np.ndarray:
-    """Return which times are the one before."""
+    """Return times that equal the previous one."""
     return np.concatenate([[False], np.diff(t) == 0.0])
 
 
 def _longest_rise(t: np.ndarray) -> np.ndarray:
-    """Return which times are of the longest sequence that does not fall."""
+    """Return a mask of the longest non-decreasing subsequence of times."""
     ends, places, before = list[float](), list[int](), np.full(len(t), -1)
     for k, x in enumerate(t.tolist()):
         at = bisect_right(ends, x)

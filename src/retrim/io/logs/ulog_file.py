@@ -1,7 +1,7 @@
-"""Logs of PX4 (ULog). Needs the extra ``logs``.
+"""Reads logs of PX4 (ULog). Needs the extra ``logs``.
 
-A field is ``topic.field``, as ``vehicle_local_position.vx``; ``vehicle_attitude.q`` is the whole array, and
-``topic#1.field`` the second instance of a topic.
+A field is ``topic.field``, for example ``vehicle_local_position.vx``. ``vehicle_attitude.q`` is a whole array, and
+``topic#1.field`` selects the second instance of a topic.
 """
 
 import contextlib
@@ -25,7 +25,7 @@ def read_ulog(
 ) -> tuple[dict[str, Series], list[str]]:
     """Read topics of a ULog; see :class:`~retrim.io.logs.series.LogReader`.
 
-    Times are the topics' own, those of the sample where a topic has them, or those of a field that the map names.
+    Times come from the map's time field, if the topic has it, or from the topic: the sample's time if available.
     """
     if find_spec("pyulog") is None:
         raise LogError(f"{path}: a ULog needs pyulog: pip install 'retrim[logs]'")
@@ -68,9 +68,9 @@ def _parsed(path: Path) -> Any:
     from pyulog import ULog
 
     try:
-        with path.open("rb") as file, contextlib.redirect_stdout(io.StringIO()):  # it prints what it finds wrong
+        with path.open("rb") as file, contextlib.redirect_stdout(io.StringIO()):  # the parser prints its findings
             log = ULog(file)
-    except Exception as error:  # whatever its parser meets in bytes that are no ULog
+    except Exception as error:  # the parser raises various errors for bytes that are not a ULog
         raise LogError(f"{path}: cannot be read as ULog ({type(error).__name__}: {error})") from error
     if not log.data_list:
         raise LogError(f"{path}: this ULog holds no topic")
@@ -78,7 +78,7 @@ def _parsed(path: Path) -> Any:
 
 
 def _field(path: Path, name: str, topics: Mapping[str, Any]) -> tuple[Any, list[str]]:
-    """Return the topic of a field, and its columns."""
+    """Return the topic of a field and its columns."""
     topic, _, field = name.partition(".")
     if topic not in topics:
         raise missing_field(path, topic, sorted(topics))

@@ -1,4 +1,4 @@
-"""Recordings for other viewers, by the ends of their names."""
+"""Recordings for other viewers, by file suffix."""
 
 import os
 from collections.abc import Callable, Mapping
@@ -12,13 +12,13 @@ from .rerun_file import write_rrd
 
 
 class Viewer(NamedTuple):
-    """A kind of recording."""
+    """A format of recordings."""
 
     write: Callable[[Path, Recording], None]
     package: str
-    """What writes it, as it is imported."""
+    """Import name of the package that writes it."""
     extra: str
-    """Of this package, that installs it."""
+    """Extra of retrim that installs the package."""
 
 
 VIEWERS: Mapping[str, Viewer] = {
@@ -28,7 +28,7 @@ VIEWERS: Mapping[str, Viewer] = {
 
 
 def check_recording(path: Path | None) -> None:
-    """Check the file of a recording before anything is flown; None for no recording.
+    """Check the file of a recording before a flight; None for no recording.
 
     Raises:
         ConfigError: The file cannot be written, or the package that writes it is not installed.
@@ -47,10 +47,10 @@ def check_recording(path: Path | None) -> None:
 
 
 def can_record(path: Path) -> bool:
-    """Return whether what writes recordings of that name is installed."""
+    """Return whether the package for recordings of that name is installed."""
     return find_spec(VIEWERS[path.suffix].package) is not None
 
 
 def record(path: Path, flight: Recording) -> None:
-    """Write a flight in the form that the end of the name says; the file appears when it is whole."""
+    """Write a flight in the format of the file suffix; the file appears once it is complete."""
     VIEWERS[path.suffix].write(path, flight)
