@@ -83,8 +83,7 @@ class LearnerLoop:
             plan: Plan of the learner.
             bus: Bus of the flight.
             clock: Function that returns the time [s].
-            setup_of: Function that returns the set-up of a preset and a reference; loops of several vehicles may
-                share a set-up.
+            setup_of: Function that returns a set-up; loops of several vehicles may share one.
         """
         state, preset = load_learnt(plan.start, trust=plan.trust)
         self.plan, self.bus, self.state, self._clock = plan, bus, state, clock
@@ -215,11 +214,7 @@ class LearnerLoop:
         return LearnerState(self.state.policy, update.state)
 
     def _judge(self) -> bool:
-        """Continue from a policy once control has accepted it, and from the last valid one after a rollback.
-
-        Returns:
-            Whether a policy was rolled back.
-        """
+        """Continue from an accepted policy, or after a rollback from the last valid one; return if there was one."""
         status = self._status()
         given_up, back = status.get("given_up", []), False
         while self._flown and self._flown[-1][0] in given_up:
@@ -244,11 +239,7 @@ class LearnerLoop:
         return last_note(self.bus, "status")
 
     def _wanted(self) -> bool:
-        """Return whether control accepts updates and learning is not paused.
-
-        After the end of policy mode control does not accept updates, and a further update would displace the last one
-        that was in flight.
-        """
+        """Return whether control accepts updates, which it does in policy mode only, and learning is not paused."""
         return self._status().get("mode", "policy") == "policy" and not last_note(self.bus, "learning").get(
             "paused", False
         )

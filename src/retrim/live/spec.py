@@ -26,6 +26,10 @@ MAINS = {
     "bridge": "retrim.live.bridge_process:carry",
 }
 """Main function of each process, by role."""
+UNHURRIED = ("residual", "policy", "identifier", "recorder", "page", "bridge")
+"""Roles that do not run on the core of the processes with real-time requirements."""
+RESTARTED = (*UNHURRIED, "watchdog")
+"""Roles that are restarted when their process dies or hangs."""
 VEHICLE = "retrim.live.vehicle_process:fly"
 """Main function of the plant process if the plant is a vehicle."""
 

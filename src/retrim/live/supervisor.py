@@ -24,17 +24,14 @@ from ..transport.shared_memory import SharedMemoryBus
 from .plans import plan_of
 from .refused_notes import RefusedNotes
 from .remote_learners import RemoteLearners
-from .spec import LiveSpec
+from .spec import RESTARTED, UNHURRIED, LiveSpec
 from .status import Status
 from .topics import topics
 
 LANDING = 60.0  # [s] for a landing; afterwards the processes are ended wherever the vehicle is
 LAST = 5  # [ticks] for the log to receive the last reports of control after the plant has ended
 ATTEMPTS = 5  # restarts per process
-LEARN = ("residual", "policy", "identifier", "recorder", "page", "bridge")
-"""Roles that do not run on the core of the processes with real-time requirements."""
 READY_S = 300.0  # [s], including compilation
-RESTARTED = ("residual", "policy", "identifier", "watchdog", "recorder", "page", "bridge")
 
 
 @dataclass
@@ -291,7 +288,7 @@ class Supervisor:
         return found
 
     def _start(self, role: str) -> None:
-        cores = cores_of("learn" if role in LEARN else "fly", self._cores)
+        cores = cores_of("learn" if role in UNHURRIED else "fly", self._cores)
         self.processes[role] = launch(self.spec.mains[role], self._plan(role), self._complaints(role), cores)
 
     def _complaints(self, role: str) -> Path:
