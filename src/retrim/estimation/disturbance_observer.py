@@ -129,7 +129,8 @@ class DisturbanceObserver(eqx.Module):
         doubted = jnp.exp(-dt / DECAY_TAU * consistency.doubt**2)
         decay = jnp.where(consistency.certain, 1.0, doubted).astype(x.p.dtype)
         # The model bridges a few dropped frames, since the measured velocity has the full noise. After other
-        # contradictions it does not: measurements may be later than declared, and then the prediction is for another time.
+        # contradictions it does not: measurements may be later than declared, so that the prediction is for another
+        # time.
         dropped = consistency.repeated | s.consistency.repeated
         coasts = comparable & dropped & (consistency.doubt < COAST)
         v = jnp.where(coasts, predicted, x.v)
