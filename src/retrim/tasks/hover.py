@@ -92,7 +92,7 @@ class Hover(AbstractHover):
 
 
 class L2Hover(AbstractHover):
-    """Hover with a tip of the reward at the goal; the paper's reward is flat there and leaves an error of centimetres."""
+    """Hover with a tip of the reward at the goal; the paper's is flat there and leaves an error of centimetres."""
 
     def reward(self, t: Float[Array, ""], x: State, u: Command) -> Float[Array, ""]:
         """Return the paper's reward - 3 (sqrt(|p - goal|^2 + (1 cm)^2) - 1 cm)."""
