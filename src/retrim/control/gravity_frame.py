@@ -66,8 +66,8 @@ class GravityFrame(AbstractController[GravityFrameState]):
     def with_vehicle(self, member: Member) -> "GravityFrame":
         """Return the same for an identified vehicle.
 
-        The observer uses the delay of the vehicle and the lag of its thrust. Its time constant depends on the vehicle,
-        since the frame must not turn much faster than the vehicle can follow.
+        The observer uses the delay of the vehicle and the lag of its thrust. It is as fast as the
+        vehicle permits, since the frame must not turn much faster than the vehicle can follow.
         """
         observer = dataclasses.replace(self.observer, path=member.path)
         if member.lateness is not None:
