@@ -1,4 +1,4 @@
-"""Adaptation as pure functions and messages; :mod:`retrim.runtime` gives them a clock."""
+"""Adaptation as pure functions and messages; :mod:`retrim.runtime` runs them on a clock."""
 
 from .buffer import RollingBuffer as RollingBuffer
 from .gate import Verdict as Verdict

@@ -12,12 +12,12 @@ from ..physics.state import Command, State
 
 
 class RollingBuffer:
-    """Keeps the last ``size`` ticks (paper, Sec. IV-A.3: 100 for hover). ``window`` is a copy, never a view."""
+    """Keeps the last ``size`` ticks (paper, Sec. IV-A.3: 100 for hover). ``window`` returns a copy, not a view."""
 
     def __init__(self, size: int) -> None:
         if size < 2:
             raise ValueError(f"RollingBuffer: size = {size} must be at least 2, for one difference of velocity")
-        # Leaves in NumPy: a tick is converted once, and not for every window that it is part of.
+        # NumPy leaves: each tick is converted once, and not again for every window that contains it.
         self._rows: deque[tuple[float, float, list[np.ndarray]]] = deque(maxlen=size)
         self._structure: Any = None
         self._size = size
@@ -31,20 +31,20 @@ class RollingBuffer:
         self._rows.append((t, age, [np.asarray(leaf) for leaf in leaves]))
 
     def accepted(self, u: Command) -> None:
-        """Replace the last command by the one that the plant accepted."""
+        """Replace the last command with the one that the plant accepted."""
         late = [np.asarray(leaf) for leaf in jax.tree.leaves(u)]
         _, _, leaves = self._rows[-1]
         leaves[-len(late) :] = late
 
     def clear(self) -> None:
-        """Forget everything."""
+        """Remove all ticks."""
         self._rows.clear()
 
     def window(self) -> Window:
-        """Return a snapshot of fixed shape; while it fills, the oldest tick is repeated in front and marked invalid.
+        """Return a snapshot of fixed shape; while it fills, copies of the oldest tick, marked invalid, come first.
 
         Raises:
-            ValueError: Nothing was pushed yet.
+            ValueError: The buffer is empty.
         """
         if not self._rows:
             raise ValueError("RollingBuffer: no tick was pushed yet")

@@ -1,4 +1,4 @@
-"""The gate: a re-trained policy must be finite, and no worse than the flying one, before it may fly."""
+"""The gate: a re-trained policy must be finite, and not worse than the current one, before it may fly."""
 
 from typing import Any
 
@@ -19,13 +19,13 @@ class Verdict(eqx.Module):
 
     admitted: Bool[Array, ""]
     finite: Bool[Array, ""]
-    """No weight of the candidate is NaN or infinite."""
+    """True if all weights of the candidate are finite."""
     candidate: Float[Array, ""]
     """Cost of the candidate: minus the mean reward of its roll-outs."""
     incumbent: Float[Array, ""]
-    """Cost of the policy that flies."""
+    """Cost of the policy in flight."""
     trusted: Bool[Array, ""] = eqx.field(default_factory=lambda: jnp.array(True))
-    """Enough measurements of the window are consistent with each other."""
+    """True if enough measurements of the window are consistent with each other."""
 
     def provided(self, trusted: Bool[Array, ""]) -> "Verdict":
         """Return the verdict that admits the candidate only if the measurements are trusted, too."""
@@ -51,7 +51,7 @@ def judge(candidate: Policy, incumbent: Policy, env: Env, x0: Start) -> Verdict:
 
     Args:
         candidate: The re-trained policy.
-        incumbent: The policy that flies.
+        incumbent: The policy in flight.
         env: Task and current hybrid model.
         x0: Starts (leading axis) on which the candidate was not trained.
 

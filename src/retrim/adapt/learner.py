@@ -25,12 +25,12 @@ from .trim import AbstractTrim, Untrimmed
 from .vehicles import AbstractVehicles, OwnVehicle
 from .views import AbstractView, WorldView
 
-HELD_OUT = 8  # starts that the gate flies
-VEHICLES = 2**30 + 5  # folded into the keys of starts for the vehicles that fly from them
+HELD_OUT = 8  # number of starts for the roll-outs of the gate
+VEHICLES = 2**30 + 5  # folded into the keys of starts to draw the vehicles at these starts
 
 
 class LearnerState(eqx.Module):
-    """What has been learnt so far, in two halves, so that two processes can own one each."""
+    """Learned policy and residual. They are separate, so that two processes can own one each."""
 
     policy: PolicyState
     residual: Any
@@ -49,13 +49,13 @@ class FitReport(eqx.Module):
 
 
 class OnlineLearner(eqx.Module):
-    """How to learn from a window of flight (paper, Sec. IV-A.3). Every number that may change is an array."""
+    """Learner from a window of flight (paper, Sec. IV-A.3). Every number that may change is an array."""
 
     env: Env
-    """Task of the flight, nominal model and its delay; the model knows nothing of the plant."""
+    """Task of the flight, nominal model and its delay; the model is independent of the plant."""
     residual_model: ResidualModel
     optimiser: AbstractPolicyOptimiser
-    """What re-trains the policy."""
+    """Optimiser that re-trains the policy."""
     plant_delay_ticks: int = eqx.field(static=True)
     """Declared command delay of the plant [ticks], to pair accelerations with the commands that caused them."""
     num_updates: int = eqx.field(static=True)
@@ -63,15 +63,15 @@ class OnlineLearner(eqx.Module):
     num_envs: int = eqx.field(static=True)
     """Starts per optimiser step."""
     starts: AbstractStarts = TaskStarts()
-    """Where they lie."""
+    """Source of the starts."""
     view: AbstractView = WorldView()
-    """Coordinates in which the policy is trained, and flown."""
+    """Coordinates in which the policy is trained and flies."""
     trim: AbstractTrim = Untrimmed()
-    """What it commands at rest after an update."""
+    """Correction of the policy's command at rest after an update."""
     vehicles: AbstractVehicles = OwnVehicle()
     """Vehicle of the flight: that of the model, or an identified one."""
     low_rank_optimiser: AbstractPolicyOptimiser | None = None
-    """What re-trains a low-rank delta, of the same kind as ``optimiser``; None: the same."""
+    """Optimiser that re-trains a low-rank delta, of the same kind as ``optimiser``; None for ``optimiser`` itself."""
 
     def __check_init__(self) -> None:
         """Raise ``ValueError`` for sizes that cannot work."""
@@ -88,9 +88,9 @@ class OnlineLearner(eqx.Module):
 
     @eqx.filter_jit
     def fit_residual(self, state: Any, window: Window) -> tuple[Any, FitReport]:
-        """Fit the residual model to a window, from where the last fit ended.
+        """Fit the residual model to a window, starting from the last fit.
 
-        Measurements that contradict each other are left out, and with more than half of them nothing is learned.
+        Measurements that contradict each other are left out. If they are more than half, the fit is not accepted.
 
         Args:
             state: State of the residual model.
@@ -117,16 +117,17 @@ class OnlineLearner(eqx.Module):
     ) -> tuple[PolicyState, Verdict]:
         """Re-train the policy by back-propagation in the corrected model, and judge the result.
 
-        Gradients flow through the analytical model only. The gate flies eight starts that the update did not train
-        on: four states of the window, four random starts of the task. No start is a measurement that contradicts its
-        neighbours, and the gate refuses every policy while more than half of the measurements do.
+        Gradients flow through the analytical model only. The gate simulates flights from eight starts that the update
+        did not use for training: four states of the window and four random starts of the task. Measurements that
+        contradict their neighbours are not used as starts, and the gate refuses every policy while more than half of
+        the measurements are contradictory.
 
         Args:
             state: Policy to start from.
             residual: State of the residual model.
             window: Ticks of flight.
-            key: Consumed.
-            flown: Policy that flies, and that the trained one has to be better than; that of ``state`` by default.
+            key: Random key, consumed.
+            flown: Policy in flight, with which the gate compares the trained one; by default that of ``state``.
 
         Returns:
             The trained policy, and the gate's verdict on it.

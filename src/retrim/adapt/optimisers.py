@@ -1,4 +1,4 @@
-"""The optimiser of an update: what it remembers of the last one, and how its rate falls."""
+"""The optimiser of a policy update: the state it keeps between updates, and the decay of its rate."""
 
 import abc
 from typing import Any
@@ -13,7 +13,7 @@ from ..learn.bptt import PolicyState
 
 
 class AbstractPolicyOptimiser(eqx.Module):
-    """Adam behind a clip. Every number is an array, so that another value compiles nothing."""
+    """Gradient clipping, then Adam. Every number is an array, so that a new value does not cause a new compilation."""
 
     rate: eqx.AbstractVar[Float[Array, ""]]
     max_grad_norm: eqx.AbstractVar[Float[Array, ""]]
@@ -28,15 +28,15 @@ class AbstractPolicyOptimiser(eqx.Module):
 
 
 class FreshAdam(AbstractPolicyOptimiser):
-    """Each update starts a fresh Adam, whose rate falls to zero along a cosine (the paper)."""
+    """Each update starts a fresh Adam, whose rate decays to zero with a cosine schedule (the paper)."""
 
     rate: Float[Array, ""]
     """Learning rate at the start of an update."""
     max_grad_norm: Float[Array, ""]
-    """Largest norm of a policy gradient; infinity for none."""
+    """Largest norm of a policy gradient; infinity for no limit."""
 
     def transformation(self, num_updates: int) -> optax.GradientTransformation:
-        """Return Adam with a rate that falls."""
+        """Return Adam with a decaying rate."""
         schedule = optax.cosine_decay_schedule(1.0, num_updates)
         return optax.chain(
             optax.clip_by_global_norm(self.max_grad_norm),
@@ -45,36 +45,37 @@ class FreshAdam(AbstractPolicyOptimiser):
         )
 
     def begin(self, state: PolicyState, num_updates: int) -> PolicyState:
-        """Forget the moments of the last update."""
+        """Reset the moments of the last update."""
         return PolicyState(state.policy, self.transformation(num_updates).init(state.policy.params))
 
 
 class CarriedAdam(AbstractPolicyOptimiser):
     """One Adam of constant rate for the whole flight, whose momentum starts from rest in each update.
 
-    The scale of the gradients is carried over, their direction is not: an update that was refused, or learnt across a
-    change of the world, would push every later one the same way. The first moment is not corrected for its start, so
-    that every update, the first too, begins gently: along a constant gradient five steps move 1.3 rates.
+    The scale of the gradients is carried over, but their direction is not: otherwise an update that was refused, or
+    that was learned across a change of the world, would push every later one in the same direction. The first moment
+    has no bias correction, so that every update, also the first, begins gently: along a constant gradient five steps
+    move 1.3 rates.
     """
 
     rate: Float[Array, ""]
     """Learning rate."""
     max_grad_norm: Float[Array, ""]
-    """Largest norm of a policy gradient; infinity for none."""
+    """Largest norm of a policy gradient; infinity for no limit."""
 
     def transformation(self, num_updates: int) -> optax.GradientTransformation:
-        """Return Adam; the number of steps does not matter."""
+        """Return Adam, which does not depend on the number of steps."""
         clip = optax.clip_by_global_norm(self.max_grad_norm)
         return optax.chain(clip, _scale_by_adam_from_rest(), optax.scale_by_learning_rate(self.rate))
 
     def begin(self, state: PolicyState, num_updates: int) -> PolicyState:
-        """Keep the second moments; the first start at zero."""
+        """Keep the second moments, and reset the first moments to zero."""
         still = optax.tree.zeros_like(optax.tree.get(state.optimiser, "mu"))
         return PolicyState(state.policy, optax.tree.set(state.optimiser, mu=still))
 
 
 def _scale_by_adam_from_rest(b1: float = 0.9, b2: float = 0.999, eps: float = 1e-8) -> optax.GradientTransformation:
-    """Return ``optax.scale_by_adam`` without the correction of the first moment for its start."""
+    """Return ``optax.scale_by_adam`` without the bias correction of the first moment."""
     adam = optax.scale_by_adam(b1, b2, eps)
 
     def update(grads: optax.Updates, state: Any, params: optax.Params | None = None) -> tuple[optax.Updates, Any]:

@@ -1,4 +1,4 @@
-"""Where the roll-outs of an update start."""
+"""Starts of the roll-outs of an update."""
 
 import abc
 from collections.abc import Callable
@@ -24,7 +24,7 @@ class AbstractStarts(eqx.Module):
 
 
 class TaskStarts(AbstractStarts):
-    """Those of pretraining (the paper)."""
+    """Starts of pretraining (the paper)."""
 
     def __call__(self, task: AbstractTask, window: Window, key: Key[Array, ""], updates: int, envs: int) -> Start:
         """Draw from the task."""
@@ -32,18 +32,18 @@ class TaskStarts(AbstractStarts):
 
 
 class FlownStarts(AbstractStarts):
-    """Most from where the vehicle has just been, the rest from the task, so that nothing is forgotten.
+    """Most starts from recent states of the flight, the others from the task, so that the policy does not forget.
 
-    Far starts with few environments make noisy gradients, and the policy that they train jitters by centimetres.
+    Distant starts with few environments give noisy gradients, and the resulting policy jitters by centimetres.
     """
 
     spread: Float[Array, ""]
     """Standard deviation that is added to position [m] and velocity [m/s]."""
     from_task: int = eqx.field(static=True, default=2)
-    """Environments of each step that start where the task says."""
+    """Number of environments of each step whose starts are drawn from the task."""
 
     def __call__(self, task: AbstractTask, window: Window, key: Key[Array, ""], updates: int, envs: int) -> Start:
-        """Draw from the window, and from the task."""
+        """Draw from the window and from the task."""
         k_task, k_rows, k_p, k_v = random.split(key, 4)
         far = min(self.from_task, envs)
         shape = (updates, envs - far)
@@ -57,7 +57,7 @@ class FlownStarts(AbstractStarts):
 
 
 def drawn(window: Window, key: Key[Array, ""], shape: tuple[int, ...]) -> Start:
-    """Draw states, with the times at which they were so, from the valid part of the window; the key is consumed."""
+    """Draw states, with the times at which they were true, from the valid part of the window; the key is consumed."""
     weight = window.valid.astype(window.x.p.dtype)
     row = random.choice(key, window.valid.shape[0], shape, p=weight / jnp.sum(weight))
     make: Callable[..., Start] = Start

@@ -1,7 +1,7 @@
-"""The trim: what a re-trained policy commands where the vehicle should come to rest.
+"""The trim: the command of a re-trained policy at the point where the vehicle should come to rest.
 
-An update makes a policy better over the next seconds, and moves the point where it comes to rest by a millimetre, every
-time another way. That point needs no training: it is where the policy commands hover.
+An update improves a policy over the next seconds, but moves its rest point by a millimetre, each time in another
+direction. The rest point does not need training: it is the point where the policy commands hover.
 """
 
 import abc
@@ -18,32 +18,32 @@ from ..physics.state import Command, State
 
 
 class AbstractTrim(eqx.Module):
-    """What is done to the command at rest after an update."""
+    """Correction of the command at rest after an update."""
 
     @abc.abstractmethod
     def __call__(self, policy: Policy | LoraPolicy, env: Env, window: Window) -> Policy | LoraPolicy:
-        """Return the policy that flies.
+        """Return the corrected policy.
 
         Args:
             policy: The re-trained policy.
             env: The corrected model in which it was trained.
-            window: The flight that it was trained for.
+            window: The flight for which it was trained.
         """
 
 
 class Untrimmed(AbstractTrim):
-    """Nothing is done (the paper)."""
+    """No correction (the paper)."""
 
     def __call__(self, policy: Policy | LoraPolicy, env: Env, window: Window) -> Policy | LoraPolicy:
-        """Return the policy as it was trained."""
+        """Return the policy unchanged."""
         return policy
 
 
 class RestTrim(AbstractTrim):
-    """The policy's output is shifted so that at rest at home, with the heading of the flight, it commands hover.
+    """Shifts the policy's output so that it commands hover at rest at home, with the heading of the flight.
 
-    In the frame of the gravity that is felt, that command keeps the vehicle there under a disturbance, too. It is for
-    tasks that rest at home and leave the heading free: at the heading that it has, the vehicle stays.
+    In the frame of the effective gravity, that command keeps the vehicle there also under a disturbance. Use it for
+    tasks that rest at home and leave the heading free: the vehicle keeps its present heading.
     """
 
     def __call__(self, policy: Policy | LoraPolicy, env: Env, window: Window) -> Policy | LoraPolicy:

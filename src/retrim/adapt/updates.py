@@ -1,4 +1,4 @@
-"""What learners send to pilots: frozen, typed messages that turn into bytes and back."""
+"""Messages from learners to pilots: frozen and typed, with conversion to bytes and back."""
 
 import json
 import math
@@ -19,16 +19,16 @@ NOTHING: Counts = (0,) * len(REASONS)
 
 @dataclass(frozen=True)
 class ResidualUpdate:
-    """A residual was fitted."""
+    """Message that a residual was fitted."""
 
     computed_from: float
-    """Time of the newest measurement that it was learnt from [s]."""
+    """Time of the newest measurement from which it was learned [s]."""
     rms_error: float
     """Root mean square of the fit's error [m/s^2]."""
     state: Any
     """New state of the residual model."""
     excluded: Counts = NOTHING
-    """Numbers of steps that were excluded from the fit, by reason, see :class:`~retrim.learn.screening.Screening`."""
+    """Number of steps that were excluded from the fit, by reason, see :class:`~retrim.learn.screening.Screening`."""
 
     def note(self) -> str:
         """Return one line for the log."""
@@ -38,12 +38,12 @@ class ResidualUpdate:
 
 @dataclass(frozen=True)
 class PolicyUpdate:
-    """A policy was re-trained and admitted."""
+    """Message that a policy was re-trained and admitted."""
 
     computed_from: float
-    """Time of the newest measurement that it was learnt from [s]."""
+    """Time of the newest measurement from which it was learned [s]."""
     cost: float
-    """Its cost on the gate's roll-outs."""
+    """Cost of the new policy on the gate's roll-outs."""
     incumbent_cost: float
     """Cost of the policy that it replaces."""
     state: PolicyState
@@ -56,7 +56,7 @@ class PolicyUpdate:
 
 @dataclass(frozen=True)
 class Rejection:
-    """A result that must not be used."""
+    """Message that a result must not be used."""
 
     computed_from: float
     layer: Layer
@@ -69,7 +69,7 @@ class Rejection:
 
 @dataclass(frozen=True)
 class Skip:
-    """A window was offered while the learner was busy."""
+    """Message that a window was offered while the learner was busy."""
 
     computed_from: float
     layer: Layer
@@ -95,8 +95,8 @@ def unpack_update(data: bytes, like: LearnerState, *, source: str) -> Update:
 
     Args:
         data: Bytes of a message.
-        like: A learner state of the structure, shapes and types that are expected.
-        source: Where the bytes come from, for messages of errors.
+        like: A learner state with the expected structure, shapes and types.
+        source: Source of the bytes, for error messages.
 
     Returns:
         The update.
@@ -119,7 +119,7 @@ def unpack_update(data: bytes, like: LearnerState, *, source: str) -> Update:
 
 
 def _checked(plain: Any, cls: type) -> dict[str, Any]:
-    """Return the plain fields of a message; raise ``TypeError`` or ``ValueError``, with its name, for a wrong one."""
+    """Return the plain fields of a message; raise ``TypeError`` or ``ValueError`` with the name of an invalid field."""
     wanted = {f.name: f.type for f in fields(cls) if f.name != "state"}
     if not isinstance(plain, dict) or plain.keys() != wanted.keys():
         raise TypeError(f"expected {', '.join(wanted)}")

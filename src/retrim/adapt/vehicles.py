@@ -1,4 +1,4 @@
-"""The vehicle behind a window of flight: that of the model, or one of a family that the window identifies."""
+"""The vehicle of a window of flight: that of the model, or one of a family, identified from the window."""
 
 import abc
 import dataclasses
@@ -19,16 +19,17 @@ from ..physics.path_family import Member, PathBelief, PathFamily
 from ..physics.state import Command, State
 from ..tasks.task import Start
 
-# Ticks between two estimates: each one says how noisy the measurements after it are, and rarer ones cost accuracy.
+# Ticks between two estimates. Each estimate sets the noise level of the measurements after it, so fewer estimates cost
+# accuracy.
 PIECE = 5
 
 
 class AbstractVehicles(eqx.Module):
-    """What learners know of the vehicle."""
+    """Knowledge of the learners about the vehicle."""
 
     @abc.abstractmethod
     def identify(self, window: Window) -> "Identification | None":
-        """Return what a window says of the vehicle; None if the model knows it.
+        """Return the identification of the vehicle from a window; None if the vehicle is that of the model.
 
         Args:
             window: Ticks of flight.
@@ -36,7 +37,7 @@ class AbstractVehicles(eqx.Module):
 
     @abc.abstractmethod
     def apply_path(self, window: Window) -> Window:
-        """Return the window with the commands that a model without delay and lag would have to be given.
+        """Return the window with the commands that a model without delay and lag would need as input.
 
         Args:
             window: Ticks of flight.
@@ -44,7 +45,7 @@ class AbstractVehicles(eqx.Module):
 
     @abc.abstractmethod
     def assign_vehicles(self, starts: Start, found: "Identification | None", key: Key[Array, ""]) -> Start:
-        """Return starts with the vehicles that fly from them; the key is consumed.
+        """Return starts with a vehicle assigned to each; the key is consumed.
 
         Args:
             starts: Starts of roll-outs, with any leading axes.
@@ -54,22 +55,22 @@ class AbstractVehicles(eqx.Module):
 
 
 class OwnVehicle(AbstractVehicles):
-    """The vehicle of the model, with the delay that is declared."""
+    """The vehicle of the model, with the declared delay."""
 
     def identify(self, window: Window) -> None:
         """Return None."""
 
     def apply_path(self, window: Window) -> Window:
-        """Return the window as it is; the delay is a setting of the learner."""
+        """Return the window unchanged; the delay is a setting of the learner."""
         return window
 
     def assign_vehicles(self, starts: Start, found: "Identification | None", key: Key[Array, ""]) -> Start:
-        """Return the starts as they are."""
+        """Return the starts unchanged."""
         return starts
 
 
 class Identification(NamedTuple):
-    """What a window says of the vehicle."""
+    """Identification of the vehicle from a window."""
 
     belief: PathBelief
     path: CommandPath
@@ -77,13 +78,13 @@ class Identification(NamedTuple):
 
 
 class IdentifiedVehicle(AbstractVehicles):
-    """A vehicle of a family. Updates train for samples of the belief about it."""
+    """A vehicle of a family. Updates train on samples of the belief about the vehicle."""
 
     estimator: PathEstimator
     family: PathFamily
 
     def identify(self, window: Window) -> Identification:
-        """Return what commands and attitudes of a window say of the vehicle.
+        """Return the identification of the vehicle from commands and attitudes of a window.
 
         Args:
             window: Ticks of flight.
@@ -95,7 +96,7 @@ class IdentifiedVehicle(AbstractVehicles):
         return Identification(belief, dataclasses.replace(path, response=response))
 
     def apply_path(self, window: Window) -> Window:
-        """Return the window with thrust and rates behind the identified path; its first ticks do not count."""
+        """Return the window with thrust and rates at the output of the identified path; its first ticks are invalid."""
         path, dt = self.identify(window).path, self.estimator.dt
         first: Command = jax.tree.map(lambda leaf: leaf[0], window.u)
 
@@ -110,7 +111,7 @@ class IdentifiedVehicle(AbstractVehicles):
         return dataclasses.replace(window, u=acting, valid=window.valid & (count > forgotten))
 
     def assign_vehicles(self, starts: Start, found: "Identification | None", key: Key[Array, ""]) -> Start:
-        """Return starts with vehicles that are drawn from the belief."""
+        """Return starts with vehicles drawn from the belief."""
         if found is None:
             raise ValueError("IdentifiedVehicle.assign_vehicles needs the result of identify, got None")
         belief, shape = found.belief, starts.t.shape
@@ -126,7 +127,7 @@ class IdentifiedVehicle(AbstractVehicles):
 
 
 def estimate_path(estimator: PathEstimator, window: Window) -> PathEstimate:
-    """Return the command path that a window of flight shows.
+    """Return the estimate of the command path from a window of flight.
 
     Args:
         estimator: Estimator of the path.
@@ -149,7 +150,7 @@ def estimate_path(estimator: PathEstimator, window: Window) -> PathEstimate:
 
 
 def _in_pieces(rows: Any, size: int) -> Any:
-    """Return rows with a leading axis of pieces; rows that are not valid fill the first one up."""
+    """Return rows with a leading axis of pieces; invalid rows pad the first piece."""
     missing = -len(jax.tree.leaves(rows)[0]) % size
 
     def divide(leaf: Array) -> Array:

@@ -1,4 +1,4 @@
-"""How a learner looks at the world it trains in: as it is, or in the frame of the gravity that is felt there."""
+"""Coordinates in which a learner trains the policy: those of the world, or of the frame of the effective gravity."""
 
 import abc
 import dataclasses
@@ -16,46 +16,46 @@ from ..physics.state import Command, State
 
 
 class AbstractView(eqx.Module):
-    """The environment of an update; the policy is flown in the same coordinates."""
+    """The environment of an update; the policy flies in the same coordinates."""
 
     @abc.abstractmethod
     def __call__(self, env: Env, residual: Residual) -> Env:
-        """Return the corrected environment, as the policy sees it.
+        """Return the corrected environment, in the coordinates of the policy.
 
         Args:
             env: Task and nominal model.
-            residual: What the nominal model misses, world frame [m/s^2].
+            residual: Residual acceleration of the nominal model, world frame [m/s^2].
         """
 
 
 class WorldView(AbstractView):
-    """The world as it is (the paper)."""
+    """The coordinates of the world (the paper)."""
 
     def __call__(self, env: Env, residual: Residual) -> Env:
-        """Add the residual to the model, which turns as the vehicle was seen to turn."""
+        """Add the residual, and the identified lag and bias of the body rates, to the model."""
         return as_it_turns(env, turning_of(residual)).with_residual(residual)
 
 
 class GravityView(AbstractView):
-    """The frame of the gravity that the vehicle feels, at each tick; see :mod:`retrim.control.gravity_frame`."""
+    """The frame of the effective gravity at each tick; see :mod:`retrim.control.gravity_frame`."""
 
     limit: Float[Array, ""]
     """Largest norm of the disturbance that turns the frame [m/s^2]."""
 
     def __call__(self, env: Env, residual: Residual) -> Env:
-        """Add the residual to the model, and let the frame answer it, and a bias of the rates."""
+        """Add the residual to the model; the controller compensates it with the frame, and also a bias of the rates."""
         env = with_lag(env, turning_of(residual))
         return dataclasses.replace(env.with_residual(residual), felt=Capped(residual, self.limit))
 
 
 class RestView(AbstractView):
-    """The frame of the gravity that the vehicle feels at rest at home, everywhere: pictures of it can be remembered."""
+    """The frame of the effective gravity at rest at home, in every state: a constant frame keeps old images valid."""
 
     limit: Float[Array, ""]
     """Largest norm of the disturbance that turns the frame [m/s^2]."""
 
     def __call__(self, env: Env, residual: Residual) -> Env:
-        """Add the residual to the model; the frame answers what it says at rest, and leaves a bias of the rates."""
+        """Add the residual to the model; the frame compensates its value at rest, but not a bias of the rates."""
         home = env.task.home()
         d = capped(residual(State.at(home), Command.hover(home.dtype)), self.limit)
         env = as_it_turns(env, turning_of(residual))
@@ -63,14 +63,15 @@ class RestView(AbstractView):
 
 
 def turning_of(residual: Residual) -> RateFit | None:
-    """Return what was learnt of how the vehicle turns, if something was."""
+    """Return the identified bias and lag of the body rates; None if the residual model does not identify them."""
     return residual.turning if isinstance(residual, FittedResidual) else None
 
 
 def with_lag(env: Env, found: RateFit | None) -> Env:
-    """Return the environment with the lag that was identified, if it has a lag and one was.
+    """Return the environment with the identified lag, if its model has a lag and one was identified.
 
-    It is that of the rates; thrust comes from the same motors, and has that of roll and pitch in the model.
+    The identified lag is that of the rates. In the model, thrust has the lag of roll and pitch, since the same motors
+    generate it.
     """
     if found is None or not isinstance(env.dynamics, Lagged):
         return env
@@ -79,17 +80,17 @@ def with_lag(env: Env, found: RateFit | None) -> Env:
 
 
 def as_it_turns(env: Env, found: RateFit | None) -> Env:
-    """Return the environment with the lag and the bias of the rates that were identified, if they were."""
+    """Return the environment with the identified lag and bias of the rates, if they were identified."""
     env = with_lag(env, found)
     return env if found is None else dataclasses.replace(env, dynamics=RateBiased(env.dynamics, found.bias))
 
 
 class Same(eqx.Module):
-    """The same disturbance whatever the state and the command."""
+    """A disturbance that is independent of state and command."""
 
     d: Float[Array, "3"]
-    """World [m/s^2]."""
+    """Disturbance, world [m/s^2]."""
 
     def __call__(self, x: State, u: Command) -> Float[Array, "3"]:
-        """Return it."""
+        """Return the disturbance."""
         return self.d

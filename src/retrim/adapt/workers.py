@@ -1,7 +1,7 @@
-"""Workers: what one learner does with one window, whichever clock or process it runs in.
+"""Workers: the computation of one learner on one window, independent of clock and process.
 
-A worker's state advances only when its own update comes back to it as published, so that a result that is dropped on
-the way (a new flight, a lost message) never becomes the base of the next one.
+The state of a worker advances only when it receives its own update as published. So a result that is dropped on the way
+(because of a new flight or a lost message) never becomes the base of the next one.
 """
 
 from typing import Any, Protocol, runtime_checkable
@@ -28,16 +28,16 @@ class Worker(Protocol):
     layer: Layer
 
     def learn(self, window: Window) -> Update:
-        """Learn from a window; blocks until the result is there."""
+        """Learn from a window; block until the result is available."""
         ...
 
     def receive(self, update: Update) -> None:
-        """Take note of an update that was published, of this or another layer."""
+        """Receive a published update of this or another layer."""
         ...
 
 
 def residual_update(computed_from: float, state: Any, report: FitReport) -> ResidualUpdate | Rejection:
-    """Return the message of a fit that has ended."""
+    """Return the message for a finished fit."""
     excluded = describe_counts(report.contradictions)
     if not report.accepted:
         reason = "the residual's fit is not finite, or no tick of the window can be used"
@@ -49,14 +49,14 @@ def residual_update(computed_from: float, state: Any, report: FitReport) -> Resi
 
 
 def policy_update(computed_from: float, state: PolicyState, verdict: Verdict) -> PolicyUpdate | Rejection:
-    """Return the message of an update of the policy that has ended."""
+    """Return the message for a finished update of the policy."""
     if not verdict.admitted:
         return Rejection(computed_from, "policy", verdict.reason())
     return PolicyUpdate(computed_from, float(verdict.candidate), float(verdict.incumbent), state)
 
 
 class ResidualWorker:
-    """Fits the residual model, from where its last published fit ended."""
+    """Fits the residual model, starting from its last published fit."""
 
     layer: Layer = "residual"
 
@@ -65,7 +65,7 @@ class ResidualWorker:
 
     @property
     def state(self) -> Any:
-        """What a fit goes on from."""
+        """State of the residual model from which the next fit starts."""
         return self._residual
 
     def learn(self, window: Window) -> ResidualUpdate | Rejection:
@@ -74,7 +74,7 @@ class ResidualWorker:
         return residual_update(float(window.t[-1]), fitted, report)
 
     def receive(self, update: Update) -> None:
-        """Go on from a published fit."""
+        """Continue from a published fit."""
         if isinstance(update, ResidualUpdate):
             self._residual = update.state
 
@@ -91,28 +91,28 @@ class PolicyWorker:
 
     @property
     def state(self) -> LearnerState:
-        """What an update goes on from: a policy, in the model of a residual."""
+        """Policy and residual from which the next update starts."""
         return LearnerState(self._policy, self._residual)
 
     @property
     def policy(self) -> Policy | LoraPolicy:
-        """The policy that an update goes on from."""
+        """Policy from which the next update starts."""
         return self._policy.policy
 
     def next_key(self) -> Key[Array, ""]:
-        """Return the key of an update; each call returns another."""
+        """Return the key of the next update; each call returns a new key."""
         self.key, key = random.split(self.key)
         now: Key[Array, ""] = key
         return now
 
     def learn(self, window: Window) -> PolicyUpdate | Rejection:
-        """Re-train; the window gives starts for the gate."""
+        """Re-train the policy; the window provides starts for the gate."""
         key = self.next_key()
         trained, verdict = jax.block_until_ready(self.learner.update_policy(self._policy, self._residual, window, key))
         return policy_update(float(window.t[-1]), trained, verdict)
 
     def receive(self, update: Update) -> None:
-        """Go on from a published policy, in the model of a published residual."""
+        """Continue from a published policy, and with the model of a published residual."""
         if isinstance(update, PolicyUpdate):
             self._policy = update.state
         elif isinstance(update, ResidualUpdate):

@@ -1,4 +1,4 @@
-"""Controllers: policies and others."""
+"""Controllers: learned policies and other control laws."""
 
 from .controller import AbstractController as AbstractController
 from .controller import PolicyController as PolicyController

@@ -23,14 +23,14 @@ class TrackingState(eqx.Module):
 
 
 class ActuatorTracking(AbstractController[TrackingState]):
-    """Tells the controller inside which thrust and body rates act now.
+    """Provides the controller inside with the present thrust and body rates.
 
     The command path predicts them. A gyroscope, or the measured attitudes, corrects the body rates.
     """
 
     inner: AbstractController[Any]
     path: CommandPath
-    """Command path of the vehicle, as far as it is known."""
+    """Known command path of the vehicle."""
     dt: float = eqx.field(static=True)
     """Control tick [s]."""
     omega: Float[Array, "3"] | None = None
@@ -47,7 +47,7 @@ class ActuatorTracking(AbstractController[TrackingState]):
         return dataclasses.replace(self, inner=self.inner.with_inertial(omega, a), omega=omega)
 
     def with_vehicle(self, member: Member) -> "ActuatorTracking":
-        """Return the same for a vehicle that was identified."""
+        """Return the same for an identified vehicle."""
         return dataclasses.replace(self, inner=self.inner.with_vehicle(member), path=member.path)
 
     def condition(self, memory: TrackingState) -> Condition | None:
@@ -59,7 +59,7 @@ class ActuatorTracking(AbstractController[TrackingState]):
         return TrackingState(BodyRates.start(x, self.dt), self.inner.init(x))
 
     def __call__(self, memory: TrackingState, t: Float[Array, ""], x: State) -> tuple[Command, TrackingState]:
-        """Return the command of the controller inside, which is told what acts."""
+        """Return the command of the controller inside, which receives the present thrust and body rates."""
         rates = memory.rates.measured(x, self.age, self.path, self.dt, self.omega)
         u, inner = self.inner.with_actuators(rates.path.actuators)(memory.inner, t, x)
         return u, TrackingState(rates.issued(u, self.path, self.dt), inner)

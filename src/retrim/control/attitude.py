@@ -1,4 +1,4 @@
-"""From the acceleration that a vehicle shall have to the command that gives it."""
+"""Conversion of a desired acceleration into a command."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -8,15 +8,15 @@ from ..physics.state import STANDARD_GRAVITY, Command, State
 from ..tasks.abstract_reference import Point
 from ..tasks.flatness import flat_command
 
-LEAST_LIFT = 2.0  # [m/s^2], upward part of the thrust that is asked for: an attitude needs some
-STEEPEST = 4.0  # tangent of the largest tilt that is asked for, 76 degrees
+LEAST_LIFT = 2.0  # [m/s^2], smallest upward part of a desired thrust, which the attitude needs to be defined
+STEEPEST = 4.0  # tangent of the largest desired tilt, 76 degrees
 
 
 def flyable(thrust: Float[Array, "3"]) -> Float[Array, "3"]:
-    """Return a thrust that a quadrotor can turn to: upward, and tilted by 76 degrees at most.
+    """Return a thrust to which a quadrotor can turn: upward, and tilted by at most 76 degrees.
 
     Args:
-        thrust: Mass-normalised thrust that is wanted, world [m/s^2].
+        thrust: Desired mass-normalised thrust, world [m/s^2].
     """
     up = jnp.maximum(thrust[2], LEAST_LIFT)
     sideways = jnp.sqrt(jnp.sum(thrust[:2] ** 2) + 1e-12)
@@ -32,21 +32,21 @@ def attitude_of(thrust: Float[Array, "3"], heading: Float[Array, ""]) -> Float[A
 
 
 def thrust_of(acceleration: Float[Array, "3"]) -> Float[Array, "3"]:
-    """Return the mass-normalised thrust that gives an acceleration, world [m/s^2]."""
+    """Return the mass-normalised thrust for an acceleration, world [m/s^2]."""
     return acceleration + jnp.array([0.0, 0.0, STANDARD_GRAVITY], dtype=acceleration.dtype)
 
 
 def command_for(x: State, thrust: Float[Array, "3"], wanted: Point, gain: Float[Array, "3"]) -> Command:
-    """Return the command that turns a vehicle to a thrust, and gives what lies along its axis already.
+    """Return the command that turns a vehicle to a thrust; its collective thrust is the part along the present axis.
 
     Args:
         x: State in which the command begins to act.
-        thrust: Mass-normalised thrust that is wanted, world [m/s^2].
-        wanted: Reference: its heading, and how fast its attitude turns.
-        gain: Body rate for each radian of attitude error, about each body axis [1/s].
+        thrust: Desired mass-normalised thrust, world [m/s^2].
+        wanted: Reference, for its heading and the rate of its attitude.
+        gain: Body rate per radian of attitude error, about each body axis [1/s].
 
     Source:
-        Lee, Leok and McClamroch 2010, on the level of body rates, with the rotation vector as the attitude error.
+        Lee, Leok and McClamroch 2010, at the level of body rates, with the rotation vector as the attitude error.
     """
     thrust = flyable(thrust)
     R = attitude_of(thrust, wanted.heading)

@@ -1,4 +1,4 @@
-"""Condition of a controller that can step back from a part of its function, and the words for it."""
+"""Condition of a controller that can step back from a part of its function, and its description in words."""
 
 from enum import IntEnum
 
@@ -7,7 +7,7 @@ from jaxtyping import Array, Int
 
 
 class Stage(IntEnum):
-    """Which parts of an adapted flight act."""
+    """Active parts of an adapted flight."""
 
     ADAPTED = 0
     OBSERVED = 1
@@ -39,7 +39,7 @@ GROUNDS = {
 
 
 class Condition(eqx.Module):
-    """How far a controller has stepped back, and why."""
+    """Stage to which a controller has stepped back, and the cause."""
 
     stage: Int[Array, ""]
     cause: Int[Array, ""]
@@ -50,5 +50,5 @@ class Condition(eqx.Module):
 
 
 def describe_condition(stage: int, cause: int) -> str:
-    """Return a stage and the cause of its beginning in words."""
+    """Return a stage and its cause in words."""
     return f"{PARTS[Stage(stage)]}: {GROUNDS[Cause(cause)]}"

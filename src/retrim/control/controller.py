@@ -22,18 +22,18 @@ M = TypeVar("M")
 
 
 class AbstractController(eqx.Module, Generic[M]):
-    """Learned policies, model-predictive control and classical laws alike."""
+    """Base class of learned policies, model-predictive control and classical control laws."""
 
     @abc.abstractmethod
     def init(self, x: State) -> M:
-        """Return the memory at the start of a flight in the state ``x``; like a call, it is traced by JAX."""
+        """Return the memory at the start of a flight in the state ``x``; JAX traces it, as it traces calls."""
 
     @abc.abstractmethod
     def __call__(self, memory: M, t: Float[Array, ""], x: State) -> tuple[Command, M]:
-        """Decide the next command.
+        """Return the next command.
 
         Args:
-            memory: What :meth:`init` or the last call returned.
+            memory: Result of :meth:`init` or of the last call.
             t: Time since the start of the flight [s].
             x: Measured state.
 
@@ -47,12 +47,12 @@ class AbstractController(eqx.Module, Generic[M]):
         return memory
 
     def with_age(self, age: float | Float[Array, ""]) -> "AbstractController[M]":
-        """Return the same controller for measurements ``age`` old [s]; by default they are taken as they are."""
+        """Return the same controller for measurements ``age`` old [s]; by default the age is ignored."""
         del age
         return self
 
     def with_inertial(self, omega: Float[Array, "3"], a: Float[Array, "3"]) -> "AbstractController[M]":
-        """Return the same controller for a tick in which more was measured; by default it is not looked at.
+        """Return the same controller for a tick with inertial measurements; by default they are ignored.
 
         Args:
             omega: Body rates [rad/s].
@@ -62,16 +62,16 @@ class AbstractController(eqx.Module, Generic[M]):
         return self
 
     def with_vehicle(self, member: Member) -> "AbstractController[M]":
-        """Return the same controller for a vehicle that was identified; by default it does not use it.
+        """Return the same controller for an identified vehicle; by default it is ignored.
 
         Args:
-            member: Its most likely command path, and the belief about it.
+            member: Most likely command path of the vehicle, and the belief about it.
         """
         del member
         return self
 
     def with_actuators(self, actuators: ActuatorState) -> "AbstractController[M]":
-        """Return the same controller for a tick in which thrust and rates are known; by default it does not use them.
+        """Return the same controller for a tick in which thrust and rates are known; by default they are ignored.
 
         Args:
             actuators: Present thrust and body rates.
@@ -80,7 +80,7 @@ class AbstractController(eqx.Module, Generic[M]):
         return self
 
     def condition(self, memory: M) -> Condition | None:
-        """Return how far the controller has stepped back from its full function; None if it never does."""
+        """Return the condition of the controller; None for a controller that never steps back."""
         del memory
         return None
 
@@ -90,16 +90,16 @@ class AbstractController(eqx.Module, Generic[M]):
         return False
 
     def follow(self, estimate: VehicleEstimate) -> "AbstractController[Any]":
-        """Return the controller for a vehicle that another process identifies; by default it does not use it.
+        """Return the controller for a vehicle that another process identifies; by default the estimate is ignored.
 
         Args:
-            estimate: Vehicle as it is identified now.
+            estimate: Present estimate of the vehicle.
         """
         del estimate
         return self
 
     def vehicle(self, memory: M) -> VehicleReport | None:
-        """Return the vehicle that was identified; None for a controller that identifies none."""
+        """Return the identified vehicle; None for a controller that does not identify the vehicle."""
         del memory
         return None
 
@@ -107,13 +107,13 @@ class AbstractController(eqx.Module, Generic[M]):
         """Return the same controller for states and commands of ``frame``.
 
         Raises:
-            FrameError: It cannot be turned.
+            FrameError: The controller does not support other frames.
         """
         raise FrameError(f"{type(self).__name__} cannot be flown in another frame")
 
 
 class PolicyController(AbstractController[tuple[Any, Command]]):
-    """A policy behind its observation. The memory is that of the observation, and the last command."""
+    """A policy with its observation. The memory consists of that of the observation and the last command."""
 
     observation: AbstractObservation[Any]
     policy: Policy
@@ -136,13 +136,13 @@ class PolicyController(AbstractController[tuple[Any, Command]]):
         return memory[0], u
 
     def with_vehicle(self, member: Member) -> "PolicyController":
-        """Return the same policy behind the observation of a vehicle that was identified."""
+        """Return the same policy with the observation of an identified vehicle."""
         return dataclasses.replace(self, observation=self.observation.with_belief(member.belief))
 
     def with_actuators(self, actuators: ActuatorState) -> "PolicyController":
-        """Return the same policy behind the observation of a vehicle whose thrust and rates are known."""
+        """Return the same policy with the observation of a vehicle whose thrust and rates are known."""
         return dataclasses.replace(self, observation=self.observation.with_actuators(actuators))
 
     def in_frame(self, frame: FeltFrame) -> "PolicyController":
-        """Return the same policy behind the turned observation."""
+        """Return the same policy with the observation in ``frame``."""
         return dataclasses.replace(self, observation=self.observation.in_frame(frame))

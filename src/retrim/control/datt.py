@@ -1,7 +1,8 @@
-"""DATT (Huang et al. 2023): a policy that looks ahead along its reference, and is told the disturbance.
+"""DATT (Huang et al. 2023): a policy that looks ahead along its reference and receives the disturbance.
 
-Written from the paper's description, with what makes it stronger here: positions are relative to the reference, vectors
-in the body frame, and it sees the state in which its command begins to act, and what acts until then.
+The implementation follows the description in the paper, with changes that improve it here: positions are relative to
+the reference, vectors are in the body frame, and the observation contains the state in which the command begins to act
+and the command that acts until then.
 """
 
 import dataclasses
@@ -18,17 +19,17 @@ from ..physics.state import STANDARD_GRAVITY, Command, State
 from ..tasks.task import AbstractTask
 from .controller import AbstractController
 
-AHEAD, APART = 10, 0.06  # points of the reference that are seen, and the time between them [s]
-OWN = 22  # numbers of the state: error, velocity, attitude, disturbance, what acts
+AHEAD, APART = 10, 0.06  # number of reference points in the observation, and the time between them [s]
+OWN = 22  # numbers of the state: error, velocity, attitude, disturbance, acting command
 SIZE = OWN + 3 * AHEAD
-SCALE = (5.0, 3.0, 3.0, 1.0)  # of actions: [m/s^2], [rad/s]
+SCALE = (5.0, 3.0, 3.0, 1.0)  # scale of actions: [m/s^2], [rad/s]
 
 
 class DattNet(eqx.Module):
-    """Actor and critic behind one encoder of the look-ahead: two convolutions along it, then three layers each."""
+    """Actor and critic with a shared encoder of the look-ahead: two convolutions along it, then three layers each."""
 
     first: Float[Array, "3 3 8"]
-    """Kernel of three points, three coordinates, eight channels."""
+    """Kernel: three points, three coordinates, eight channels."""
     first_bias: Float[Array, "8"]
     second: Float[Array, "3 8 8"]
     second_bias: Float[Array, "8"]
@@ -51,7 +52,7 @@ class DattNet(eqx.Module):
             jnp.zeros(8),
             actor,
             eqx.nn.MLP(seen, "scalar", width, 3, key=k_critic),
-            jnp.full(4, -0.5, dtype=actor.layers[-1].bias.dtype),  # of a weak type, the first update is compiled twice
+            jnp.full(4, -0.5, dtype=actor.layers[-1].bias.dtype),  # a weak type would compile the first update twice
         )
 
     def __call__(self, o: Float[Array, " o"]) -> tuple[Float[Array, "4"], Float[Array, ""]]:
@@ -62,7 +63,7 @@ class DattNet(eqx.Module):
 
 
 def _along(points: Float[Array, "n i"], kernel: Float[Array, "k i c"], bias: Float[Array, " c"]) -> Float[Array, "m c"]:
-    """A convolution along the points, as one product with a banded matrix: rows of samples make it a large one."""
+    """Return a convolution along the points, as one product with a banded matrix, which is large for many samples."""
     n, i = points.shape
     k, _, c = kernel.shape
     m = n - k + 1
@@ -73,7 +74,7 @@ def _along(points: Float[Array, "n i"], kernel: Float[Array, "k i c"], bias: Flo
 
 
 def datt_observation(x: State, acting: Command, d: Float[Array, "3"], ahead: Float[Array, "n 3"]) -> Float[Array, " o"]:
-    """Return what the policy sees.
+    """Return the observation of the policy.
 
     Args:
         x: State.
@@ -87,7 +88,7 @@ def datt_observation(x: State, acting: Command, d: Float[Array, "3"], ahead: Flo
 
 
 def datt_command(action: Float[Array, "4"], low: Command, high: Command) -> Command:
-    """Return the command of an action, within the limits; zero is hover."""
+    """Return the command of an action, within the limits; an action of zero is hover."""
     hover = jnp.array([STANDARD_GRAVITY, 0.0, 0.0, 0.0], dtype=action.dtype)
     wanted = hover + jnp.array(SCALE, dtype=action.dtype) * action
     return Command.of(wanted).within(low, high)
@@ -103,15 +104,15 @@ class DattState(eqx.Module):
 
 
 class Datt(AbstractController[DattState]):
-    """The trained policy in flight, told the disturbance by an L1 estimator."""
+    """The trained policy in flight, with the disturbance from an L1 estimator."""
 
     net: DattNet
     task: AbstractTask
-    """It says where the vehicle should be."""
+    """Task, which provides the reference."""
     prediction: Prediction
     estimator: L1Estimator
     known: Float[Array, ""]
-    """Largest disturbance per axis that training knew [m/s^2]; the estimate is cut off there."""
+    """Largest disturbance per axis in training [m/s^2]; the estimate is clipped to it."""
     low: Command
     high: Command
 

@@ -1,7 +1,7 @@
 """Active exploration: small doublets of thrust and body rates while the command path is not known well enough.
 
 Each pulse train is (+, -, -, +), so that it leaves neither a velocity nor a displacement. The vehicle moves by a few
-centimetres. A policy does not excite by default: whoever wants it adds the result to the command.
+centimetres. A policy does not excite by default; the caller adds the result to the command.
 """
 
 import equinox as eqx
@@ -24,13 +24,13 @@ class Excitation(eqx.Module):
     pulse: Float[Array, "4"]
     """Length of a pulse of thrust, roll, pitch and yaw [s]."""
     delay_margin: Float[Array, ""]
-    """Half width of the 90 % interval of the delay that is narrow enough [s]."""
+    """Sufficient half width of the 90 % interval of the delay [s]."""
     lag_margin: Float[Array, ""]
-    """Likewise of the lag of the rates, as a share of it."""
+    """The same for the lag of the rates, as a share of the lag."""
     gain_margin: Float[Array, ""]
-    """Likewise of the gain of the thrust."""
+    """The same for the gain of the thrust, as a share of the gain."""
     longest: Float[Array, ""]
-    """Time after which it ends in any case [s]."""
+    """Time after which the excitation ends in any case [s]."""
 
     @classmethod
     def of(
@@ -48,10 +48,10 @@ class Excitation(eqx.Module):
         Args:
             thrust: Amplitude of the thrust [m/s^2].
             rates: Amplitudes of the body rates [rad/s].
-            delay_margin: Half width of the 90 % interval of the delay that is narrow enough [s].
-            lag_margin: Likewise of the lag of the rates, as a share of it.
-            gain_margin: Likewise of the gain of the thrust, as a share of it.
-            longest: Time after which it ends in any case [s].
+            delay_margin: Sufficient half width of the 90 % interval of the delay [s].
+            lag_margin: The same for the lag of the rates, as a share of the lag.
+            gain_margin: The same for the gain of the thrust, as a share of the gain.
+            longest: Time after which the excitation ends in any case [s].
 
         Raises:
             ValueError: An amplitude is negative or a margin is not positive.
@@ -68,11 +68,11 @@ class Excitation(eqx.Module):
         return cls(jnp.array(thrust), jnp.array(rates), pulse, *margins, jnp.array(longest))
 
     def __call__(self, t: Float[Array, ""], estimate: PathEstimate) -> Command:
-        """Return what is added to the command: zero where the estimate is narrow enough.
+        """Return the addition to the command, which is zero where the estimate is narrow enough.
 
         Args:
             t: Time since the start of the flight [s].
-            estimate: What is known of the command path.
+            estimate: Present estimate of the command path.
         """
         t = t.astype(self.thrust.dtype)
         thrust, rates = self.wide(estimate)
@@ -84,7 +84,7 @@ class Excitation(eqx.Module):
         return Command(self.thrust * signs[0], self.rates * signs[1:])
 
     def wide(self, estimate: PathEstimate) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
-        """Return whether the thrust, and whether the rates, are not known to within the margins."""
+        """Return whether the estimates of thrust and of rates are wider than the margins."""
         gain, lag, delay = estimate.thrust_gain, estimate.rate_lag, estimate.delay
         thrust = 0.5 * (gain.high - gain.low) > self.gain_margin * gain.mean
         rates = 0.5 * (lag.high - lag.low) > self.lag_margin * lag.mean

@@ -1,4 +1,4 @@
-"""A controller that survives measurements that are no numbers."""
+"""A controller that tolerates measurements that are not finite."""
 
 from typing import Any, Generic, TypeVar
 
@@ -15,7 +15,7 @@ from .controller import AbstractController
 from .vehicle_report import VehicleReport
 
 LARGEST = float(2**20)
-"""A number of this size or more, in SI units, is no measurement; networks overflow far beyond it."""
+"""Limit of valid measurements, in SI units; networks overflow only far beyond it."""
 
 M = TypeVar("M")
 
@@ -71,7 +71,7 @@ class FiniteController(AbstractController[FiniteMemory[Any]]):
         return self.base.vehicle(memory.inner)
 
     def with_vehicle(self, member: Member) -> "FiniteController":
-        """Return the same for a vehicle that was identified."""
+        """Return the same for an identified vehicle."""
         return FiniteController(self.base.with_vehicle(member))
 
     def with_actuators(self, actuators: ActuatorState) -> "FiniteController":
@@ -84,5 +84,5 @@ class FiniteController(AbstractController[FiniteMemory[Any]]):
 
 
 def _all_below(tree: State | Command) -> Bool[Array, ""]:
-    """Whether all numbers are; NaN is not."""
+    """Return whether all numbers are below the limit; NaN is not."""
     return jnp.all(jnp.stack([jnp.all(jnp.abs(leaf) < LARGEST) for leaf in jax.tree.leaves(tree)]))

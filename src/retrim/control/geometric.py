@@ -15,16 +15,16 @@ from .controller import AbstractController
 
 
 class Gains(eqx.Module):
-    """Gains of a controller in three loops."""
+    """Gains of a controller with three loops."""
 
     position: Float[Array, ""]
-    """[1/s^2]"""
+    """Gain of the position error [1/s^2]."""
     velocity: Float[Array, ""]
-    """[1/s]"""
+    """Gain of the velocity error [1/s]."""
     attitude: Float[Array, ""]
-    """[1/s]"""
+    """Gain of the attitude error [1/s]."""
     integral: Float[Array, ""]
-    """[1/s^3]; zero: no integral action."""
+    """Gain of the integral of the position error [1/s^3]; zero for no integral action."""
 
     def acceleration(self, x: State, wanted: Point, integral: Float[Array, "3"]) -> Float[Array, "3"]:
         """Return the acceleration that brings a vehicle to its reference, world [m/s^2].
@@ -32,13 +32,13 @@ class Gains(eqx.Module):
         Args:
             x: State.
             wanted: Reference.
-            integral: Of the position error [m s].
+            integral: Integral of the position error [m s].
         """
         back = self.position * (wanted.p - x.p) + self.velocity * (wanted.v - x.v)
         return wanted.a + back + self.integral * integral
 
     def turning(self) -> Float[Array, "3"]:
-        """Return the gains of the attitude about each body axis [1/s]; a quadrotor turns slowly about its thrust."""
+        """Return the attitude gain about each body axis [1/s]; a quadrotor turns slowly about its thrust axis."""
         return self.attitude * jnp.array([1.0, 1.0, 0.4], dtype=self.attitude.dtype)
 
 
@@ -47,22 +47,22 @@ class GeometricState(eqx.Module):
 
     underway: Underway
     integral: Float[Array, "3"]
-    """Of the position error [m s]."""
+    """Integral of the position error [m s]."""
 
 
 class Geometric(AbstractController[GeometricState]):
-    """Geometric tracking, with integral action where its gain is not zero."""
+    """Geometric tracking, with integral action if its gain is not zero."""
 
     task: AbstractTask
-    """It says where the vehicle should be."""
+    """Task, which provides the reference."""
     gains: Gains
     prediction: Prediction
     limit: Float[Array, ""]
-    """Of what integral action asks for, per axis [m/s^2]."""
+    """Largest acceleration from integral action, per axis [m/s^2]."""
     low: Command
     """Smallest command that the vehicle accepts."""
     high: Command
-    """Largest command that it accepts."""
+    """Largest command that the vehicle accepts."""
 
     def with_age(self, age: float | Float[Array, ""]) -> "Geometric":
         """Return the same for measurements that are ``age`` old [s]."""
@@ -73,7 +73,7 @@ class Geometric(AbstractController[GeometricState]):
         return GeometricState(self.prediction.init(x), jnp.zeros_like(x.p))
 
     def __call__(self, memory: GeometricState, t: Float[Array, ""], x: State) -> tuple[Command, GeometricState]:
-        """Decide for the state in which the command begins to act."""
+        """Compute the command for the state in which it begins to act."""
         gain, dt = self.gains.integral, self.prediction.dt
         x, _ = self.prediction(memory.underway, x, gain * -memory.integral)
         wanted = self.task.wanted(t + self.prediction.delay_ticks * dt)

@@ -1,8 +1,8 @@
-"""Fly an unchanged controller in the frame of the gravity that the vehicle feels.
+"""Fly an unchanged controller in the frame of the effective gravity.
 
-A constant disturbance is gravity, tilted and scaled (:mod:`retrim.physics.felt_frame`): in that frame nothing disturbs
-the vehicle, so a controller needs no other input, and no other training, to do its task under a constant push. What
-changes with state and command is answered as if it stayed as it is now.
+A constant disturbance tilts and scales gravity (:mod:`retrim.physics.felt_frame`). In the frame of this effective
+gravity the vehicle is undisturbed, so a controller performs its task under a constant push without further inputs or
+training. A disturbance that changes with state and command is treated as if its present value were constant.
 """
 
 import dataclasses
@@ -24,7 +24,7 @@ from ..physics.state import Command, State
 from ..tasks.occluded import OccludedMemory
 from .controller import AbstractController, PolicyController
 
-SHARE_OF_LATENESS = 0.25  # of delay and rate lag: time constant of the observer for an identified vehicle
+SHARE_OF_LATENESS = 0.25  # time constant of the observer for an identified vehicle, as a share of delay plus rate lag
 FASTEST, SLOWEST = 0.015, 0.05  # [s], its limits
 
 
@@ -38,36 +38,36 @@ class GravityFrameState(eqx.Module):
 
 
 class GravityFrame(AbstractController[GravityFrameState]):
-    """Any controller that can be turned, in the gravity that is known and that a disturbance observer estimates."""
+    """Flies a controller in the frame of the effective gravity, from a known and an estimated disturbance."""
 
     inner: AbstractController[Any]
     observer: DisturbanceObserver
-    """It estimates what is not known."""
+    """Observer that estimates the unknown part of the disturbance."""
     known: Residual | None = None
-    """Residual that has been learnt, world frame [m/s^2]: what it says beyond what it says at rest needs no estimate,
-    which would come late."""
+    """Learned residual, world frame [m/s^2]. Its deviation from its value at rest is used directly, since an estimate
+    of it would be late."""
     age: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(0.0))
-    """How old measurements are [s]: the controller inside is shown what they say of now."""
+    """Age of measurements [s]; the controller inside receives the state extrapolated to the current time."""
     rate_bias: Float[Array, "3"] = eqx.field(default_factory=lambda: jnp.zeros(3))
-    """The vehicle turns so much faster than it is told [rad/s], so it is told less."""
+    """Actual minus commanded body rates [rad/s]; it is subtracted from the command."""
     trust_estimate: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(1.0))
-    """Share of the disturbance that turns the frame: 0 flies the controller inside as it is."""
+    """Share of the disturbance that turns the frame; with 0 the controller inside flies without compensation."""
     trust_known: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(1.0))
-    """Share of what has been learnt, residual and bias of the rates, that is used."""
+    """Share of the learned residual and of the learned bias of the rates that is used."""
     actuators: ActuatorState | None = None
-    """Present thrust and body rates; None: the last command acts."""
+    """Present thrust and body rates; None if the last command acts."""
     steady: Float[Array, "3"] = eqx.field(default_factory=lambda: jnp.zeros(3))
-    """Disturbance that turns the frame beside the estimated one, world [m/s^2]."""
+    """Disturbance that turns the frame in addition to the estimated one, world [m/s^2]."""
 
     def with_age(self, age: float | Float[Array, ""]) -> "GravityFrame":
         """Return the same for measurements that are ``age`` old [s]."""
         return dataclasses.replace(self, age=jnp.array(age))
 
     def with_vehicle(self, member: Member) -> "GravityFrame":
-        """Return the same for a vehicle that was identified.
+        """Return the same for an identified vehicle.
 
-        The observer uses its delay and the lag of its thrust. It is as fast as the vehicle permits: the frame must not
-        turn much faster than the vehicle can follow.
+        The observer uses the delay of the vehicle and the lag of its thrust. It is as fast as the
+        vehicle permits, since the frame must not turn much faster than the vehicle can follow.
         """
         observer = dataclasses.replace(self.observer, path=member.path)
         if member.lateness is not None:
@@ -89,7 +89,7 @@ class GravityFrame(AbstractController[GravityFrameState]):
         return GravityFrameState(observed, self.inner.init(x), FeltFrame.of(observed.d_hat))
 
     def __call__(self, memory: GravityFrameState, t: Float[Array, ""], x: State) -> tuple[Command, GravityFrameState]:
-        """Return the inner controller's command in the frame of what is felt now."""
+        """Return the command of the controller inside, in the frame of the present effective gravity."""
         observer, felt = self.observer, jnp.zeros_like(x.p)
         if self.known is not None:
             unsteady = Unsteady(self.known, self.trust_known)
@@ -109,7 +109,7 @@ class GravityFrame(AbstractController[GravityFrameState]):
         return u, GravityFrameState(observer.issued(observed, u), inner, frame)
 
     def accepted(self, memory: GravityFrameState, u: Command) -> GravityFrameState:
-        """Remember the accepted command, in the observer and, as the frame has it, in the controller inside."""
+        """Remember the accepted command in the observer and, transformed to the frame, in the controller inside."""
         observer = self.observer.accepted(memory.observer, u)
         meant = memory.frame.command(Command(u.c, u.omega + self._bias(u.omega.dtype)))
         return GravityFrameState(observer, self.inner.accepted(memory.inner, meant), memory.frame)
@@ -119,7 +119,10 @@ class GravityFrame(AbstractController[GravityFrameState]):
 
 
 class SeenFrame(AbstractController[tuple[OccludedMemory, Command]]):
-    """A policy behind :class:`OccludedKeypoints`, in the gravity that its pose filter estimates; it needs no state."""
+    """A policy with :class:`OccludedKeypoints`, in the frame of the effective gravity that its pose filter estimates.
+
+    It does not need the measured state.
+    """
 
     inner: PolicyController
     limit: Float[Array, ""]
@@ -132,7 +135,7 @@ class SeenFrame(AbstractController[tuple[OccludedMemory, Command]]):
     def __call__(
         self, memory: tuple[OccludedMemory, Command], t: Float[Array, ""], x: State
     ) -> tuple[Command, tuple[OccludedMemory, Command]]:
-        """Return the inner controller's command in the frame of what was felt a tick ago."""
+        """Return the command of the controller inside, in the frame of the effective gravity one tick ago."""
         seen, last = memory
         frame = FeltFrame.of(capped(seen.pose.d, self.limit))
         u, (seen, _) = self.inner.in_frame(frame)((seen, frame.command(last)), t, frame.state(x))
@@ -145,24 +148,24 @@ class SeenFrame(AbstractController[tuple[OccludedMemory, Command]]):
 
 
 class Unsteady(eqx.Module):
-    """What a residual predicts beyond what it predicts at rest: that part depends on state and command."""
+    """Part of a residual beyond its value at rest; this part depends on state and command."""
 
     residual: Residual
     share: Float[Array, ""]
-    """Share of it that is used."""
+    """Share of this part that is used."""
 
     def __call__(self, x: State, u: Command) -> Float[Array, "3"]:
-        """Return the rest of the residual acceleration, world frame [m/s^2]."""
+        """Return this part of the residual acceleration, world frame [m/s^2]."""
         rest = self.residual(x, u) - self.residual(State.at(x.p), Command.hover(x.p.dtype))
         return self.share.astype(x.p.dtype) * rest
 
 
 class Capped(eqx.Module):
-    """A residual whose norm is limited, so that there is a frame of the gravity that is felt."""
+    """A residual with a limited norm, so that the frame of the effective gravity is defined."""
 
     residual: Residual
     limit: Float[Array, ""]
-    """[m/s^2]"""
+    """Largest norm [m/s^2]."""
 
     def __call__(self, x: State, u: Command) -> Float[Array, "3"]:
         """Return the residual acceleration, world frame [m/s^2]."""
@@ -170,5 +173,5 @@ class Capped(eqx.Module):
 
 
 def capped(d: Float[Array, "3"], limit: Float[Array, ""]) -> Float[Array, "3"]:
-    """Return ``d``, shortened to ``limit`` if it is longer."""
+    """Return ``d`` with its norm limited to ``limit``."""
     return d * jnp.minimum(1.0, limit / jnp.sqrt(jnp.sum(d * d) + 1e-12))

@@ -1,9 +1,9 @@
-"""Identify the vehicle in flight, and fly by the result.
+"""Identify the vehicle in flight, and use the result in the controller.
 
-The estimator of the command path (:mod:`retrim.estimation.command_path`) sees every measurement and command. Its 90 %
-intervals become the belief of a policy that is trained for a family of vehicles, and the gain of the thrust scales the
-commands. Nothing is trained or compiled for that: beliefs are inputs. They change slowly, so that no estimate, right or
-wrong, changes the commands by a jump.
+The estimator of the command path (:mod:`retrim.estimation.command_path`) receives every measurement and command. Its
+90 % intervals become the belief of a policy that is trained for a family of vehicles, and the gain of the thrust scales
+the commands. This does not need training or compilation, since beliefs are inputs. They change slowly, so that an
+estimate, right or wrong, does not make the commands jump.
 """
 
 import dataclasses
@@ -22,22 +22,22 @@ from .controller import AbstractController
 from .vehicle_report import VehicleEstimate, VehicleReport
 
 PACE = 2.0  # [1/s]: an unknown coordinate is known after half a second at the earliest
-GAIN_PACE = 1.0  # [1/s], change of the gain of the thrust
+GAIN_PACE = 1.0  # [1/s], largest rate of change of the gain of the thrust
 GAINS = (0.4, 2.5)
 
 
 class BeliefState(eqx.Module):
-    """Memory of a flight by a belief, and of the controller inside."""
+    """Memory of a flight with a belief, and of the controller inside."""
 
     belief: PathBelief
     """Belief of the last command."""
     gain: Float[Array, ""]
-    """Gain of the thrust that the last command allows for."""
+    """Gain of the thrust that is used for the last command."""
     inner: Any
 
 
 class BeliefFlight(AbstractController[BeliefState]):
-    """Flies a controller for a family of vehicles by a belief, which follows the identified vehicle slowly."""
+    """Flies a controller for a family of vehicles with a belief, which follows the identified vehicle slowly."""
 
     inner: AbstractController[Any]
     family: PathFamily
@@ -65,7 +65,7 @@ class BeliefFlight(AbstractController[BeliefState]):
         return BeliefState(self.prior, jnp.ones_like(x.p[0]), self._flying(self.prior).init(x))
 
     def __call__(self, memory: BeliefState, t: Float[Array, ""], x: State) -> tuple[Command, BeliefState]:
-        """Return the command of the controller inside for the vehicle as it is believed now."""
+        """Return the command of the controller inside for the present belief about the vehicle."""
         dt = self.dt
         belief = memory.belief.towards(self.estimate.belief, PACE * dt)
         change = jnp.clip(self.estimate.gain.astype(x.p.dtype) - memory.gain, -GAIN_PACE * dt, GAIN_PACE * dt)
@@ -85,14 +85,14 @@ class BeliefFlight(AbstractController[BeliefState]):
 
 
 class IdentifiedState(eqx.Module):
-    """Memory of the identification and of the flight by its result."""
+    """Memory of the identification and of the flight that uses its result."""
 
     path: EstimatorState
     flight: BeliefState
 
 
 class IdentifiedFlight(AbstractController[IdentifiedState]):
-    """Flies a controller for a family of vehicles, and identifies which vehicle it is."""
+    """Flies a controller for a family of vehicles, and identifies the vehicle."""
 
     inner: AbstractController[Any]
     estimator: PathEstimator
@@ -100,7 +100,7 @@ class IdentifiedFlight(AbstractController[IdentifiedState]):
     prior: PathBelief
     """Belief at take-off."""
     declared: Float[Array, "2"] | None = None
-    """Command delay and rate lag of the vehicle file [s]; None if it states none."""
+    """Command delay and rate lag of the vehicle file [s]; None if the file does not state them."""
     omega: Float[Array, "3"] | None = None
     """Measured body rates [rad/s]; None if they are not measured."""
     a: Float[Array, "3"] | None = None
@@ -121,7 +121,7 @@ class IdentifiedFlight(AbstractController[IdentifiedState]):
         return self.inner.condition(memory.flight.inner)
 
     def vehicle(self, memory: IdentifiedState) -> VehicleReport:
-        """Return the vehicle as it is known now."""
+        """Return the present estimate of the vehicle."""
         return VehicleReport(memory.path.estimate, self.declared)
 
     def init(self, x: State) -> IdentifiedState:
@@ -130,7 +130,7 @@ class IdentifiedFlight(AbstractController[IdentifiedState]):
         return IdentifiedState(path, self.follow(vehicle_estimate(self.family, path.estimate)).init(x))
 
     def __call__(self, memory: IdentifiedState, t: Float[Array, ""], x: State) -> tuple[Command, IdentifiedState]:
-        """Identify, and return the command of the controller inside for the vehicle as it is known now."""
+        """Update the identification, and return the command of the controller inside for the present estimate."""
         path = self.estimator.update(memory.path, t, x, self.omega, self.a, self.age)
         u, flight = self.follow(vehicle_estimate(self.family, path.estimate))(memory.flight, t, x)
         return u, IdentifiedState(self.estimator.issued(path, u), flight)
@@ -144,20 +144,20 @@ class IdentifiedFlight(AbstractController[IdentifiedState]):
 
     @property
     def identifies(self) -> bool:
-        """True."""
+        """Whether the controller identifies its vehicle in flight: always true."""
         return True
 
     def follow(self, estimate: VehicleEstimate) -> BeliefFlight:
-        """Return the flight by the result of an identification, here or in another process.
+        """Return the controller for the result of an identification, here or in another process.
 
         Args:
-            estimate: Vehicle as it is identified now.
+            estimate: Present estimate of the vehicle.
         """
         return BeliefFlight(self.inner, self.family, self.prior, estimate, self.estimator.dt)
 
 
 def vehicle_estimate(family: PathFamily, estimate: PathEstimate) -> VehicleEstimate:
-    """Return the vehicle of an estimate of its command path.
+    """Return the estimate of the vehicle from an estimate of its command path.
 
     Args:
         family: Family of the vehicle.
@@ -167,7 +167,7 @@ def vehicle_estimate(family: PathFamily, estimate: PathEstimate) -> VehicleEstim
 
 
 def belief_from(family: PathFamily, estimate: PathEstimate) -> PathBelief:
-    """Return what an estimate says of the coordinates of a path: the 90 % interval of each.
+    """Return the belief from an estimate: the 90 % interval of each coordinate of the path.
 
     Args:
         family: Family of the vehicle.
@@ -186,5 +186,5 @@ def belief_from(family: PathFamily, estimate: PathEstimate) -> PathBelief:
 
 
 def bounded_gain(estimate: PathEstimate) -> Float[Array, ""]:
-    """Return the gain of the thrust of an estimate, within what a vehicle may have."""
+    """Return the gain of the thrust of an estimate, within the range of possible vehicles."""
     return jnp.clip(estimate.thrust_gain.mean, *GAINS)

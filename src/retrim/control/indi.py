@@ -1,8 +1,8 @@
-"""Incremental nonlinear dynamic inversion: the thrust that acts, corrected by what the measured acceleration lacks.
+"""Incremental nonlinear dynamic inversion: corrects the acting thrust by the error of the measured acceleration.
 
-Whatever disturbs the vehicle is in the acceleration that is measured, so that no model of it is needed: the wanted
-thrust is f + (a_wanted - a), with the thrust f that acts and the acceleration a behind one filter, so that they belong
-to the same moment (Smeur, de Croon and Chu 2018; Tal and Karaman 2021, here above the loop of the body rates).
+The measured acceleration contains every disturbance, so that a model of the disturbance is not needed: the desired
+thrust is f + (a_wanted - a). The acting thrust f and the acceleration a pass the same filter, so that they belong to
+the same time (Smeur, de Croon and Chu 2018; Tal and Karaman 2021, here above the loop of the body rates).
 """
 
 import dataclasses
@@ -28,16 +28,17 @@ class IncrementalState(eqx.Module):
     last: State
     """State measured one tick ago."""
     excess: Float[Array, "3"]
-    """What the thrust that acts has beyond the measured acceleration and gravity, filtered, world [m/s^2]."""
+    """Filtered difference between the acting thrust and the thrust that explains the measured acceleration, world
+    [m/s^2]."""
     t: Float[Array, ""]
-    """Time of the last measurement [s]; minus infinity before the first: then there is nothing to compare."""
+    """Time of the last measurement [s]; minus infinity before the first measurement."""
 
 
 class Incremental(AbstractController[IncrementalState]):
-    """INDI on the level of the thrust vector."""
+    """INDI at the level of the thrust vector."""
 
     task: AbstractTask
-    """It says where the vehicle should be."""
+    """Task, which provides the reference."""
     gains: Gains
     prediction: Prediction
     tau: Float[Array, ""]
@@ -45,11 +46,11 @@ class Incremental(AbstractController[IncrementalState]):
     low: Command
     """Smallest command that the vehicle accepts."""
     high: Command
-    """Largest command that it accepts."""
+    """Largest command that the vehicle accepts."""
     omega: Float[Array, "3"] | None = None
-    """Measured body rates [rad/s]; None: those that the commands give."""
+    """Measured body rates [rad/s]; None for those that follow from the commands."""
     a: Float[Array, "3"] | None = None
-    """Measured acceleration, the mean over the last tick, world [m/s^2]; None: that of the measured velocities."""
+    """Measured acceleration, the mean over the last tick, world [m/s^2]; None for that of the measured velocities."""
 
     def with_age(self, age: float | Float[Array, ""]) -> "Incremental":
         """Return the same for measurements that are ``age`` old [s]."""
@@ -64,11 +65,11 @@ class Incremental(AbstractController[IncrementalState]):
         return IncrementalState(self.prediction.init(x), x, jnp.zeros_like(x.p), jnp.full_like(x.p[0], -jnp.inf))
 
     def __call__(self, memory: IncrementalState, t: Float[Array, ""], x: State) -> tuple[Command, IncrementalState]:
-        """Decide for the state in which the command begins to act."""
+        """Compute the command for the state in which it begins to act."""
         dt, last = self.prediction.dt, memory.last
         acted, _ = self.prediction.acted(memory.underway)
         a = (x.v - last.v) / dt if self.a is None else self.a
-        # An accelerometer is not late where the attitude is.
+        # The accelerometer has no latency, even if the attitude has.
         late = self.prediction.age if self.a is not None else jnp.zeros_like(self.prediction.age)
         turned = so3.exp(late.astype(a.dtype) * (acted.omega if self.omega is None else self.omega))
         thrust = self.prediction.thrust(memory.underway, so3.mul(last.R, turned), so3.mul(x.R, turned))

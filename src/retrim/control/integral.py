@@ -1,4 +1,4 @@
-"""Integral action on the position of an unchanged policy: the baseline that learning has to beat in hover."""
+"""Integral action on the position of an unchanged policy: the baseline for learning in hover."""
 
 import dataclasses
 from typing import Any
@@ -18,27 +18,27 @@ class IntegralState(eqx.Module):
     """Integral of the position error, and the memory of the controller inside."""
 
     integral: Float[Array, "3"]
-    """[m s]"""
+    """Integral of the position error [m s]."""
     inner: Any
 
 
 class IntegralAction(AbstractController[IntegralState]):
-    """Shows a controller the position p + gain * integral of (p - target)."""
+    """Gives a controller the position p + gain * integral of (p - target)."""
 
     inner: AbstractController[Any]
     task: AbstractTask
-    """It says where the vehicle should be."""
+    """Task, which provides the target."""
     gain: Float[Array, ""]
-    """[1/s]"""
+    """Gain of the integral [1/s]."""
     limit: Float[Array, ""]
-    """Clamp of the integral per axis [m s]."""
+    """Limit of the integral per axis [m s]."""
 
     def init(self, x: State) -> IntegralState:
-        """Return the memory at the start of a flight: the integral is zero."""
+        """Return the memory at the start of a flight, with an integral of zero."""
         return IntegralState(jnp.zeros_like(x.p), self.inner.init(x))
 
     def __call__(self, memory: IntegralState, t: Float[Array, ""], x: State) -> tuple[Command, IntegralState]:
-        """Integrate one tick, and let the controller act on the shifted position."""
+        """Integrate one tick, and return the command of the controller for the shifted position."""
         grown = memory.integral + self.task.dt * (x.p - self.task.target(t))
         integral = jnp.clip(grown, -self.limit, self.limit)
         u, inner = self.inner(memory.inner, t, State(x.p + self.gain * integral, x.R, x.v))
@@ -49,7 +49,7 @@ class IntegralAction(AbstractController[IntegralState]):
         return IntegralState(memory.integral, self.inner.accepted(memory.inner, u))
 
     def with_vehicle(self, member: Member) -> "IntegralAction":
-        """Return the same for a vehicle that was identified."""
+        """Return the same for an identified vehicle."""
         return dataclasses.replace(self, inner=self.inner.with_vehicle(member))
 
     def with_actuators(self, actuators: ActuatorState) -> "IntegralAction":

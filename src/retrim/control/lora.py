@@ -1,7 +1,7 @@
 """Low-rank adaptation (Hu et al. 2022; paper, Sec. III-F): the base is frozen, two thin factors per layer are trained.
 
-y = (W + scale * B A) x + b. B starts at zero, so that a fresh delta changes nothing. A network of the paper's size has
-12,864 numbers to train instead of 272,900.
+y = (W + scale * B A) x + b. B starts at zero, so that a fresh delta does not change the policy. A network of the
+paper's size has 12,864 numbers to train instead of 272,900.
 """
 
 import equinox as eqx
@@ -16,22 +16,22 @@ SCALE = 4.0
 
 
 class LowRankFactors(eqx.Module):
-    """What is added to one weight matrix: ``scale * up @ down``."""
+    """Factors of the addition to one weight matrix, ``scale * up @ down``."""
 
     down: Float[Array, "rank fan_in"]
-    """A"""
+    """Factor A."""
     up: Float[Array, "fan_out rank"]
-    """B"""
+    """Factor B."""
 
 
 class LoraPolicy(eqx.Module):
-    """A frozen policy and a delta. It trains like a :class:`Policy`; :meth:`merged` flies."""
+    """A frozen policy and a delta. It is trained like a :class:`Policy`; use :meth:`merged` in flight."""
 
     base: Policy
     delta: tuple[LowRankFactors, ...]
     scale: Float[Array, ""]
     shift: Float[Array, "4"]
-    """Added to the output of the network; no optimiser trains it."""
+    """Addition to the output of the network; it is not trained."""
 
     def __check_init__(self) -> None:
         """Raise ``ValueError``, with the shapes, if the delta does not fit the base."""
@@ -46,16 +46,16 @@ class LoraPolicy(eqx.Module):
     def of(
         cls, base: Policy, *, key: Key[Array, ""], ranks: tuple[int, ...] = RANKS, scale: float = SCALE
     ) -> "LoraPolicy":
-        """Return a fresh delta: A uniform within 1 / sqrt(fan-in) (Kaiming), B zero, so that nothing changes yet.
+        """Return a fresh delta: A uniform within 1 / sqrt(fan-in) (Kaiming), B zero, so that the output is unchanged.
 
         Args:
             base: Policy to adapt.
-            key: Consumed.
-            ranks: One rank per layer (the paper's for two hidden layers by default).
+            key: Random key, consumed.
+            ranks: One rank per layer (by default those of the paper, for two hidden layers).
             scale: Factor of B A.
 
         Raises:
-            ValueError: There is no rank for each layer, from 1 to the smaller side of its matrix.
+            ValueError: There is not one rank per layer, or a rank is not between 1 and the smaller side of its matrix.
         """
         if len(ranks) != len(base.layers):
             raise ValueError(f"LoRA: {len(ranks)} ranks {ranks} for {len(base.layers)} layers")
@@ -79,11 +79,11 @@ class LoraPolicy(eqx.Module):
         return LoraPolicy(self.base, delta, self.scale, self.shift)
 
     def shifted(self, by: Float[Array, "4"]) -> "LoraPolicy":
-        """Return the policy whose output is ``by`` larger, for every observation; base and delta stay."""
+        """Return the policy whose output is ``by`` larger, for every observation; base and delta are unchanged."""
         return LoraPolicy(self.base, self.delta, self.scale, self.shift + by)
 
     def merged(self) -> Policy:
-        """Return a plain policy with the delta merged into its weights; no gradient flows to the base."""
+        """Return a plain policy with the delta merged into its weights; gradients do not flow to the base."""
         base, scale, shift = lax.stop_gradient((self.base, self.scale, self.shift))
         layers: Layers = tuple(
             eqx.tree_at(lambda l: l.weight, layer, layer.weight + scale * thin.up @ thin.down)

@@ -1,19 +1,20 @@
-"""The monitor of an adapted policy: steps back when adapting makes a flight worse than not adapting.
+"""The monitor of an adapted policy: it steps back if the adapted flight is worse than a flight without adaptation.
 
-An adapted flight has parts that can fail on their own: the re-trained policy with what was learned of the residual, and
-the disturbance observer. The monitor flies them in stages:
+An adapted flight has parts that can fail separately: the re-trained policy with the learned residual, and the
+disturbance observer. The monitor uses them in stages:
 
     ADAPTED   the re-trained policy, the learned residual and the observer,
     OBSERVED  the base policy and the observer,
-    SLOW      the base policy and a mean of the estimate, which is slow enough for late or wrongly scaled measurements,
+    SLOW      the base policy and a mean of the estimate that is slow enough for late or wrongly scaled measurements,
     BASE      the base policy alone, in the world frame.
 
-Two tests step back. (1) A *twin*, a simulated vehicle, shows the flight of the base policy: in the nominal model with
-the mean of the estimated disturbance. If the error of the vehicle exceeds that of the twin in three intervals in a row,
-or by much in one, the flight goes back by one stage. It returns after a while, which doubles each time. (2) An estimate
-that swings back and forth by itself (:mod:`retrim.control.swings`) shows that the observer drives the vehicle:
-measurements are later than declared, or wrongly scaled. That does not heal in flight: the base policy flies at once,
-then with the slow mean, and after a second oscillation alone to the end.
+The monitor steps back after one of two tests. (1) A *twin*, a simulated vehicle, predicts the flight of the base
+policy, in the nominal model with the mean of the estimated disturbance. If the error of the vehicle exceeds that of the
+twin in three consecutive intervals, or by a large amount in one, the flight steps back by one stage. It returns after a
+waiting time, which doubles each time. (2) An estimate that swings back and forth by itself
+(:mod:`retrim.control.swings`) shows that the observer drives the vehicle, because measurements are later than declared
+or wrongly scaled. Such an error persists in flight: the base policy takes over at once, later with the slow mean, and
+after a second oscillation alone to the end.
 """
 
 import dataclasses
@@ -36,27 +37,27 @@ from .policy import Policy
 from .swings import Swings
 
 INTERVAL = 1.0  # [s] over which errors are averaged
-MARGIN, FAR = 0.03, 0.7  # [m] beyond the error of the twin: too much in a row, and too much once
-STRIKES = 3  # intervals in a row; a vehicle recovers from the largest kick of the gauntlet within two
-LOST = 3.0  # [m]: a twin with a larger error begins again at the vehicle
+MARGIN, FAR = 0.03, 0.7  # [m], limits of the error beyond that of the twin: in consecutive intervals, and in one
+STRIKES = 3  # consecutive intervals; a vehicle recovers from the largest kick of the gauntlet within two
+LOST = 3.0  # [m]; a twin with a larger error restarts at the vehicle
 SWINGS = 8.0  # the largest kick of the gauntlet reaches 6.7; measurements 60 ms late drive the estimate beyond 8
 CALM = 2.0  # swings up to which the estimate has its full weight
-RAMP = 0.2  # [s] at the start, within which the estimate gains its weight: a launch with late measurements drives it
-HOLD = 10.0  # [s] before the first return
-REACH, WIDENING = 0.3, 0.1  # [m] and [m/s]: after an oscillation, the base policy sees no larger error at first
-MEAN_TAU = 1.0  # [s], of the mean of the estimate
+RAMP = 0.2  # [s], rise of the weight of the estimate at the start, since a launch with late measurements disturbs it
+HOLD = 10.0  # [s], waiting time before the first return
+REACH, WIDENING = 0.3, 0.1  # [m] and [m/s], largest error for the base policy after an oscillation, and its growth
+MEAN_TAU = 1.0  # [s], time constant of the mean of the estimate
 
 
 class Twin(eqx.Module):
-    """A simulated vehicle that the base policy flies, beside the errors of both vehicles."""
+    """A simulated vehicle under the base policy, and the errors of both vehicles."""
 
     x: State
     memory: Any
-    """Of the base policy."""
+    """Memory of the base policy."""
     excess: Float[Array, ""]
     """Sum over the interval of the error of the vehicle minus that of the twin [m]."""
     ticks: Int[Array, ""]
-    """Since the start of the interval."""
+    """Number of ticks since the start of the interval."""
     path: PathState | None = None
     """Command path of the simulated vehicle; None if it follows commands at once."""
 
@@ -71,35 +72,35 @@ class MonitorState(eqx.Module):
     cause: Int[Array, ""]
     """Reason of the last change of the stage."""
     best: Int[Array, ""]
-    """Stage beyond which the flight does not return."""
+    """Best stage to which the flight may return."""
     swings: Swings
     d: Float[Array, "3"]
     """Mean of the estimated disturbance, world [m/s^2]."""
     twin: Twin
     strikes: Int[Array, ""]
-    """Intervals in a row with an error beyond that of the twin."""
+    """Number of consecutive intervals with an error beyond that of the twin."""
     wait: Float[Array, ""]
-    """Time until the flight may return to the stage before [s]."""
+    """Time until the flight may return to the previous stage [s]."""
     hold: Float[Array, ""]
-    """Time that the next step back lasts [s]."""
+    """Duration of the next step back [s]."""
 
 
 class Monitor(AbstractController[MonitorState]):
-    """Flies an adapted policy in the frame of effective gravity, and steps back from it."""
+    """Flies an adapted policy in the frame of the effective gravity, and steps back from it if necessary."""
 
     frame: GravityFrame
     """The adapted flight; the controller inside is a :class:`~retrim.control.controller.PolicyController`."""
     task: AbstractTask
-    """It measures the error."""
+    """Task, which defines the error."""
     path: CommandPath | None = None
-    """Command path of the twin; None: it follows commands at once."""
+    """Command path of the twin; None if it follows commands at once."""
 
     def with_age(self, age: float | Float[Array, ""]) -> "Monitor":
         """Return the same for measurements that are ``age`` old [s]."""
         return dataclasses.replace(self, frame=self.frame.with_age(age))
 
     def with_vehicle(self, member: Member) -> "Monitor":
-        """Return the same for a vehicle that was identified."""
+        """Return the same for an identified vehicle."""
         return Monitor(self.frame.with_vehicle(member), self.task, member.path)
 
     def with_actuators(self, actuators: ActuatorState) -> "Monitor":
@@ -107,7 +108,7 @@ class Monitor(AbstractController[MonitorState]):
         return dataclasses.replace(self, frame=self.frame.with_actuators(actuators))
 
     def init(self, x: State) -> MonitorState:
-        """Return the memory at the start of a flight; the policy of now is the base policy from then on."""
+        """Return the memory at the start of a flight; the present policy becomes the base policy."""
         policy, zero, never = self._inner.policy, jnp.zeros_like(x.p[0]), jnp.array(0)
         twin = Twin(x, self._inner.init(x), zero, never, self._at_hover(x))
         flight, hold = self.frame.init(x), jnp.full_like(zero, HOLD)
@@ -115,7 +116,7 @@ class Monitor(AbstractController[MonitorState]):
         return MonitorState(flight, policy, never, never, never, Swings.none(still), still, twin, never, zero, hold)
 
     def __call__(self, memory: MonitorState, t: Float[Array, ""], x: State) -> tuple[Command, MonitorState]:
-        """Decide the command of this stage, and judge the stage."""
+        """Return the command of this stage, and test the stage."""
         adapted, observed = memory.stage == Stage.ADAPTED, memory.stage <= Stage.OBSERVED
         slow = memory.stage == Stage.SLOW
         flying = dataclasses.replace(
@@ -143,15 +144,15 @@ class Monitor(AbstractController[MonitorState]):
         return Condition(memory.stage, memory.cause)
 
     def _trust(self, memory: MonitorState, t: Float[Array, ""]) -> Float[Array, ""]:
-        """Return the weight of the estimate: small at the launch, and the smaller the more the estimate swings."""
+        """Return the weight of the estimate: small at the launch, and smaller the more the estimate swings."""
         calm = jnp.clip((SWINGS - memory.swings.size) / (SWINGS - CALM), 0.0, 1.0)
         return calm * jnp.minimum(1.0, t / RAMP).astype(calm.dtype)
 
     def _reach(self, memory: MonitorState) -> Float[Array, ""]:
-        """Return the largest error that the policy sees [m].
+        """Return the largest error in the observation of the policy [m].
 
-        With late measurements, a large error makes a policy oscillate that flies well near its target. The limit grows,
-        since a push that nobody answers needs an error to hold against it.
+        With late measurements, a policy that flies well near its target oscillates under a large error. The limit
+        grows, since an uncompensated push needs an error to hold against it.
         """
         swung = (memory.cause == Cause.OSCILLATION) & (memory.stage == Stage.BASE)
         return jnp.where(swung, REACH + WIDENING * (HOLD - jnp.minimum(memory.wait, HOLD)), jnp.inf)
@@ -202,7 +203,7 @@ class Monitor(AbstractController[MonitorState]):
         """Return the twin one tick later."""
         nominal, base = self.frame.observer.nominal, dataclasses.replace(self._inner, policy=s.base)
         excess = self.task.error(t, x) - self.task.error(t, s.twin.x)
-        near = self.task.error(t, s.twin.x) < LOST  # false for an error that is not a number, too
+        near = self.task.error(t, s.twin.x) < LOST  # also false for an error that is not a number
         at, memory, path = where(near, (s.twin.x, s.twin.memory, s.twin.path), (x, base.init(x), self._at_hover(x)))
         if path is None or self.path is None:
             u, memory = base(memory, t, at)

@@ -1,9 +1,9 @@
-"""Model-predictive path integral control: many random command sequences, weighted by what they would cost.
+"""Model-predictive path integral control: many random command sequences, weighted by their predicted costs.
 
-Each tick the mean of the last tick, shifted, is perturbed by noise; every sequence is rolled out in the nominal model,
-with the disturbance that an estimator sees, if there is one; and the new mean is that of all, each with the weight
-exp(-cost / temperature) (Williams et al. 2017; costs as flown beside DATT, Huang et al. 2023). The noise is correlated
-in time (Vlahov et al. 2024): what is drawn afresh for each tick cancels out before it has moved the vehicle.
+In each tick the shifted mean of the last tick is perturbed by noise. Every sequence is rolled out in the nominal model,
+with the estimated disturbance if there is an estimator. The new mean is that of all sequences, each with the weight
+exp(-cost / temperature) (Williams et al. 2017; costs as in the comparison with DATT, Huang et al. 2023). The noise is
+correlated in time (Vlahov et al. 2024), since independent noise in each tick cancels out before it moves the vehicle.
 """
 
 import dataclasses
@@ -30,7 +30,7 @@ class MppiState(eqx.Module):
 
     underway: Underway
     mean: Float[Array, "horizon 4"]
-    """Commands that are planned, [c, omega] each."""
+    """Planned commands, [c, omega] each."""
     estimate: L1State
     last: State
     """State measured one tick ago."""
@@ -41,7 +41,7 @@ class Mppi(AbstractController[MppiState]):
     """MPPI over commands, in the nominal model with actuator lag."""
 
     task: AbstractTask
-    """It says where the vehicle should be."""
+    """Task, which provides the reference."""
     prediction: Prediction
     low: Command
     """Smallest command of the vehicle."""
@@ -49,30 +49,30 @@ class Mppi(AbstractController[MppiState]):
     """Largest command of the vehicle."""
     key: Key[Array, ""]
     estimator: L1Estimator | None
-    """It corrects the model; None: the model stays nominal."""
+    """Estimator of the disturbance in the model; None for the nominal model."""
     spread: Float[Array, "4"]
     """Standard deviation of the noise: thrust [m/s^2], body rates [rad/s]."""
     correlation: Float[Array, ""]
-    """Time constant over which the noise forgets itself [s]."""
+    """Correlation time of the noise [s]."""
     temperature: Float[Array, ""]
-    """Of the weights; in the unit of the cost."""
+    """Temperature of the weights, in the unit of the cost."""
     position_cost: Float[Array, ""]
-    """Per metre and second."""
+    """Cost of the position error, per metre and second."""
     velocity_cost: Float[Array, ""]
-    """Per metre, of the difference of velocities."""
+    """Cost of the velocity error, per metre."""
     attitude_cost: Float[Array, ""]
-    """Per unit of 1 - <q, q_ref>^2 and second."""
+    """Cost of the attitude error, per unit of 1 - <q, q_ref>^2 and second."""
     samples: int = eqx.field(static=True, default=1024)
-    """Sequences in a tick."""
+    """Number of sequences per tick."""
     horizon: int = eqx.field(static=True, default=40)
-    """Ticks of a sequence."""
+    """Length of a sequence [ticks]."""
 
     def with_age(self, age: float | Float[Array, ""]) -> "Mppi":
         """Return the same for measurements that are ``age`` old [s]."""
         return dataclasses.replace(self, prediction=self.prediction.with_age(age))
 
     def init(self, x: State) -> MppiState:
-        """Return the memory at the start of a flight: hover is planned."""
+        """Return the memory at the start of a flight, with hover as the plan."""
         mean = jnp.tile(Command.hover(x.p.dtype).vector(), (self.horizon, 1))
         return MppiState(self.prediction.init(x), mean, L1State.start(x), x, jnp.array(0))
 
@@ -102,7 +102,7 @@ class Mppi(AbstractController[MppiState]):
         return dataclasses.replace(memory, underway=self.prediction.accepted(memory.underway, u))
 
     def _colour(self, dtype: jnp.dtype) -> Float[Array, "horizon horizon"]:
-        """Return what turns independent numbers into ones with the correlation exp(-|difference| / time constant)."""
+        """Return the matrix that gives independent numbers the correlation exp(-|difference| / time constant)."""
         ticks = jnp.arange(self.horizon, dtype=dtype)
         kept = jnp.exp(-self.prediction.dt / self.correlation.astype(dtype))
         since = ticks[:, None] - ticks[None, :]
@@ -117,7 +117,7 @@ class Mppi(AbstractController[MppiState]):
         wanted: Point,
         d: Float[Array, "3"],
     ) -> Float[Array, " samples"]:
-        """Return what each plan costs. Samples lie along the last axis, so that every operation is a long row."""
+        """Return the cost of each plan. Samples are along the last axis, so that every operation has long rows."""
         dt, dtype = self.prediction.dt, x.p.dtype
         tau = self.prediction.tau.astype(dtype)
         pull = d + jnp.array([0.0, 0.0, -STANDARD_GRAVITY], dtype=dtype)

@@ -1,4 +1,4 @@
-"""A controller that sees no vehicle far from its target."""
+"""A controller that limits the distance from the target in its input."""
 
 from typing import Any
 
@@ -14,24 +14,24 @@ from .controller import AbstractController
 
 
 class NearTarget(AbstractController[Any]):
-    """Shows a controller the vehicle at ``reach`` from the target where it is farther away.
+    """Gives a controller a position within ``reach`` of the target if the vehicle is farther away.
 
-    The commands of a policy grow with the distance. Where measurements are late, a policy that is stable near its
-    target may oscillate and crash from far away.
+    The commands of a policy grow with the distance. If measurements are late, a policy that is stable near its target
+    may oscillate and crash from far away.
     """
 
     inner: AbstractController[Any]
     task: AbstractTask
-    """It says where the target is."""
+    """Task, which provides the target."""
     reach: Float[Array, ""]
-    """Largest distance that is shown, in the coordinates of the controller [m]."""
+    """Largest distance in the input, in the coordinates of the controller [m]."""
 
     def init(self, x: State) -> Any:
         """Return the memory of the controller inside."""
         return self.inner.init(x)
 
     def __call__(self, memory: Any, t: Float[Array, ""], x: State) -> tuple[Command, Any]:
-        """Decide as the controller inside does for a vehicle that is near."""
+        """Return the command of the controller inside for the limited distance."""
         target = self.task.target(t)
         away = x.p - target
         distance = jnp.sqrt(jnp.sum(away * away) + 1e-12)
@@ -44,7 +44,7 @@ class NearTarget(AbstractController[Any]):
         return self.inner.accepted(memory, u)
 
     def with_vehicle(self, member: Member) -> "NearTarget":
-        """Return the same for a vehicle that was identified."""
+        """Return the same for an identified vehicle."""
         return NearTarget(self.inner.with_vehicle(member), self.task, self.reach)
 
     def with_actuators(self, actuators: ActuatorState) -> "NearTarget":

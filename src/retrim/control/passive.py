@@ -8,10 +8,10 @@ from .controller import AbstractController
 
 
 class Passive(AbstractController[tuple[()]]):
-    """Commands hover, whatever it sees: what decides is on board."""
+    """Commands hover for every state, since the vehicle has its own controller on board."""
 
     def init(self, x: State) -> tuple[()]:
-        """Return nothing: there is nothing to remember."""
+        """Return an empty memory."""
         return ()
 
     def __call__(self, memory: tuple[()], t: Float[Array, ""], x: State) -> tuple[Command, tuple[()]]:
@@ -19,5 +19,5 @@ class Passive(AbstractController[tuple[()]]):
         return Command.hover(x.p.dtype), memory
 
     def in_frame(self, frame: FeltFrame) -> "Passive":
-        """Return itself: hover is hover in every frame."""
+        """Return itself, since hover is the same in every frame."""
         return self

@@ -18,10 +18,10 @@ Inputs = tuple[Float[Array, "... _"], ...]
 
 
 class Policy(eqx.Module):
-    """A ReLU network with a smooth, bounded output. ``layers`` are trained; the commands never are.
+    """A ReLU network with a smooth, bounded output. ``layers`` are trained; the commands are constant.
 
     u = u_min + (u_max - u_min) sigmoid(y + y_0), where y is the network's output and y_0 makes y = 0 the hover
-    command. A hard limit would have no gradient once it is reached; this one always has some.
+    command. A hard limit would not have a gradient once it is reached; the sigmoid always has one.
     """
 
     layers: tuple[eqx.nn.Linear, ...]
@@ -37,8 +37,8 @@ class Policy(eqx.Module):
 
         Args:
             observation_size: Length of the observation.
-            vehicle: It gives the limits of the commands.
-            key: Consumed.
+            vehicle: Vehicle with the limits of the commands.
+            key: Random key, consumed.
             hidden: Widths of the hidden layers.
         """
         sizes = (observation_size, *hidden, 4)
@@ -54,7 +54,7 @@ class Policy(eqx.Module):
                 )
             )
         bounds = (Command.hover(), vehicle.command_min, vehicle.command_max)
-        # Of strong types, as a loaded policy has them: what was compiled for one is not compiled again for the other.
+        # Strong types, as in a loaded policy, so that programs for one are not compiled again for the other.
         bounds = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=leaf.dtype), bounds)
         return cls(tuple(layers), *bounds)
 
@@ -90,7 +90,7 @@ class Policy(eqx.Module):
     def perturbed(self, observation: Float[Array, " o"], perturbations: Perturbations) -> tuple[Command, Inputs]:
         """Return the command with ``perturbations[l]`` added to the output of layer l, without gradients to weights.
 
-        Also returns each layer's input: with the perturbations' cotangents they give every weight gradient.
+        Also return the input of each layer; with the cotangents of the perturbations they give every weight gradient.
         """
         h, inputs = observation, []
         for i, (layer, perturbation) in enumerate(zip(self.layers, perturbations, strict=True)):

@@ -1,4 +1,4 @@
-"""A policy that commands hover where it rests, whatever it observes beside the state."""
+"""A policy that commands hover at its rest point, for all observations other than the state."""
 
 import dataclasses
 from typing import Any
@@ -13,14 +13,14 @@ from .controller import PolicyController
 
 
 class RestingController(PolicyController):
-    """A policy whose output is shifted by that at rest at home, with the heading of now.
+    """A policy whose output is shifted by its output at rest at home, with the present heading.
 
-    A policy for many vehicles comes to rest somewhere else for each belief. The shift removes that error, so that it
+    A policy for many vehicles has another rest point for each belief. The shift removes that error, so that the policy
     rests at home, as :class:`~retrim.adapt.trim.RestTrim` does after an update.
     """
 
     home: Float[Array, "3"]
-    """Where the vehicle rests [m]."""
+    """Position at which the vehicle rests [m]."""
 
     def __call__(
         self, memory: tuple[Any, Command], t: Float[Array, ""], x: State
@@ -33,5 +33,5 @@ class RestingController(PolicyController):
         return shifted(memory, t, x)
 
     def in_frame(self, frame: FeltFrame) -> "RestingController":
-        """Return the same policy behind the turned observation, at rest at the turned home."""
+        """Return the same policy with observation and home in ``frame``."""
         return dataclasses.replace(self, observation=self.observation.in_frame(frame), home=frame.vector(self.home))

@@ -1,8 +1,8 @@
-"""Controllers that need the state, flown from what a camera sees.
+"""State-based controllers with the pose from camera images.
 
-The filter that estimates the pose behind :class:`OccludedKeypoints` for a policy estimates it for them too, from the
-same points and the same commands. A controller that looks at an inertial unit keeps it: what is measured in the body
-frame is turned into the world by the estimated attitude.
+The pose filter of :class:`OccludedKeypoints`, which estimates the pose for a policy, also estimates it for these
+controllers, from the same points and the same commands. A controller that uses an inertial unit keeps it: the estimated
+attitude transforms its measurements from the body frame to the world.
 """
 
 import dataclasses
@@ -27,14 +27,14 @@ class SeenPoseState(eqx.Module):
 
 
 class SeenPose(AbstractController[SeenPoseState]):
-    """Any controller, shown the position, attitude and velocity that the pose filter of the keypoints estimates."""
+    """A controller that receives position, attitude and velocity from the pose filter of the keypoints."""
 
     observation: OccludedKeypoints
     inner: AbstractController[Any]
     omega: Float[Array, "3"] | None = None
-    """Measured body rates [rad/s]; None: they are not measured."""
+    """Measured body rates [rad/s]; None if they are not measured."""
     a: Float[Array, "3"] | None = None
-    """Acceleration, the mean over the last tick, world [m/s^2]; None: it is not measured."""
+    """Acceleration, the mean over the last tick, world [m/s^2]; None if it is not measured."""
 
     def with_age(self, age: float | Float[Array, ""]) -> "SeenPose":
         """Return the same for frames that are ``age`` old [s]."""
@@ -45,12 +45,12 @@ class SeenPose(AbstractController[SeenPoseState]):
         return dataclasses.replace(self, omega=omega, a=a)
 
     def init(self, x: State) -> SeenPoseState:
-        """Return the memory at the start of a flight: the filter begins near the state, not in it."""
+        """Return the memory at the start of a flight; the filter starts near the state, not exactly at it."""
         seen = self.observation.init(x)
         return SeenPoseState(seen, self.inner.init(seen.pose.x), Command.hover(x.p.dtype))
 
     def __call__(self, memory: SeenPoseState, t: Float[Array, ""], x: State) -> tuple[Command, SeenPoseState]:
-        """Decide for the pose that is estimated; the state says where camera and inertial unit are, and no more."""
+        """Return the command for the estimated pose; the state only defines the pose of camera and inertial unit."""
         _, seen = self.observation(memory.seen, t, x, memory.last)
         here, controller = seen.pose.x, self.inner
         if self.omega is not None and self.a is not None:

@@ -4,24 +4,24 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-SWING = 2.0  # [m/s^2], least distance between two turning points of an axis
-UNIT = 4.0  # [m/s^2]: a swing of this size counts as one, others by their squares
-MEMORY = 1.5  # [s], time constant with which swings are forgotten
+SWING = 2.0  # [m/s^2], smallest distance between two turning points of an axis
+UNIT = 4.0  # [m/s^2], size of a swing that counts as one; others count by the square of their size
+MEMORY = 1.5  # [s], time constant of the forgetting of swings
 
 
 class Swings(eqx.Module):
-    """Turning points of an estimate per axis, and the size of its swings lately.
+    """Turning points of an estimate per axis, and the size of its recent swings.
 
-    A disturbance that steps, a load or a gust moves an estimate once. An observer that drives its own vehicle, because
+    A step of the disturbance, a load or a gust moves an estimate once. An observer that drives its own vehicle, because
     measurements are late or wrongly scaled, moves it back and forth by several m/s^2 more than once a second.
     """
 
     start: Float[Array, "3"]
-    """Turning point at which the swing of now began [m/s^2]."""
+    """Turning point at which the present swing began [m/s^2]."""
     extreme: Float[Array, "3"]
-    """Farthest value since [m/s^2]."""
+    """Farthest value since then [m/s^2]."""
     size: Float[Array, ""]
-    """Sum of the squares of the swings of all axes in units of 4 m/s^2, forgotten exponentially."""
+    """Sum of the squares of the swings of all axes in units of 4 m/s^2, with exponential forgetting."""
 
     @classmethod
     def none(cls, d: Float[Array, "3"]) -> "Swings":

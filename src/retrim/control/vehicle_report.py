@@ -1,4 +1,4 @@
-"""The vehicle that was identified: for the controller that flies it, and as a line for the log."""
+"""The identified vehicle: for the controller, and as a line for the log."""
 
 import equinox as eqx
 from jaxtyping import Array, Float
@@ -11,7 +11,7 @@ REPORTS = (1.0, 5.0)
 
 
 class VehicleEstimate(eqx.Module):
-    """The vehicle as it is identified now."""
+    """Present estimate of the vehicle."""
 
     belief: PathBelief
     gain: Float[Array, ""]
@@ -19,11 +19,11 @@ class VehicleEstimate(eqx.Module):
 
 
 class VehicleReport(eqx.Module):
-    """What is known of the vehicle now, beside what its file states."""
+    """Present estimate of the vehicle, and the values in its file."""
 
     estimate: PathEstimate
     declared: Float[Array, "2"] | None = None
-    """Command delay and rate lag of the vehicle file [s]; None if it states none."""
+    """Command delay and rate lag of the vehicle file [s]; None if the file does not state them."""
 
     def note(self) -> str:
         """Return the vehicle in one line."""

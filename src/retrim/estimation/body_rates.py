@@ -1,7 +1,7 @@
-"""Body rates now: those of a gyroscope, or those that commands and measured attitudes imply.
+"""Present body rates from a gyroscope, or from commands and measured attitudes.
 
 Without a gyroscope, the command path predicts the rates, and the rotation between two attitudes corrects them. That
-rotation is noisy and of the past; the prediction is of now and as good as what is known of the path.
+rotation is noisy and late; the prediction is current, and as accurate as the known command path.
 """
 
 import dataclasses
@@ -16,11 +16,11 @@ from ..physics.actuator_response import ActuatorState
 from ..physics.command_path import LONGEST_DELAY, CommandPath, PathState
 from ..physics.state import Command, State
 
-SHARE = 0.3  # of the difference between measurement and prediction that corrects the prediction
+SHARE = 0.3  # share of the difference between measurement and prediction that corrects the prediction
 
 
 class BodyRates(eqx.Module):
-    """Prediction of the body rates, and what it needs."""
+    """Prediction of the body rates, and its memory."""
 
     R: Float[Array, "3 3"]
     """Attitude measured one tick ago."""
@@ -29,9 +29,9 @@ class BodyRates(eqx.Module):
     path: PathState
     """Command path now."""
     mean: Float[Array, "3"]
-    """Predicted mean over the tick that has just ended [rad/s]."""
+    """Predicted mean rates over the tick that has just ended [rad/s]."""
     earlier: Float[Array, "3"]
-    """Likewise over the tick before."""
+    """Predicted mean rates over the tick before [rad/s]."""
 
     @classmethod
     def start(cls, x: State, dt: float, *, longest: float = LONGEST_DELAY) -> "BodyRates":
@@ -48,7 +48,7 @@ class BodyRates(eqx.Module):
 
     @property
     def omega(self) -> Float[Array, "3"]:
-        """Body rates now [rad/s]."""
+        """Present body rates [rad/s]."""
         return self.path.actuators.command.omega
 
     def measured(
@@ -66,7 +66,7 @@ class BodyRates(eqx.Module):
             age: Age of ``x`` [s].
             path: Command path of the vehicle.
             dt: Control tick [s].
-            omega: Rates of a gyroscope [rad/s]; None if there is none.
+            omega: Rates of a gyroscope [rad/s]; None without a gyroscope.
         """
         if omega is None:
             late = jnp.clip(age / dt, 0.0, 1.0).astype(x.p.dtype)
@@ -76,7 +76,7 @@ class BodyRates(eqx.Module):
             error = omega.astype(x.p.dtype) - self.omega
         error = jnp.where(jnp.all(jnp.isfinite(error)), error, 0.0)
         acting = self.path.actuators
-        # A rate that differs by the end of a tick has changed faster during it.
+        # A rate that differs at the end of a tick has changed faster during the tick.
         slope = acting.slope + SHARE * (path.response.rate_lag / dt) * error
         corrected = ActuatorState(Command(acting.command.c, acting.command.omega + error), slope)
         return dataclasses.replace(self, R=x.R, path=dataclasses.replace(self.path, actuators=corrected))

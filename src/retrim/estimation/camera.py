@@ -10,29 +10,29 @@ from ..physics.state import State
 
 DOWN = ((0.0, -1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
 """Body to camera: the camera's z looks along body -z; camera x is body -y, camera y is body -x."""
-D_MIN = 0.05  # of the denominator of the projection, far off axis and behind
+D_MIN = 0.05  # smallest denominator of the projection, for points far off axis and behind
 
 
 class Projection(NamedTuple):
     """A point in the image."""
 
     pixel: Float[Array, "2"]
-    """Normalised: the image is [-1, 1] x [-1, 1]."""
+    """Normalised coordinates; the image is [-1, 1] x [-1, 1]."""
     visible: Bool[Array, ""]
-    """In front of the camera, where the model holds, and inside the image."""
+    """True if the point is in front of the camera, where the model holds, and inside the image."""
 
 
 class Camera(eqx.Module):
-    """Intrinsics."""
+    """Intrinsic parameters of a camera."""
 
     xi: Float[Array, ""]
     alpha: Float[Array, ""]
     focal: Float[Array, "2"]
-    """[px]"""
+    """Focal lengths [px]."""
     centre: Float[Array, "2"]
-    """[px]"""
+    """Principal point [px]."""
     size: Float[Array, "2"]
-    """[px]"""
+    """Size of the image [px]."""
 
     @classmethod
     def published(cls) -> "Camera":
@@ -46,7 +46,7 @@ class Camera(eqx.Module):
         )
 
     def project(self, P: Float[Array, "3"]) -> Projection:
-        """Project a point in camera coordinates [m]; finite, with a finite gradient, wherever the point is."""
+        """Project a point in camera coordinates [m]; result and gradient are finite for every point."""
         d1 = jnp.sqrt(jnp.sum(P**2) + 1e-12)
         z1 = self.xi * d1 + P[2]
         d2 = jnp.sqrt(P[0] ** 2 + P[1] ** 2 + z1**2 + 1e-12)

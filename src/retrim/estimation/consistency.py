@@ -1,8 +1,8 @@
 """Consistency of two successive measurements: whether a rigid body can have moved from one to the other.
 
 A single wrong velocity enters two accelerations with opposite signs and 50 times its size (at 50 Hz), so that one
-sample in a window can outweigh all others. These tests need no model of the vehicle and no history, and they have one
-definition for the disturbance observer, which sees a pair per tick, and for the learners, which see a window.
+sample in a window can outweigh all others. These tests do not need a model of the vehicle or a history. They have one
+definition for the disturbance observer, which receives a pair per tick, and for the learners, which receive a window.
 """
 
 import equinox as eqx
@@ -13,20 +13,20 @@ from jaxtyping import Array, Bool, Float
 from ..physics import so3
 from ..physics.state import State, where
 
-SPEED = 0.25  # [m/s] between a velocity and the derivative of the position that is no fault, as a small bias
-SPREADS = 4.0  # of the noise beyond it; a normal distribution has fewer than 1 in 10^4 there
-NOISE_PRIOR = 1e-3  # [m], before anything was measured
-NOISE_LIMIT = 3e-3  # [m]: a larger noise is a fault, or every fault would look like noise
+SPEED = 0.25  # [m/s], tolerated difference of a velocity from the derivative of the position, such as a small bias
+SPREADS = 4.0  # tolerated deviations of the noise beyond it; a normal distribution exceeds them in < 1 of 10^4
+NOISE_PRIOR = 1e-3  # [m], before the first measurement
+NOISE_LIMIT = 3e-3  # [m]; larger noise is a fault, since otherwise every fault would look like noise
 NOISE_TAU = 1.0  # [s], memory of the noise
-JUMP = 3.0**0.5  # of the mean size of the change of a gap to that of a gap, where positions have white noise
-ACCELERATION = 150.0  # [m/s^2], beyond any vehicle of this kind, a push and a collision with air included
-RATE = 40.0  # [rad/s], beyond any rate that a vehicle of this kind is commanded
-REST = 1e-3  # [m/s]: a vehicle slower than this may well be measured twice in the same state
-SCALE = 0.25  # as a share: so far the motion may differ from what the velocities say
-CORRELATED = 0.5  # squared correlation of gaps and steps, at least, of a wrong scale
-MOTION, OVER_NOISE = 0.15, 3.0  # [m/s] and times the noise of gaps: mean motion that shows a scale
+JUMP = 3.0**0.5  # ratio of the mean size of the change of a gap to that of a gap, for white noise of positions
+ACCELERATION = 150.0  # [m/s^2], beyond any vehicle of this kind, including a push and a collision with air
+RATE = 40.0  # [rad/s], beyond any commanded rate of a vehicle of this kind
+REST = 1e-3  # [m/s]; a slower vehicle may be measured twice in the same state
+SCALE = 0.25  # largest difference of the motion from that of the velocities, as a share
+CORRELATED = 0.5  # smallest squared correlation of gaps and steps for a wrong scale
+MOTION, OVER_NOISE = 0.15, 3.0  # [m/s], and multiple of the noise of gaps: smallest mean motion that shows a scale
 SCALE_TAU = 1.0  # [s], memory of the moments that show a scale
-DOUBT_TAU = 0.3  # [s], memory of the share of steps that cannot be used
+DOUBT_TAU = 0.3  # [s], memory of the share of unusable steps
 SKEW = 0.1  # largest entry of R^T R - I of a rotation
 
 
@@ -34,13 +34,13 @@ class Findings(eqx.Module):
     """Contradictions between two successive measurements; all false for a possible motion."""
 
     repeated: Bool[Array, ""]
-    """The second one is the first one again, to the bit, although the vehicle moves."""
+    """The second measurement equals the first one bit for bit, although the vehicle moves."""
     velocity: Bool[Array, ""]
     """The velocity is not the derivative of the position."""
     acceleration: Bool[Array, ""]
-    """The acceleration is beyond what a vehicle can do."""
+    """The acceleration is beyond the capability of a vehicle."""
     attitude: Bool[Array, ""]
-    """An attitude is no rotation, or the vehicle turned faster than it can."""
+    """An attitude is not a rotation, or the vehicle turned faster than it can."""
     not_finite: Bool[Array, ""]
 
     @property
@@ -51,7 +51,7 @@ class Findings(eqx.Module):
 
 
 def gap(before: State, after: State, dt: float) -> Float[Array, "3"]:
-    """Return the step of the position without the mean of the velocities at its ends, world [m].
+    """Return the step of the position minus that from the mean of the velocities at its ends, world [m].
 
     The trapezoidal rule is exact to dt^3 / 12 times the jerk, which is 0.1 mm at 50 Hz in the most agile flight.
     """
@@ -59,15 +59,15 @@ def gap(before: State, after: State, dt: float) -> Float[Array, "3"]:
 
 
 def gap_noise(before: Float[Array, "3"], after: Float[Array, "3"]) -> Float[Array, ""]:
-    """Return the noise that two successive gaps show [m].
+    """Return the size of the noise from two successive gaps [m].
 
-    Velocities with a bias or a wrong scale have gaps that hardly change, which are no noise.
+    Velocities with a bias or a wrong scale have gaps that hardly change, which do not count as noise.
     """
     return jnp.sqrt(jnp.sum((after - before) ** 2) + 1e-20) / JUMP
 
 
 class Scale(eqx.Module):
-    """Moments of gaps and of steps by velocity, whose covariance shows a wrong scale of the velocities."""
+    """Moments of gaps and of steps from velocities; their covariance shows a wrong scale of the velocities."""
 
     gap: Float[Array, "3"]
     """Mean gap, world [m]."""
@@ -85,13 +85,13 @@ class Scale(eqx.Module):
         return cls(missing, step, jnp.sum(missing * step), jnp.stack([jnp.sum(missing**2), jnp.sum(step**2)]))
 
     def verdict(self, dt: float, noise: Float[Array, ""]) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
-        """Return whether the vehicle moved enough to show the scale, and whether the scale is wrong then.
+        """Return whether the vehicle moved enough to show the scale, and whether the scale is then wrong.
 
-        Constant errors of the velocity do not count: the moments are centred.
+        Constant errors of the velocity do not count, since the moments are centred.
 
         Args:
             dt: Control tick [s].
-            noise: Typical size of a gap by noise [m].
+            noise: Typical size of a gap due to noise [m].
         """
         covariance = self.product - jnp.sum(self.gap * self.step)
         gaps = self.squares[0] - jnp.sum(self.gap**2)
@@ -102,13 +102,13 @@ class Scale(eqx.Module):
 
 
 def contradictions(before: State, after: State, dt: float, noise: Float[Array, ""]) -> Findings:
-    """Return what contradicts the motion from one measurement to the next.
+    """Return the contradictions in the motion from one measurement to the next.
 
     Args:
         before: First measurement.
         after: Measurement one tick later.
         dt: Control tick [s].
-        noise: Typical size of a :func:`gap` by noise in this flight, see :func:`gap_noise` [m].
+        noise: Typical size of a :func:`gap` due to noise in this flight, see :func:`gap_noise` [m].
     """
     same = [jnp.all(a == b) for a, b in ((before.p, after.p), (before.R, after.R), (before.v, after.v))]
     slack = SPEED * dt + SPREADS * jnp.minimum(noise, NOISE_LIMIT)
@@ -131,19 +131,19 @@ class Consistency(eqx.Module):
     gap: Float[Array, "3"]
     """Last :func:`gap`, world [m]."""
     noise: Float[Array, ""]
-    """Typical size of a gap by noise [m]."""
+    """Typical size of a gap due to noise [m]."""
     scale: Scale
     """Moments of the last second."""
     scaled: Bool[Array, ""]
-    """Whether velocities had a wrong scale when the vehicle moved last."""
+    """Whether velocities had a wrong scale when the vehicle last moved."""
     repeated: Bool[Array, ""]
-    """Whether the last measurement is the one before it again, as after a dropped frame."""
+    """Whether the last measurement equals the one before it, as after a dropped frame."""
     possible: Bool[Array, ""]
     """Whether the last measurement did not contradict the one before it."""
     certain: Bool[Array, ""]
-    """Whether the step to the last measurement can be used: neither of its ends contradicts the measurement before."""
+    """Whether the step to the last measurement is usable: neither of its ends contradicts the measurement before."""
     doubt: Float[Array, ""]
-    """Share of the last steps that could not be used; one at the start, when nothing has shown that they can."""
+    """Share of unusable steps among the last ones; one at the start, before any step was tested."""
 
     @classmethod
     def start(cls, x: State) -> "Consistency":
@@ -159,7 +159,7 @@ class Consistency(eqx.Module):
             before: Last measurement.
             x: New measurement.
             dt: Control tick [s].
-            successive: Whether there is one tick between them; if not, they are not compared.
+            successive: Whether one tick separates the two measurements; otherwise they are not compared.
         """
         missing, v = gap(before, x, dt), 0.5 * (before.v + x.v)
         found = contradictions(before, x, dt, self.noise)

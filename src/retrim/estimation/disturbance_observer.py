@@ -1,23 +1,24 @@
 """Disturbance observer: the acceleration that the nominal model misses, from states and commands.
 
-A filter of two states per axis, velocity v and disturbance d: the nominal model predicts how v changes over a tick, d
-stands still, and the measured velocity corrects both,
+The filter has two states per axis, velocity v and disturbance d. The nominal model predicts the change of v over a
+tick, the prediction of d is constant, and the measured velocity corrects both,
 
     v <- v_predicted + (1 - z w) (v_measured - v_predicted),
     d <- d + (1 - z) (1 - w) (v_measured - v_predicted) / dt,
 
 with the poles z and w. One of them belongs to the time constant that a vehicle's unmodelled motors and delays allow.
-The other has the bandwidth of the steady Kalman filter for a disturbance that wanders by q sqrt(t) and velocities of
-noise r per tick, (q / (r sqrt(dt)))^(1/2) [rad/s]; r is that of the last second. Without noise z is zero, and the
-observer is a first-order low-pass of what the model missed in each tick.
+The other has the bandwidth of the steady Kalman filter for a disturbance that wanders by q sqrt(t) and velocities with
+the noise r per tick, (q / (r sqrt(dt)))^(1/2) [rad/s]; r is that of the last second. Without noise z is zero, and the
+observer is a first-order low-pass filter of the acceleration that the model misses in each tick.
 
-While a command at a limit acts, what the vehicle does is no disturbance: d and r are held, and v is what is measured.
-So it is at the first measurement and after a tick that was missed, since what changed then is not of one tick.
+While a command at a limit acts, the motion of the vehicle does not show the disturbance: d and r are held, and v is set
+to the measured velocity. The same applies at the first measurement and after a missed tick, since the change is then
+not that of one tick.
 
-Measurements that contradict each other (:mod:`retrim.estimation.consistency`) contain no information about the
-disturbance: d is held during such a tick and the next one; v is predicted if a frame was dropped. d decays faster the
-more of the last ticks were such, since an estimate without measurements is a push of its own. The correction of one
-tick is limited, so that a wrong velocity that no test finds has little effect.
+Measurements that contradict each other (:mod:`retrim.estimation.consistency`) do not contain information about the
+disturbance: d is held during such a tick and the next one; v is predicted if a frame was dropped. The more of the last
+ticks have contradictions, the faster d decays, since an estimate without measurements acts as a push. The correction of
+one tick is limited, so that a wrong velocity that passes all tests has little effect.
 """
 
 import dataclasses
@@ -36,7 +37,7 @@ from .consistency import Consistency
 from .latency import follows
 
 NOISE_TAU = 1.0  # [s], memory of the estimated noise
-DECAY_TAU = 0.1  # [s], decay of the estimate if all of them do
+DECAY_TAU = 0.1  # [s], decay of the estimate if all of the last ticks have contradictions
 CORRECTION, SPREADS = 0.08, 6.0  # [m/s] and standard deviations of the noise: largest innovation of a tick
 COAST = 0.5  # share of the last ticks with contradictions up to which the model predicts v after a dropped frame
 SECOND_DIFFERENCE = 1.954  # mean magnitude of the second difference of white noise, in standard deviations
@@ -48,7 +49,7 @@ class ObserverState(eqx.Module):
     last: State
     """State measured one tick ago."""
     t: Float[Array, ""]
-    """When [s]; minus infinity before the first measurement."""
+    """Time of the last measurement [s]; minus infinity before the first measurement."""
     commands: CommandQueue
     """Commands of the last ticks; the newest was issued for the tick that has just ended."""
     v: Float[Array, "3"]
@@ -56,11 +57,11 @@ class ObserverState(eqx.Module):
     d_hat: Float[Array, "3"]
     """Estimated disturbance acceleration, world [m/s^2]."""
     missed: Float[Array, "3"]
-    """What the model missed in the last tick by the measured velocities alone, world [m/s^2]."""
+    """Acceleration that the model missed in the last tick, from the measured velocities alone, world [m/s^2]."""
     noise: Float[Array, ""]
     """Estimated standard deviation of a measured velocity per axis [m/s]."""
     thrust: Float[Array, ""]
-    """Thrust that acts at the end of the last tick, behind the lag [m/s^2]."""
+    """Thrust that acts at the end of the last tick, after the lag [m/s^2]."""
     consistency: Consistency
 
 
@@ -69,24 +70,24 @@ class DisturbanceObserver(eqx.Module):
 
     nominal: AbstractDynamics[Any]
     tau: Float[Array, ""]
-    """Smallest time constant [s]; what the model does not know of motors and delays must be faster."""
+    """Smallest time constant [s]; unmodelled motors and delays must be faster."""
     limit: Float[Array, ""]
     """Largest norm of the estimate [m/s^2]."""
     wander: Float[Array, ""]
-    """Standard deviation per axis of what the disturbance becomes within a second [m/s^2]; infinite: noise is none."""
+    """Standard deviation per axis of the change of the disturbance in a second [m/s^2]; infinity ignores the noise."""
     path: CommandPath = eqx.field(default_factory=CommandPath.of)
-    """What becomes of a command; rates are measured, so that only its delay and its thrust count."""
+    """Command path of the vehicle. Rates are measured, so that only its delay and its thrust are used."""
     limits: tuple[Command, Command] | None = None
-    """Smallest and largest command; None: commands have no limit."""
+    """Smallest and largest command; None if commands are not limited."""
     longest_delay: float = eqx.field(static=True, default=LONGEST_DELAY)
-    """Longest delay that the memory has room for [s]."""
+    """Longest delay that the memory can hold [s]."""
 
     def arrival(self, s: ObserverState) -> Command:
-        """Return the command that arrived during the tick that has just ended, in the mean."""
+        """Return the mean command that arrived during the tick that has just ended."""
         return s.commands.arrival(self.path.delay, self.nominal.dt)
 
     def init(self, x: State) -> ObserverState:
-        """Return the memory of a vehicle that hovers at ``x`` undisturbed."""
+        """Return the memory of an undisturbed vehicle that hovers at ``x``."""
         zero = jnp.zeros_like(x.p)
         hover = Command.hover(x.p.dtype)
         commands = CommandQueue.of(hover, self.nominal.dt, longest=self.longest_delay)
@@ -94,7 +95,7 @@ class DisturbanceObserver(eqx.Module):
         return ObserverState(x, never, commands, x.v, zero, zero, zero[0], hover.c, Consistency.start(x))
 
     def __call__(self, s: ObserverState, t: Float[Array, ""], x: State) -> ObserverState:
-        """Return the memory with the estimate corrected by what was newly measured.
+        """Return the memory with the estimate corrected by the new measurement.
 
         Call it once per tick, then :meth:`issued` with the command of the new tick.
 
@@ -105,7 +106,7 @@ class DisturbanceObserver(eqx.Module):
         """
         nominal, dt = self.nominal, self.nominal.dt
         mean, thrust = self.path.thrust(s.commands, s.thrust, dt)
-        # The vehicle turned as it was measured to turn, whatever rates it was told.
+        # Use the measured rotation of the vehicle instead of the commanded rates.
         u = Command(mean, so3.log(so3.mul(s.last.R.T, x.R)) / dt)
         gained = nominal.state(nominal.step(nominal.init(s.last), u, jnp.zeros_like(x.p))).v - s.last.v
         missed = (x.v - s.last.v - gained) / dt
@@ -127,8 +128,9 @@ class DisturbanceObserver(eqx.Module):
         )
         doubted = jnp.exp(-dt / DECAY_TAU * consistency.doubt**2)
         decay = jnp.where(consistency.certain, 1.0, doubted).astype(x.p.dtype)
-        # The model bridges a few dropped frames; the measured velocity has all of the noise. After other contradictions
-        # it does not: measurements may be later than declared, and then the prediction is of another time.
+        # The model bridges a few dropped frames, since the measured velocity has the full noise. After other
+        # contradictions it does not: measurements may be later than declared, so that the prediction is for another
+        # time.
         dropped = consistency.repeated | s.consistency.repeated
         coasts = comparable & dropped & (consistency.doubt < COAST)
         v = jnp.where(coasts, predicted, x.v)
@@ -147,6 +149,6 @@ class DisturbanceObserver(eqx.Module):
         return dataclasses.replace(s, commands=s.commands.amend(u))
 
     def _noise(self, s: ObserverState, missed: Float[Array, "3"]) -> Float[Array, ""]:
-        """Noise of velocities shows in how much the missed acceleration jumps from tick to tick."""
+        """Return the noise of velocities, estimated from the jumps of the missed acceleration between ticks."""
         seen = jnp.mean(jnp.abs(missed - s.missed)) * self.nominal.dt / SECOND_DIFFERENCE
         return s.noise + (1.0 - jnp.exp(-self.nominal.dt / NOISE_TAU)) * (seen - s.noise)

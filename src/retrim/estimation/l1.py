@@ -1,16 +1,16 @@
-"""L1 adaptive estimation of a disturbance: a predictor of the velocity, a law that is constant over a tick, a filter.
+"""L1 adaptive estimation of a disturbance: a velocity predictor, an adaptation law constant over a tick, a filter.
 
-The predictor's velocity v_hat follows the measured one, v, as fast as its pole A_s < 0 says. The law picks the sigma
-that would take all of the prediction error away within a tick, and the filter makes the estimate of it,
+The predicted velocity v_hat follows the measured velocity v at the speed of the pole A_s < 0. The law selects the sigma
+that would remove the whole prediction error within a tick, and the filter computes the estimate from it,
 
     v_hat <- v_hat + dt (g + f - sigma + A_s (v_hat - v)),
     sigma <- exp(A_s dt) phi^-1 (v_hat - v),   phi = (exp(A_s dt) - 1) / A_s,
     d_hat <- alpha d_hat - (1 - alpha) sigma,
 
-where f is the thrust that was commanded (Hovakimyan and Cao 2010; as flown with DATT, Huang et al. 2023). A constant
-disturbance d shows in -sigma from the second tick on, so that d_hat approaches it with the time constant
--dt / ln(alpha). At the first measurement, and after a tick that was missed, the predictor starts from what is measured,
-and d_hat is held: what changed then is not of one tick.
+where f is the commanded thrust (Hovakimyan and Cao 2010; as in DATT, Huang et al. 2023). A constant disturbance d
+appears in -sigma from the second tick on, so that d_hat approaches it with the time constant -dt / ln(alpha). At the
+first measurement, and after a missed tick, the predictor starts from the measured velocity and d_hat is held, since the
+change is then not that of one tick.
 """
 
 import equinox as eqx
@@ -22,7 +22,7 @@ from .latency import follows
 
 
 class L1State(eqx.Module):
-    """Memory of the estimator; all are world vectors."""
+    """Memory of the estimator; all vectors are in the world frame."""
 
     v_hat: Float[Array, "3"]
     """Predicted velocity [m/s]."""
@@ -43,9 +43,9 @@ class L1Estimator(eqx.Module):
     """Estimates the disturbance that acts, from velocities and commanded thrust."""
 
     pole: Float[Array, ""]
-    """A_s, of the predictor [1/s]; negative."""
+    """Pole A_s of the predictor [1/s]; negative."""
     alpha: Float[Array, ""]
-    """Share of the old estimate that stays in a tick, 0 to 1."""
+    """Share of the old estimate that is kept in a tick, 0 to 1."""
     dt: float = eqx.field(static=True)
     """Control tick [s]."""
 
@@ -62,7 +62,7 @@ class L1Estimator(eqx.Module):
         pole, alpha = self.pole.astype(dtype), self.alpha.astype(dtype)
         gravity = jnp.array([0.0, 0.0, -STANDARD_GRAVITY], dtype=dtype)
         decay = jnp.exp(pole * self.dt)
-        # The predictor over the tick that has ended, from the error at its beginning, which sigma was made of.
+        # Predict over the tick that has ended, from the error at its beginning, from which sigma was computed.
         error = s.sigma * jnp.expm1(pole * self.dt) / pole / decay
         v_hat = s.v_hat + self.dt * (gravity + thrust - s.sigma + pole * error)
         sigma = decay * pole / jnp.expm1(pole * self.dt) * (v_hat - x.v)

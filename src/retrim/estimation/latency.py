@@ -1,4 +1,4 @@
-"""What an old measurement says of now, and whether one is of the tick after another."""
+"""Extrapolation of old measurements to the current time, and a test for successive measurements."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -9,24 +9,24 @@ from ..physics.state import Command, State
 
 
 def follows(t: Float[Array, ""], last: Float[Array, ""], dt: float) -> Bool[Array, ""]:
-    """Return whether a measurement is of the tick after another; what changed between others is not of one tick.
+    """Return whether a measurement follows another by one tick; otherwise their difference is not that of one tick.
 
     Args:
         t: Time of the measurement [s].
-        last: Time of the one before [s]; minus infinity where there was none.
+        last: Time of the measurement before [s]; minus infinity for the first measurement.
         dt: Control tick [s].
     """
     return jnp.abs(t - last - dt) < 0.5 * dt
 
 
 def ahead(x: State, u: Command, d: Float[Array, "3"], age: Float[Array, ""]) -> State:
-    """Return the state a while after ``x``, by Eq. (1) of the paper with constant acceleration and body rates.
+    """Return the state ``age`` after ``x``, by Eq. (1) of the paper with constant acceleration and body rates.
 
     Args:
-        x: State that was measured.
-        u: Command that has acted since.
+        x: Measured state.
+        u: Command that has acted since then.
         d: Disturbance, world [m/s^2].
-        age: How old the measurement is [s].
+        age: Age of the measurement [s].
     """
     a = f_a(x, u, d).v
     return State(x.p + age * x.v + 0.5 * age**2 * a, so3.mul(x.R, so3.exp(age * u.omega)), x.v + age * a)

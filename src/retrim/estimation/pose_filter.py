@@ -1,7 +1,8 @@
-"""Error-state extended Kalman filter of the camera's pose, and of the disturbance that is felt there.
+"""Error-state extended Kalman filter of the camera's pose and of the disturbance.
 
-The filter knows the ground pattern, the commands and Eq. (1) of the paper; it never sees the state. While no point is
-visible it predicts; one visible point already corrects it. What Eq. (1) misses, it takes for a slow acceleration.
+The filter uses the ground pattern, the commands and Eq. (1) of the paper, but not the state. It only predicts while all
+points are invisible; one visible point is enough for a correction. Errors of Eq. (1) are modelled as a slow
+acceleration.
 """
 
 import equinox as eqx
@@ -17,15 +18,15 @@ from ..physics.state import Command, State
 from .camera import Camera, in_camera
 
 START = (0.1, 0.05, 0.2)  # uncertainty of the pose at hand-over: m, rad, m/s
-PUSH = 1.0  # [m/s^2]: uncertainty of the disturbance at hand-over
-DRIFT = (0.0, 0.5, 1.0)  # what Eq. (1) misses beside it: rates [rad/s] and acceleration [m/s^2], held over a tick
-WANDER = 1.0  # [m/s^2] in a second: the random walk of the disturbance
-ITERATIONS = 3  # a first look may be far off: the projection is linearised anew where the last one ended
-GATE = 4.0  # a point farther off than so many standard deviations corrects no more than one there
+PUSH = 1.0  # [m/s^2], uncertainty of the disturbance at hand-over
+DRIFT = (0.0, 0.5, 1.0)  # further errors of Eq. (1): rates [rad/s] and acceleration [m/s^2], held over a tick
+WANDER = 1.0  # [m/s^2] in a second, random walk of the disturbance
+ITERATIONS = 3  # a first estimate may be far off, so the projection is linearised again at the last result
+GATE = 4.0  # standard deviations; a point farther off corrects no more than one at this distance
 
 
 class PoseFilter(eqx.Module):
-    """Estimate, and covariance of its error: position (world), attitude (body), velocity and disturbance (world)."""
+    """Estimate and covariance of its error: position (world), attitude (body), velocity and disturbance (world)."""
 
     x: State
     d: Float[Array, "3"]
@@ -49,8 +50,8 @@ class PoseFilter(eqx.Module):
 
         Args:
             u: Command that reached the actuators during that time.
-            dt: [s]
-            tau: Time constants of the actuators [s]; None for none.
+            dt: Time step [s].
+            tau: Time constants of the actuators [s]; None for actuators without lag.
         """
         x, dtype = self.x, self.P.dtype
         u, end = (u, u) if tau is None else lagged(self.acting, u, dt, tau)
@@ -83,8 +84,8 @@ class PoseFilter(eqx.Module):
             camera: The camera model.
             ground: Keypoints, world [m].
             pixels: Measured projections (normalised image coordinates).
-            visible: Which of them were measured.
-            noise: Their standard deviation per axis (normalised).
+            visible: Whether each of them was measured.
+            noise: Standard deviation of the pixels per axis (normalised).
         """
 
         def expected(off: Float[Array, "12"]) -> Float[Array, "14"]:
@@ -96,7 +97,7 @@ class PoseFilter(eqx.Module):
         here = (jnp.zeros(12, dtype=self.P.dtype), self.P)
 
         def scalar(carry: tuple[Array, Array], row: tuple[Array, ...]) -> tuple[tuple[Array, Array], None]:
-            """Take in one number of a pixel; this needs no matrix inverse."""
+            """Correct by one coordinate of a pixel, which does not need a matrix inverse."""
             (off, P), (h, level, r, seen) = carry, row
             Ph = P @ h
             s = h @ Ph + r

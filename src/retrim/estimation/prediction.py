@@ -1,4 +1,4 @@
-"""What a measurement says of the moment when the next command begins to act."""
+"""Prediction of the state at the time when the next command begins to act."""
 
 import dataclasses
 
@@ -13,16 +13,16 @@ from .latency import ahead
 
 
 class Underway(eqx.Module):
-    """Commands that a vehicle has been given, and what its actuators have made of them."""
+    """Commands under way to a vehicle, and the state of its actuators."""
 
     before: Command
-    """What acted at the beginning of the tick that has just ended."""
+    """Command that acted at the beginning of the tick that has just ended, after the actuator lag."""
     commands: tuple[Command, ...]
     """Commands of the last ticks, oldest first; the oldest acted during the tick that has just ended."""
 
 
 class Prediction(eqx.Module):
-    """Eq. (1) of the paper with the actuator lag and the command delay that are declared of a vehicle."""
+    """Eq. (1) of the paper with the declared actuator lag and command delay of a vehicle."""
 
     tau: Float[Array, ""]
     """Time constant of the actuators [s]."""
@@ -31,7 +31,7 @@ class Prediction(eqx.Module):
     delay_ticks: int = eqx.field(static=True, default=0)
     """Declared command delay [ticks]."""
     age: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(0.0))
-    """How old measurements are [s]."""
+    """Age of measurements [s]."""
 
     def with_age(self, age: float | Float[Array, ""]) -> "Prediction":
         """Return the same for measurements that are ``age`` old [s]."""
@@ -43,7 +43,7 @@ class Prediction(eqx.Module):
         return Underway(hover, (hover,) * (self.delay_ticks + 1))
 
     def acted(self, s: Underway) -> tuple[Command, Command]:
-        """Return what acted over the tick that has just ended, in the mean, and what acts at its end."""
+        """Return the mean command that acted over the tick that has just ended, and the one that acts at its end."""
         return lagged(s.before, s.commands[0], self.dt, self.tau.astype(s.before.c.dtype))
 
     def thrust(self, s: Underway, before: Float[Array, "3 3"], after: Float[Array, "3 3"]) -> Float[Array, "3"]:
@@ -52,20 +52,20 @@ class Prediction(eqx.Module):
         Args:
             s: Memory.
             before: Attitude at the beginning of the tick, body to world.
-            after: Attitude at its end.
+            after: Attitude at the end of the tick.
         """
         return self.acted(s)[0].c * 0.5 * (before[:, 2] + after[:, 2])
 
     def __call__(
         self, s: Underway, x: State, d: Float[Array, "3"], omega: Float[Array, "3"] | None = None
     ) -> tuple[State, Command]:
-        """Return the state, and what acts, when a command that is issued now begins to act.
+        """Return the state and the acting command at the time when a command that is issued now begins to act.
 
         Args:
             s: Memory.
             x: Measured state.
             d: Disturbance, world [m/s^2].
-            omega: Measured body rates [rad/s], where they are; else they are those that the commands give.
+            omega: Measured body rates [rad/s]; None for those that follow from the commands.
         """
         _, acting = self.acted(s)
         if omega is not None:

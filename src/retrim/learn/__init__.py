@@ -1,4 +1,4 @@
-"""Learning from roll-outs and windows of flight: arrays in, arrays out, no clock."""
+"""Learning from roll-outs and windows of flight: pure functions of arrays, without a clock."""
 
 from .bptt import PolicyState as PolicyState
 from .bptt import bptt as bptt

@@ -1,4 +1,4 @@
-"""What PPO has seen, and how much better it was than what was expected: generalised advantage estimates."""
+"""Samples of PPO, and their generalised advantage estimates."""
 
 from typing import Any, NamedTuple
 
@@ -17,14 +17,14 @@ class Seen(NamedTuple):
     log_prob: Float[Array, "..."]
     value: Float[Array, "..."]
     outcome: Outcome
-    """Its reward is scaled by 1 - gamma, and has what a truncated episode would have gone on to win."""
+    """Outcomes. The reward is scaled by 1 - gamma and includes the expected future reward of a truncated episode."""
 
 
 def advantages(seen: Seen, last: Float[Array, " envs"], discount: float, trace: float) -> Float[Array, "steps envs"]:
     """Return the generalised advantage estimates (Schulman et al. 2016, Eq. 16).
 
     Args:
-        seen: Samples; an episode that ends in one does not go on in the next.
+        seen: Samples; an episode that ends in one step does not continue in the next.
         last: Value of the states after the last step.
         discount: gamma.
         trace: lambda.

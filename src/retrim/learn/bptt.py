@@ -57,8 +57,8 @@ def bptt(
 ) -> tuple[PolicyState, Float[Array, " updates"]]:
     """Optimise a policy by one optimiser step per row of starts.
 
-    Pure and traceable: callers compile it once. A step whose gradient is not finite is skipped, since one bad start
-    must not destroy a policy.
+    The function is pure and traceable, so callers compile it once. A step whose gradient is not finite is skipped,
+    since one bad start must not destroy a policy.
 
     Args:
         state: Policy and optimiser state to start from.
@@ -71,7 +71,7 @@ def bptt(
     """
 
     def update(state: PolicyState, starts: Start) -> tuple[PolicyState, Float[Array, ""]]:
-        # From params to plain layers and, with the gradient, back; for a plain policy both are the identity.
+        # Map params to plain layers, and pull the gradient back; for a plain policy both are the identity.
         layers, pull = jax.vjp(lambda params: state.policy.with_params(params).merged().layers, state.policy.params)
         plain = state.policy.merged().with_params(layers)
         loss, by_layers = policy_gradient(plain, env, starts)

@@ -16,22 +16,22 @@ from ..physics.state import Command, State
 from .problem import Outcome
 
 EPISODE = 10.0  # [s]
-TICK = 0.02  # [s], of what follows; with another tick the same happens in a second
+TICK = 0.02  # [s], tick of WALK and DISCOUNT; for another tick they are scaled to the same effect per second
 WALK = 0.02  # [m/s^2], standard deviation of a step of the disturbance, per axis
 DISCOUNT = 0.99
 KNOWN = 1.0  # [m/s^2], largest disturbance per axis
 
 
 class DattEnv(NamedTuple):
-    """An episode under way."""
+    """State of an episode."""
 
     x: State
     acting: Command
-    """What the actuators make of the commands so far."""
+    """Command that acts now, after the lag of the actuators."""
     d: Float[Array, "3"]
     """Disturbance, world [m/s^2]."""
     reference: Int[Array, ""]
-    """Its number in the bank."""
+    """Index of the reference in the bank."""
     tick: Int[Array, ""]
 
 
@@ -47,7 +47,7 @@ class DattProblem(eqx.Module):
     dt: float = eqx.field(static=True, default=0.02)
 
     def reset(self, key: Key[Array, ""]) -> DattEnv:
-        """Begin beside the start of a random reference, somewhat tilted, under a random disturbance."""
+        """Begin near the start of a random reference, slightly tilted, under a random disturbance."""
         k_p, k_v, k_a, k_yaw, k_d, k_r = random.split(key, 6)
         number = random.randint(k_r, (), 0, self.bank.shape[0])
         p = self.bank[number, 0] + random.uniform(k_p, (3,), minval=-0.7, maxval=0.7)
@@ -58,14 +58,14 @@ class DattProblem(eqx.Module):
         return DattEnv(x, Command.hover(p.dtype), d, number, jnp.array(0))
 
     def observe(self, s: DattEnv, key: Key[Array, ""]) -> Float[Array, " o"]:
-        """Return what the policy sees, with 5 mm of noise on the position, as DATT has it."""
+        """Return the observation of the policy, with 5 mm of noise on the position, as in DATT."""
         every = round(APART / self.dt)
         at = jnp.minimum(s.tick + every * jnp.arange(AHEAD), self.bank.shape[1] - 1)
         x = State(s.x.p + 0.005 * random.normal(key, (3,), s.x.p.dtype), s.x.R, s.x.v)
         return datt_observation(x, s.acting, s.d, self.bank[s.reference, at])
 
     def step(self, s: DattEnv, action: Float[Array, "4"], key: Key[Array, ""]) -> tuple[DattEnv, Outcome]:
-        """Fly a tick; the reward is DATT's: minus the distance, half the heading, and a tenth of the speed."""
+        """Fly one tick; the reward is that of DATT: minus distance, half the heading, and a tenth of the speed."""
         mean, acting = lagged(s.acting, datt_command(action, self.low, self.high), self.dt, self.tau)
         x = PointMass(self.dt).step(s.x, mean, s.d)
         walk = WALK * (self.dt / TICK) ** 0.5
@@ -76,7 +76,7 @@ class DattProblem(eqx.Module):
         speed = jnp.sqrt(jnp.sum(x.v * x.v) + 1e-12)
         reward = -(jnp.minimum(away, 5.0) + 0.5 * jnp.abs(heading) + 0.1 * jnp.minimum(speed, 1.0))
         lost = away > 5.0
-        reward = jnp.where(lost, reward / (1.0 - discount(self.dt)), reward)  # as if it stayed there for ever
+        reward = jnp.where(lost, reward / (1.0 - discount(self.dt)), reward)  # as if the vehicle stayed there for ever
         return after, Outcome(reward, lost, after.tick >= ticks_of(self.dt))
 
 
@@ -94,7 +94,7 @@ def reference_bank(seed: int, n: int = 512, *, dt: float = 0.02) -> np.ndarray:
     """Return random references: points, zigzags, chains of polynomials and Lissajous figures, a quarter each.
 
     Args:
-        seed: All follow from it.
+        seed: Seed of all references.
         n: Number of references.
         dt: Time between rows [s].
 
@@ -111,7 +111,7 @@ def reference_bank(seed: int, n: int = 512, *, dt: float = 0.02) -> np.ndarray:
 
 
 def _zigzag(draw: np.random.Generator, t: np.ndarray) -> np.ndarray:
-    """Straight lines between way-points on alternating sides, of 0.6 to 1.5 s each."""
+    """Return straight lines between way-points on alternating sides, of 0.6 to 1.5 s each."""
     knots = np.concatenate([[0.0], np.cumsum(draw.uniform(0.6, 1.5, 30))])
     sides = np.where(np.arange(len(knots)) % 2, 1.0, -1.0)[:, None]
     points = sides * draw.uniform(0.0, 1.0, (len(knots), 3)) * np.array([1.0, 1.0, 0.3])
@@ -120,7 +120,7 @@ def _zigzag(draw: np.random.Generator, t: np.ndarray) -> np.ndarray:
 
 
 def _chain(draw: np.random.Generator, t: np.ndarray) -> np.ndarray:
-    """Cubics through the origin, axis by axis, of 1.2 to 4 s each, whose speeds at the knots agree."""
+    """Return cubics through the origin, per axis, of 1.2 to 4 s each, with continuous speeds at the knots."""
     path = np.zeros((len(t), 3))
     for axis, share in enumerate((1.0, 1.0, 0.3)):
         knots = np.concatenate([[0.0], np.cumsum(draw.uniform(1.2, 4.0, 12))])
@@ -134,7 +134,7 @@ def _chain(draw: np.random.Generator, t: np.ndarray) -> np.ndarray:
 
 
 def _lissajous(draw: np.random.Generator, t: np.ndarray) -> np.ndarray:
-    """A sine along each axis, of 2.5 to 6 s and up to 1.5 m, whose speed rises within the first two seconds."""
+    """Return a sine along each axis, of 2.5 to 6 s and up to 1.5 m, whose speed rises within the first two seconds."""
     period, phase = draw.uniform(2.5, 6.0), draw.uniform(0.0, 2.0 * np.pi, 3)
     size = draw.uniform(0.2, 1.0, 3) * np.array([1.5, 1.5, 0.3])
     beats = np.array([1.0, draw.integers(1, 3), 1.0])

@@ -1,4 +1,4 @@
-"""Devices that compute: an axis of environments, flights or vehicles is divided among all that JAX has."""
+"""Computation on several devices: an axis of environments, flights or vehicles is divided among all JAX devices."""
 
 from typing import TypeVar
 
@@ -17,36 +17,36 @@ MANY = "many"
 
 
 def shared_by(n: int, devices: int) -> int:
-    """Return how many of so many devices share ``n`` equal pieces of work: the largest number that divides it."""
+    """Return the number of devices that share ``n`` equal pieces of work: the largest number that divides ``n``."""
     return max(k for k in range(1, devices + 1) if n % k == 0)
 
 
 def spread(tree: T, *, axis: int = 0) -> T:
-    """Divide the arrays of a tree among the devices, along one axis of them all; with one device, do nothing.
+    """Divide the arrays of a tree among the devices, along one common axis; with one device, return the tree unchanged.
 
-    Inside ``jit`` this is a constraint, from which the compiler divides what is computed of the arrays; outside, the
+    Inside ``jit`` this is a constraint, from which the compiler derives how to divide later computations; outside, the
     arrays are moved. Values do not change, but sums over the axis are taken in another order.
 
     Args:
-        tree: Arrays whose axis ``axis`` has the same length; other leaves stay.
+        tree: Arrays whose axis ``axis`` has the same length; other leaves are unchanged.
         axis: The axis of environments, flights or vehicles.
 
     Raises:
-        ConfigError: There are several hosts, and their devices do not divide it.
+        ConfigError: There are several hosts, and the length of the axis cannot be divided among their devices.
     """
     leaves = jax.tree.leaves(eqx.filter(tree, eqx.is_array))
     return _laid(tree, leaves[0].shape[axis], PartitionSpec(*[None] * axis, MANY)) if leaves else tree
 
 
 def whole(tree: T, n: int) -> T:
-    """Have each device that shares ``n`` pieces of work hold the arrays of a tree whole; see :func:`spread`."""
+    """Replicate the arrays of a tree on each device that shares ``n`` pieces of work; see :func:`spread`."""
     return _laid(tree, n, PartitionSpec())
 
 
 def gathered(tree: T) -> T:
-    """Bring arrays that every device has whole to where further work may be done anywhere; with one device, do nothing.
+    """Copy replicated arrays through the host, so that any device may use them; with one device, return them unchanged.
 
-    An array that a program on several devices has made belongs to these; one that comes from the host does not.
+    An array from a program on several devices is bound to these devices; an array from the host is not.
     """
     if jax.device_count() == 1:
         return tree

@@ -1,7 +1,7 @@
 """Pretraining of the hidden layers of a vision policy: they learn to predict the state from keypoints.
 
-The paper (Sec. IV-A.2, after Heeg et al.) trains it on flights of a random policy. Here the histories are synthetic:
-random motions of constant velocity and body rates, drawn afresh at each step, without any roll-out.
+The paper (Sec. IV-A.2, after Heeg et al.) trains them on flights of a random policy. Here the histories are synthetic:
+random motions of constant velocity and body rates, drawn anew at each step, without roll-outs.
 """
 
 import equinox as eqx
@@ -27,16 +27,16 @@ def pretrain_encoder(
     steps: int = 3000,
     batch: int = 512,
 ) -> tuple[Policy, Float[Array, " steps"]]:
-    """Train the hidden layers of ``policy`` to predict [p, R, v]; the output layer stays.
+    """Train the hidden layers of ``policy`` to predict [p, R, v]; the output layer is unchanged.
 
-    Adam at 1e-3 along a cosine. The layers are first drawn anew at the usual scale (Glorot), since a fresh policy's
-    are small.
+    The optimiser is Adam with a cosine schedule from 1e-3. The layers are first drawn anew at the usual scale (Glorot),
+    since those of a fresh policy are small.
 
     Args:
         policy: A policy with at least one hidden layer.
         observation: The observation of the policy.
-        key: Consumed.
-        motions: What the encoder is trained on; it does not generalise far beyond.
+        key: Random key, consumed.
+        motions: Distribution of the motions for training; the encoder does not generalise far beyond it.
         steps: Optimiser steps.
         batch: Random motions per step.
 

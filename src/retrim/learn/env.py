@@ -1,4 +1,4 @@
-"""The environment of training: a model, a task and a command path as one value."""
+"""The training environment: a model, a task and a command path as one value."""
 
 import dataclasses
 from typing import Any
@@ -18,27 +18,28 @@ from ..tasks.task import AbstractTask, Start
 
 
 class Env(eqx.Module):
-    """Where a policy is trained and judged: one drone, one model, one task."""
+    """Environment in which a policy is trained and judged: one drone, one model, one task."""
 
     dynamics: AbstractDynamics[Any]
-    """Model of the vehicle; it ticks at the task's rate."""
+    """Model of the vehicle; it has the tick of the task."""
     task: AbstractTask
     delay: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros(()))
-    """Transport delay of commands [s]. Another one is not another program."""
+    """Transport delay of commands [s]. Another value does not need another compilation."""
     felt: Residual | None = None
-    """The disturbance that a controller around the policy answers by the frame of the gravity that is felt, given the
-    state and the last command, world [m/s^2]; None if the policy sees the world as it is."""
+    """Disturbance that a controller around the policy compensates with the frame of the effective gravity, as a
+    function of the state and the last command, world [m/s^2]; None if the policy observes in the world frame."""
     jump_cost: Float[Array, ""] | None = None
-    """Cost of the squared change of a policy's command from tick to tick, [c, omega] in m/s^2 and rad/s; None: none."""
+    """Cost of the squared change of a policy's command from tick to tick, [c, omega] in m/s^2 and rad/s; None for no
+    cost."""
     family: PathFamily | None = None
-    """Vehicles that training draws, each with a belief about it; None: training has the vehicle of the model."""
+    """Vehicles from which training draws, each with a belief about it; None for the vehicle of the model."""
     longest_delay: float = eqx.field(static=True, default=LONGEST_DELAY)
-    """Longest delay that a roll-out has room for [s]."""
+    """Longest delay that the command queue of a roll-out can hold [s]."""
 
     def __check_init__(self) -> None:
-        """Raise ``ValueError`` for an impossible delay, and for a model and a task that tick at different rates.
+        """Raise ``ValueError`` for an invalid delay, and for a model and a task with different ticks.
 
-        A delay that is traced, or one of many, is not checked.
+        A traced delay, or an array of delays, is not checked.
         """
         check_delay(self.delay, self.longest_delay, "Env")
         if self.dynamics.dt != self.task.dt:
@@ -52,7 +53,7 @@ class Env(eqx.Module):
         """Return the same environment for a vehicle with another command path.
 
         Args:
-            path: Its delay and the response of its actuators.
+            path: Delay and actuator response of that vehicle.
         """
         return dataclasses.replace(self, dynamics=with_response(self.dynamics, path.response), delay=path.delay)
 
@@ -64,7 +65,7 @@ class Env(eqx.Module):
         return dataclasses.replace(self.task.reset(k_start), member=self.family.draw(k_member))
 
     def frame(self, x: State, last: Command) -> FeltFrame | None:
-        """Return the frame in which the policy sees the world, without gradients through it; None for the world's own.
+        """Return the frame in which the policy observes, without gradients through it; None for the world frame.
 
         Args:
             x: State.
@@ -73,7 +74,7 @@ class Env(eqx.Module):
         return None if self.felt is None else FeltFrame.of(lax.stop_gradient(self.felt(x, last)))
 
     def cost_of_jump(self, before: Command, after: Command) -> Float[Array, ""]:
-        """Return what it costs that the policy commands ``after`` a tick after it commanded ``before``."""
+        """Return the cost of the change of the policy's command from ``before`` to ``after`` in one tick."""
         if self.jump_cost is None:
             return jnp.zeros_like(after.c)
         return self.jump_cost * jnp.sum((after.vector() - before.vector()) ** 2)

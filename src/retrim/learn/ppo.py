@@ -1,9 +1,9 @@
-"""Proximal policy optimisation (Schulman et al. 2017): learning from rewards alone, for what has no gradient.
+"""Proximal policy optimisation (Schulman et al. 2017): learning from rewards alone, for problems without gradients.
 
-Many environments are stepped at once; advantages are estimated as in Schulman et al. 2016; a few passes over what was
-seen, in minibatches, maximise the clipped objective. An episode that is cut off by its time limit, and not by what the
-vehicle did, goes on in the estimate by the value of where it was cut. Values are sums of rewards scaled by 1 - gamma,
-so that they are of the size of a reward whatever the discount.
+Many environments are stepped at once; advantages are estimated as in Schulman et al. 2016; a few passes over the
+samples, in minibatches, maximise the clipped objective. If the time limit cuts an episode off, and not the behaviour of
+the vehicle, the estimate continues with the value of the state at the cut. Values are sums of rewards scaled by
+1 - gamma, so that they have the size of a reward for every discount.
 """
 
 import functools
@@ -24,7 +24,7 @@ from .problem import Problem
 
 @runtime_checkable
 class ActorCritic(Protocol):
-    """A policy, its exploration, and its judgement of a state; an :class:`equinox.Module`."""
+    """A policy, its exploration, and its value of a state; an :class:`equinox.Module`."""
 
     log_std: Float[Array, " a"]
     """Logarithm of the standard deviation of actions."""
@@ -43,29 +43,29 @@ class PpoSettings:
     """Steps of each environment between two updates."""
     minibatches: int = 4
     epochs: int = 4
-    """Passes over what was seen."""
+    """Passes over the samples."""
     learning_rate: float = 1e-3
-    """At the beginning; it falls to zero along a cosine."""
+    """Initial learning rate; it decays to zero with a cosine schedule."""
     discount: float = 0.99
     trace: float = 0.95
-    """lambda of the generalised advantage estimate."""
+    """Parameter lambda of the generalised advantage estimate."""
     clip: float = 0.2
     value_cost: float = 0.5
     entropy_gain: float = 0.0
     max_grad_norm: float = 0.5
 
     def __post_init__(self) -> None:
-        """Raise ``ValueError`` if what is seen cannot be split into the minibatches."""
+        """Raise ``ValueError`` if the samples cannot be split into the minibatches."""
         if (self.envs * self.steps) % self.minibatches:
             raise ValueError(f"PPO: {self.envs} x {self.steps} samples cannot be split into {self.minibatches} batches")
 
     def updates(self, steps: int) -> int:
-        """Return the number of updates in which at least so many steps are made."""
+        """Return the number of updates that take at least ``steps`` steps."""
         return -(-steps // (self.envs * self.steps))
 
 
 class PpoState(eqx.Module):
-    """Everything that learning goes on from."""
+    """State of the learning."""
 
     net: Any
     """The :class:`ActorCritic`."""
@@ -74,11 +74,11 @@ class PpoState(eqx.Module):
     """States of the environments."""
     key: Key[Array, ""]
     made: Int[Array, ""]
-    """Updates so far."""
+    """Number of updates so far."""
 
     @classmethod
     def of(cls, problem: Problem[Any], net: Any, key: Key[Array, ""], settings: PpoSettings) -> "PpoState":
-        """Return the state before the first update, of a network and a key, which is consumed."""
+        """Return the state before the first update, from a network and a key, which is consumed."""
         k_reset, k_learn = random.split(key)
         envs = jax.jit(jax.vmap(problem.reset))(random.split(k_reset, settings.envs))
         moments = _optimiser(settings, 1).init(eqx.filter(net, eqx.is_inexact_array))  # the same for any number
@@ -88,16 +88,16 @@ class PpoState(eqx.Module):
 def ppo(
     problem: Problem[Any], state: PpoState, settings: PpoSettings, *, steps: int
 ) -> Iterator[tuple[PpoState, dict[str, float]]]:
-    """Learn.
+    """Learn a policy.
 
     Args:
         problem: The environment.
-        state: Where learning begins, or goes on; as if it had never been left, to the bit.
+        state: State from which learning starts or resumes; a resumed run equals an uninterrupted one bit for bit.
         settings: Sizes and rates.
         steps: Steps of all environments together, from the first update on.
 
     Yields:
-        After each update the state, and figures: mean reward of a step, loss, and the share of clipped samples.
+        The state after each update, and statistics: mean reward of a step, loss, and the share of clipped samples.
     """
     updates = settings.updates(steps)
     optimiser = _optimiser(settings, updates)
@@ -108,7 +108,10 @@ def ppo(
 
 @functools.lru_cache(maxsize=32)
 def _optimiser(settings: PpoSettings, updates: int) -> optax.GradientTransformation:
-    """Adam under a cosine, behind a clip; the same object for the same numbers, so that programs are shared."""
+    """Return gradient clipping, then Adam with a cosine schedule.
+
+    The same arguments return the same object, so that compiled programs are shared.
+    """
     rate = optax.cosine_decay_schedule(settings.learning_rate, updates * settings.epochs * settings.minibatches)
     return optax.chain(optax.clip_by_global_norm(settings.max_grad_norm), optax.adam(rate, eps=1e-5))
 
@@ -117,7 +120,7 @@ def _optimiser(settings: PpoSettings, updates: int) -> optax.GradientTransformat
 def update(
     problem: Problem[Any], state: PpoState, optimiser: optax.GradientTransformation, settings: PpoSettings
 ) -> tuple[PpoState, dict[str, Float[Array, ""]]]:
-    """Step the environments, and make one update from what was seen."""
+    """Step the environments, and make one update from the samples."""
     k_next, k_roll, k_epochs = random.split(state.key, 3)
     envs, seen, last, reward = _rolled(problem, state.net, state.envs, k_roll, settings)
     advantage = advantages(seen, last, settings.discount, settings.trace)
@@ -145,7 +148,7 @@ def update(
 
 
 def log_prob(action: Float[Array, " a"], mean: Float[Array, " a"], log_std: Float[Array, " a"]) -> Float[Array, ""]:
-    """Return the logarithm of the density of an action, normal around ``mean``."""
+    """Return the logarithm of the density of an action that is normally distributed around ``mean``."""
     scaled = (action - mean) * jnp.exp(-log_std)
     return jnp.sum(-0.5 * scaled * scaled - log_std) - 0.5 * action.shape[0] * jnp.log(2.0 * jnp.pi)
 
@@ -153,7 +156,7 @@ def log_prob(action: Float[Array, " a"], mean: Float[Array, " a"], log_std: Floa
 def _rolled(
     problem: Problem[Any], net: Any, envs: Any, key: Key[Array, ""], settings: PpoSettings
 ) -> tuple[Any, Seen, Float[Array, " envs"], Float[Array, ""]]:
-    """Step all environments; where an episode ends, the next one begins."""
+    """Step all environments; an environment whose episode ends begins the next one."""
 
     def one(s: Any, key: Key[Array, ""]) -> tuple[Any, tuple[Seen, Array]]:
         k_see, k_act, k_step, k_new, k_after = random.split(key, 5)
@@ -179,7 +182,7 @@ def _rolled(
 
 
 def _loss(arrays: Any, fixed: Any, batch: Any, settings: PpoSettings) -> tuple[Array, dict[str, Array]]:
-    """Return the clipped objective with its sign turned, and figures."""
+    """Return minus the clipped objective, and statistics."""
     net, (seen, advantage, target) = eqx.combine(arrays, fixed), batch
     advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8)
     mean, value = jax.vmap(net)(seen.o)

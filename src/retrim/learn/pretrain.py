@@ -16,7 +16,7 @@ from .bptt import PolicyState, bptt
 from .devices import gathered, spread, whole
 from .env import Env
 
-PATIENCE = 10  # steps in a row without a loss; fewer are bad starts, which are left out
+PATIENCE = 10  # consecutive steps without a finite loss; fewer are due to bad starts, which are left out
 
 
 def random_starts(task: AbstractTask, key: Key[Array, ""], num_updates: int, num_envs: int) -> Start:
@@ -35,8 +35,8 @@ def train_chunk(
 ) -> tuple[PolicyState, Float[Array, " updates"]]:
     """Make ``num_updates`` optimiser steps on fresh starts; compiled once for the same optimiser, sizes and shapes.
 
-    Training is cut into such chunks, so that progress can be shown and an interrupted run keeps what it has. Several
-    devices share the starts of each step.
+    Training is divided into such chunks, so that progress can be shown and an interrupted run keeps its results.
+    Several devices share the starts of each step.
     """
     starts = spread(jax.vmap(jax.vmap(env.reset))(random.split(key, (num_updates, num_envs))), axis=1)
     return whole(bptt(state, env, starts, optimiser=optimiser), num_envs)
@@ -57,8 +57,8 @@ def pretrain(
     Args:
         policy: Policy to start from.
         env: Nominal model, task and delay.
-        key: Consumed.
-        optimiser: Optimiser of the policy's parameters. The same object does not compile again.
+        key: Random key, consumed.
+        optimiser: Optimiser of the policy's parameters. Another call with the same object does not compile again.
         num_updates: Optimiser steps, a multiple of ``chunk``, since every chunk runs the same program.
         num_envs: Starts per step.
         chunk: Steps between two results.
@@ -68,7 +68,7 @@ def pretrain(
 
     Raises:
         ValueError: ``num_updates`` is not a positive multiple of ``chunk``.
-        TrainingError: The loss is not a number, ten steps in a row or at the end.
+        TrainingError: The loss is not a number, in ten consecutive steps or at the end.
     """
     if num_updates % chunk or num_updates <= 0:
         raise ValueError(f"num_updates = {num_updates} must be a positive multiple of {chunk}")

@@ -1,4 +1,4 @@
-"""What learning from rewards is given: an environment that needs no gradient."""
+"""The environment of learning from rewards; it does not need gradients."""
 
 from typing import Generic, NamedTuple, Protocol, TypeVar, runtime_checkable
 
@@ -8,18 +8,18 @@ S = TypeVar("S")
 
 
 class Outcome(NamedTuple):
-    """What a step of an environment led to."""
+    """Result of a step of an environment."""
 
     reward: Float[Array, ""]
     terminated: Bool[Array, ""]
-    """The episode is over, and nothing more can be won."""
+    """True if the episode is over, without further rewards."""
     truncated: Bool[Array, ""]
-    """The episode is cut off by its time limit."""
+    """True if the time limit cuts the episode off."""
 
 
 @runtime_checkable
 class Problem(Protocol, Generic[S]):
-    """An environment to learn in; all are pure functions of one state."""
+    """An environment for learning; all methods are pure functions of one state."""
 
     def reset(self, key: Key[Array, ""]) -> S:
         """Return the state at the start of an episode; the key is consumed."""
@@ -30,5 +30,5 @@ class Problem(Protocol, Generic[S]):
         ...
 
     def step(self, s: S, action: Float[Array, " a"], key: Key[Array, ""]) -> tuple[S, Outcome]:
-        """Return the next state, and what the action led to."""
+        """Return the next state and the outcome of the action."""
         ...

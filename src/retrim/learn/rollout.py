@@ -1,4 +1,4 @@
-"""Roll-out of one drone, as one scan."""
+"""Roll-out of one drone as one scan."""
 
 from typing import Any
 
@@ -21,22 +21,22 @@ class Trajectory(eqx.Module):
     x: State
     """State at the start of each tick."""
     u: Command
-    """Command acting during it, in the mean."""
+    """Mean command that acts during each tick."""
     reward: Float[Array, " horizon"]
     """r(x_t, u_t). After termination: the worst reward of the roll-out so far, so that terminating never pays."""
     terminated: Bool[Array, " horizon"]
-    """True from the tick on in which the vehicle left the task's bounds; it is then frozen."""
+    """True after the tick in which the vehicle left the task's bounds; its state is then frozen."""
 
 
 def rollout(env: Env, policy: Policy, start: Start) -> Trajectory:
     """Fly ``env.task.horizon`` ticks from ``start``.
 
-    A command begins to act ``env.delay`` after it was issued; until the first one does, the vehicle is told to hover.
-    During a tick in which the acting command changes, their mean acts.
+    A command begins to act ``env.delay`` after it was issued; until the first one acts, the vehicle receives the hover
+    command. During a tick in which the acting command changes, the mean of the two commands acts.
 
     Args:
         env: Model, task and delay.
-        policy: Policy that flies.
+        policy: Policy of the flight.
         start: Time and state at which the roll-out starts.
 
     Returns:
@@ -52,9 +52,9 @@ def perturbed_rollout(
 
     Args:
         env: Model, task and delay.
-        policy: Policy that flies; no gradient flows to its weights.
+        policy: Policy of the flight; gradients do not flow to its weights.
         start: Time and state at which the roll-out starts.
-        perturbations: Per layer, horizon x width; the result is differentiable in them.
+        perturbations: Perturbations per layer, horizon x width; the result is differentiable in them.
 
     Returns:
         The trajectory, and the inputs of each layer (per layer, horizon x fan-in).
@@ -72,7 +72,7 @@ def _scan(env: Env, policy: Policy, start: Start, perturbations: Perturbations |
     shares = commands.weights(env.delay, task.dt)  # the same in every tick
 
     def framed(x: State, issued: Command) -> tuple[FeltFrame | None, AbstractTask, State]:
-        """The frame that is flown in, and task and state in it."""
+        """Return the frame of the policy, and task and state in this frame."""
         frame = env.frame(x, issued)
         return (None, task, x) if frame is None else (frame, task.in_frame(frame), frame.state(x))
 
@@ -103,7 +103,7 @@ def _scan(env: Env, policy: Policy, start: Start, perturbations: Perturbations |
         worst = jnp.minimum(worst, lax.stop_gradient(reward))
         return (s, memory, last, issued, commands, survived, worst), ((x, acting, reward, ~alive), inputs)
 
-    _, seen, x_seen = framed(start.x, hover)  # what is remembered of before the start is of the same frame
+    _, seen, x_seen = framed(start.x, hover)  # the memory of the time before the start has the same frame
     carry = (
         dynamics.init(start.x),
         seen.observation.init(x_seen),

@@ -1,4 +1,4 @@
-"""Screening of a window: its measurements that contradict each other, and its ticks that a learner can use."""
+"""Screening of a window: finds measurements that contradict each other, and ticks that a learner can use."""
 
 from collections.abc import Sequence
 
@@ -17,17 +17,17 @@ class Screening(eqx.Module):
     """Result of a screening. A window of n measurements has n - 1 steps."""
 
     steps: Bool[Array, " steps"]
-    """Steps from one measurement to the next that no test contradicts; those of invalid ticks, and steps
-    that are not one tick long, are not tested."""
+    """Steps from one measurement to the next that pass all tests; steps of invalid ticks, and steps that are not one
+    tick long, are not tested."""
     samples: Bool[Array, " n"]
-    """Measurements at one end of such a step at least."""
+    """Measurements at one end of at least one such step."""
     counts: Int[Array, "5"]
-    """Contradicted steps by reason, in the order of :class:`~retrim.estimation.consistency.Findings`."""
+    """Number of contradicted steps by reason, in the order of :class:`~retrim.estimation.consistency.Findings`."""
     trusted: Bool[Array, ""]
-    """Whether at least half of the steps are left to learn from, and velocities have the scale of the positions."""
+    """True if at least half of the steps are usable, and velocities have the scale of the positions."""
 
     def note(self) -> str:
-        """Return the reasons and their counts in words; empty without a contradiction."""
+        """Return the reasons and their counts in words; an empty string without contradictions."""
         return describe_counts(self.counts)
 
 
@@ -41,16 +41,16 @@ REASONS = (
 
 
 def describe_counts(counts: Int[ArrayLike, "5"] | Sequence[int]) -> str:
-    """Return the reasons with their counts in words; empty if all are zero."""
+    """Return the reasons with their counts in words; an empty string if all are zero."""
     found = zip(REASONS, np.asarray(counts, dtype=int).tolist(), strict=False)
     return ", ".join(f"{name}: {n}" for name, n in found if n)
 
 
 def screen(window: Window, dt: float) -> Screening:
-    """Return which measurements of a window can be learned from.
+    """Return which measurements of a window are usable for learning.
 
-    The noise of the flight is a median over its steps, up to half of which may be spoilt. The step after a repeated
-    measurement has the motion of two ticks, so it does not count either.
+    The noise of the flight is a median over its steps, so that up to half of them may be corrupted. The step after a
+    repeated measurement contains the motion of two ticks, so it does not count either.
 
     Args:
         window: Ticks of flight.
@@ -76,7 +76,7 @@ def screen(window: Window, dt: float) -> Screening:
     beside = jnp.concatenate([nothing, good]) | jnp.concatenate([good, nothing])
     judged = jnp.concatenate([nothing, valid]) | jnp.concatenate([valid, nothing])
     samples = window.valid & (beside | ~judged)
-    trusted = ~(shows & wrong) & (jnp.sum(bad & valid) <= jnp.sum(valid) // 2)  # of the majority is learned, or nothing
+    trusted = ~(shows & wrong) & (jnp.sum(bad & valid) <= jnp.sum(valid) // 2)  # learn only from a good majority
     return Screening(~(bad & valid), samples, counts, trusted)
 
 
@@ -85,7 +85,7 @@ def _rows(x: State, part: slice) -> State:
 
 
 def _median(values: Float[Array, " n"], counts: Bool[Array, " n"]) -> Float[Array, ""]:
-    """Return the median of the values that count; zero if none does."""
+    """Return the median of the values that count; zero if there is no such value."""
     ordered = jnp.sort(jnp.where(counts & jnp.isfinite(values), values, jnp.inf))
-    middle = ordered[(jnp.sum(counts) - 1) // 2]  # the last value, which is infinite, if none counts
+    middle = ordered[(jnp.sum(counts) - 1) // 2]  # the last value, which is infinite, if the count is zero
     return jnp.where(jnp.isfinite(middle), middle, 0.0)

@@ -1,4 +1,4 @@
-"""Weight gradients by one product after the scan.
+"""Weight gradients from one product after the scan.
 
 Differentiating a scan that closes over a policy adds to the weight cotangent at every step of the backward pass:
 ``horizon`` read-modify-write passes over a 512 x 512 matrix, each for a product with only as many rows as there are

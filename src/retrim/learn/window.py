@@ -1,4 +1,4 @@
-"""The last seconds of a flight, as learners take them."""
+"""The last seconds of a flight, as input of the learners."""
 
 import equinox as eqx
 import jax
@@ -10,7 +10,7 @@ from ..physics.state import Command, State
 
 
 class Window(eqx.Module):
-    """The last ``n`` ticks of a flight, oldest first. While it fills, ``valid`` is false in front."""
+    """The last ``n`` ticks of a flight, oldest first. While the window fills, ``valid`` is false for the first rows."""
 
     t: Float[Array, " n"]
     """Time of each tick since the start of the flight [s]."""
@@ -20,7 +20,7 @@ class Window(eqx.Module):
     """Command that the plant accepted at each tick (leading axis n)."""
     valid: Bool[Array, " n"]
     age: Float[Array, " n"] | None = None
-    """How old each measurement was [s]; None for not at all."""
+    """Age of each measurement [s]; None if all ages are zero."""
 
     @classmethod
     def of(
@@ -35,7 +35,7 @@ class Window(eqx.Module):
         """Build a window from the columns of a flight log.
 
         Args:
-            t: Times [s], rising.
+            t: Times, increasing [s].
             p: Positions, world [m].
             R: Attitudes, body to world.
             v: Velocities, world [m/s].

@@ -1,4 +1,4 @@
-"""Physics: pure, differentiable, unbatched; no networks, no input or output, keys only at construction."""
+"""Physics: pure, differentiable, unbatched; without networks, input or output; keys only at construction."""
 
 from .actuator_response import ActuatorResponse as ActuatorResponse
 from .actuator_response import ActuatorState as ActuatorState

@@ -1,11 +1,11 @@
-"""How thrust and body rates follow the commands that arrive.
+"""Response of thrust and body rates to the commands that arrive.
 
 Thrust follows through a gain and a first-order lag, and each body rate through a gain and a loop of second order,
 
     tau_c c' + c = k_c c_cmd,    (tau kappa / 2)^2 w'' + tau w' + w = k w_cmd,
 
 with tau = 2 zeta / omega_n and kappa = 1 / zeta. For kappa = 0 the loop is of first order with the time constant tau.
-All values are arrays, so that another lag or damping is never another program.
+All values are arrays, so that another lag or damping does not need another compilation.
 """
 
 import equinox as eqx
@@ -14,17 +14,17 @@ from jaxtyping import Array, Float
 
 from .state import Command
 
-FASTEST = 1e-6  # [s], shortest time constant of an exponential; below it, a loop has arrived after any step
-STIFFEST = 1e-6  # least kappa of the fast mode of a loop, which has decayed after any step
-NEAR_CRITICAL = 0.25  # of the square of the angle, below which its functions are series
-SERIES = 7  # terms: double precision up to NEAR_CRITICAL
+FASTEST = 1e-6  # [s], shortest time constant of an exponential; a faster loop has settled after any step
+STIFFEST = 1e-6  # smallest kappa of the fast mode of a loop, which has decayed after any step
+NEAR_CRITICAL = 0.25  # square of the angle below which its functions are computed as series
+SERIES = 7  # number of terms, for double precision up to NEAR_CRITICAL
 
 
 class ActuatorState(eqx.Module):
-    """What actuators and rate loop have made of the commands so far."""
+    """State of actuators and rate loop."""
 
     command: Command
-    """Thrust [m/s^2] and body rates [rad/s] that act."""
+    """Present thrust [m/s^2] and body rates [rad/s]."""
     slope: Float[Array, "3"]
     """Change of the body rates within their time constant, tau w' [rad/s]."""
 
@@ -35,7 +35,7 @@ class ActuatorState(eqx.Module):
 
 
 class ActuatorResponse(eqx.Module):
-    """How thrust and body rates follow the commands that arrive."""
+    """Response of thrust and body rates to the commands that arrive."""
 
     thrust_gain: Float[Array, ""]
     """Thrust over commanded thrust."""
@@ -58,7 +58,7 @@ class ActuatorResponse(eqx.Module):
         thrust_gain: float | Float[Array, ""] = 1.0,
         rate_gain: float | Float[Array, "*axes"] = 1.0,
     ) -> "ActuatorResponse":
-        """Build a response; what is given once holds for all axes.
+        """Return a response; a scalar applies to all axes.
 
         Args:
             thrust_lag: Time constant of the thrust [s].
@@ -72,28 +72,28 @@ class ActuatorResponse(eqx.Module):
 
     @property
     def settling_time(self) -> Float[Array, ""]:
-        """Three time constants of what moves the vehicle [s].
+        """Three time constants of the response that moves the vehicle [s].
 
-        A turn about the thrust axis does not move it, and yaw may take a second. A loop that rings settles with its
-        envelope.
+        A turn about the thrust axis does not move the vehicle, and yaw may take a second. A loop that rings settles
+        with its envelope.
         """
         envelope = self.rate_lag * jnp.maximum(1.0, 0.5 * self.inverse_damping**2)
         return 3.0 * jnp.maximum(self.thrust_lag, jnp.max(envelope[:2]))
 
     def target(self, u: Command) -> Command:
-        """Return what thrust and body rates become under a command that stays."""
+        """Return the final thrust and body rates under a constant command."""
         return Command(self.thrust_gain.astype(u.c.dtype) * u.c, self.rate_gain.astype(u.omega.dtype) * u.omega)
 
     def __call__(self, s: ActuatorState, u: Command, time: float | Float[Array, ""]) -> tuple[Command, ActuatorState]:
-        """Advance under a constant command; exact, and differentiable in everything.
+        """Advance under a constant command; exact, and differentiable in all arguments.
 
         Args:
             s: State at the beginning.
-            u: Command that arrives, held.
+            u: Command that arrives, held constant.
             time: Duration [s]; zero is allowed.
 
         Returns:
-            How far thrust and body rates were from :meth:`target`, integrated over the duration [m/s, rad], and the
+            Difference of thrust and body rates from :meth:`target`, integrated over the duration [m/s, rad], and the
             state at its end.
         """
         dtype, target = u.c.dtype, self.target(u)
@@ -116,7 +116,7 @@ class ActuatorResponse(eqx.Module):
 
         Args:
             c: Thrust at the beginning [m/s^2].
-            target: Thrust that it tends to [m/s^2].
+            target: Final thrust [m/s^2].
             time: Duration [s].
 
         Returns:
@@ -128,12 +128,12 @@ class ActuatorResponse(eqx.Module):
 
 
 def strong_array(value: float | Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Return an array of strong type: one of weak type would be another program."""
+    """Return an array of strong type, since one of weak type would need another compilation."""
     return jnp.asarray(value, dtype=float)
 
 
 def _modes(x: Float[Array, "3"], kappa: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-    """Mean of the loop's two modes, and their difference over rho = sqrt(1 - kappa^2), smooth through rho = 0.
+    """Return the mean of the loop's two modes, and their difference over rho = sqrt(1 - kappa^2), smooth at rho = 0.
 
     Args:
         x: Time over the time constant.
@@ -146,7 +146,7 @@ def _modes(x: Float[Array, "3"], kappa: Float[Array, "3"]) -> tuple[Float[Array,
     square = b**2 * (1.0 - kappa**2)
     near = jnp.abs(square) < NEAR_CRITICAL
     slow, quick = ~near & (kappa < 1.0), ~near & (kappa >= 1.0)
-    # Each branch is evaluated at harmless numbers where another one holds, or its gradient would not be finite.
+    # Where another branch applies, each branch is evaluated at safe numbers, since its gradient must be finite.
     k = jnp.where(slow, kappa, 0.5)
     rho = jnp.sqrt(1.0 - k**2)
     late = jnp.exp(-2.0 * x / (1.0 + rho))

@@ -1,4 +1,4 @@
-"""Actuators in front of any model. Without them, a steep reward yields gains that slow motors cannot follow."""
+"""Actuators in front of a model. Without them, a steep reward leads to gains that slow motors cannot follow."""
 
 import dataclasses
 from typing import Any, Generic, TypeVar
@@ -12,7 +12,7 @@ from .actuator_response import ActuatorResponse, ActuatorState
 from .dynamics import AbstractDynamics, AbstractWrapper
 from .state import Command, State
 
-AT_LIMIT = 0.05  # a command this share of its range from a limit, or less, is at it
+AT_LIMIT = 0.05  # share of the range around a limit within which a command counts as at the limit
 
 X = TypeVar("X")
 U = TypeVar("U")
@@ -26,16 +26,16 @@ class LagState(eqx.Module, Generic[X]):
 
 
 def lagged(acting: U, u: U, dt: float, tau: Float[Array, ""] | Command) -> tuple[U, U]:
-    """Return what a first-order lag makes of a command over a tick.
+    """Return the output of a first-order lag for a command over a tick.
 
     Args:
         acting: Command at the actuators at the beginning of the tick; or arrays of commands.
         u: Command that reaches them, of the same kind.
         dt: Length of the tick [s].
-        tau: Time constant [s], of all parts alike, or of each part of a command.
+        tau: Time constant [s], of all parts or of each part of a command.
 
     Returns:
-        The mean over the tick, and what acts at its end.
+        Mean output over the tick, and output at its end.
     """
     taus: Any = tau if isinstance(tau, Command) else jax.tree.map(lambda _: tau, u)
     decay = jax.tree.map(lambda each: jnp.exp(-dt / each), taus)
@@ -48,9 +48,9 @@ def lagged(acting: U, u: U, dt: float, tau: Float[Array, ""] | Command) -> tuple
 
 
 def is_followed(u: Command, limits: tuple[Command, Command]) -> Bool[Array, ""]:
-    """Return whether no part of a command is at a limit, where vehicles do something else.
+    """Return whether all parts of a command are away from their limits, where vehicles do not follow commands.
 
-    At the least thrust, for example, a mixer adds thrust to turn as fast as it is told.
+    At the smallest thrust, for example, a mixer adds thrust to reach the commanded rates.
 
     Args:
         u: Command.
@@ -62,19 +62,19 @@ def is_followed(u: Command, limits: tuple[Command, Command]) -> Bool[Array, ""]:
 
 
 class RateBiased(AbstractWrapper[X]):
-    """The vehicle turns faster than it is told, by a constant."""
+    """A model whose body rates exceed the commanded ones by a constant."""
 
     base: AbstractDynamics[X]
     bias: Float[Array, "3"]
-    """Body frame [rad/s]."""
+    """Actual minus commanded body rates, body frame [rad/s]."""
 
     def step(self, s: X, u: Command, a_ext: Float[Array, "3"]) -> X:
-        """Advance the base model by one tick under the rates that the vehicle turns at."""
+        """Advance the base model by one tick under the actual body rates."""
         return self.base.step(s, Command(u.c, u.omega + self.bias), a_ext)
 
 
 class Lagged(AbstractDynamics[LagState[X]]):
-    """A model behind the response of actuators and rate loop."""
+    """A model with the response of actuators and rate loop in front of it."""
 
     base: AbstractDynamics[X]
     response: ActuatorResponse
@@ -86,12 +86,12 @@ class Lagged(AbstractDynamics[LagState[X]]):
 
     @property
     def settling_ticks(self) -> Float[Array, ""]:
-        """Settling time of the response, on top of that of the base model [ticks]."""
-        # Ticks that are whole but for rounding are whole.
+        """Settling time of the response, in addition to that of the base model [ticks]."""
+        # A number of ticks that is whole except for rounding counts as whole.
         return jnp.ceil(self.response.settling_time / self.dt - 0.01) + self.base.settling_ticks
 
     def init(self, x: State) -> LagState[X]:
-        """Lift to the base model's state, with the actuators at hover."""
+        """Return the state of the base model, with the actuators at hover."""
         return LagState(self.base.init(x), ActuatorState.at(Command.hover(x.p.dtype)))
 
     def state(self, s: LagState[X]) -> State:
@@ -99,7 +99,7 @@ class Lagged(AbstractDynamics[LagState[X]]):
         return self.base.state(s.inner)
 
     def with_state(self, s: LagState[X], x: State) -> LagState[X]:
-        """Replace (p, R, v); hidden state stays."""
+        """Replace (p, R, v); the hidden state is kept."""
         return LagState(self.base.with_state(s.inner, x), s.actuators)
 
     def actuators(self, s: LagState[X]) -> ActuatorState:
@@ -107,18 +107,18 @@ class Lagged(AbstractDynamics[LagState[X]]):
         return s.actuators
 
     def step(self, s: LagState[X], u: Command, a_ext: Float[Array, "3"]) -> LagState[X]:
-        """Advance one tick under the mean of what acts over it."""
+        """Advance one tick under the mean thrust and body rates over it."""
         away, actuators = self.response(s.actuators, u, self.dt)
         mean = jax.tree.map(lambda target, each: target + each / self.dt, self.response.target(u), away)
         return LagState(self.base.step(s.inner, mean, a_ext), actuators)
 
 
 def with_response(model: AbstractDynamics[Any], response: ActuatorResponse) -> AbstractDynamics[Any]:
-    """Return a model whose actuators respond in another way; one without actuators is put behind them.
+    """Return a model with another response of its actuators; actuators are added to a model without them.
 
     Args:
         model: A model, or wrappers around one.
-        response: Of thrust and body rates.
+        response: Response of thrust and body rates.
     """
     if isinstance(model, Lagged):
         return Lagged(model.base, response)

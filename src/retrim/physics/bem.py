@@ -1,4 +1,4 @@
-"""The realistic plant: blade-element rotors, body drag, firmware's rate controller and motors, at 1 kHz."""
+"""The realistic plant: blade-element rotors, body drag, rate controller of the firmware and motors, at 1 kHz."""
 
 from typing import NamedTuple, Protocol, runtime_checkable
 
@@ -14,8 +14,8 @@ from .state import STANDARD_GRAVITY, Command, State
 from .substep import SUBSTEP, AbstractSubstepDynamics, RotorState, check_tick, rigid_body, signs
 from .vehicle import Vehicle
 
-IN_PLANE_GAIN = 3.0  # identified in flight: blade elements alone underestimate the drag of the whole vehicle
-FRAME_FACTOR = 0.9575  # of the collective thrust passes the frame
+IN_PLANE_GAIN = 3.0  # identified in flight, since blade elements alone underestimate the drag of the whole vehicle
+FRAME_FACTOR = 0.9575  # share of the collective thrust that passes the frame
 
 
 class BemState(eqx.Module):
@@ -31,7 +31,7 @@ class RateController(Protocol):
     """Turns commands into rotor speeds, once per millisecond; an ``eqx.Module``."""
 
     thrust_map: Float[Array, ""]
-    """c in Omega = sqrt(F / 4 c): what the controller assumes of its propellers [N s^2]."""
+    """Coefficient c in Omega = sqrt(F / 4 c) that the controller assumes for its propellers [N s^2]."""
 
     def __call__(
         self, vehicle: Vehicle, s: RotorState, u: Command, /
@@ -44,9 +44,9 @@ class Loads(NamedTuple):
     """Force and torque on the body, body frame."""
 
     force: Float[Array, "3"]
-    """[N]"""
+    """Force [N]."""
     torque: Float[Array, "3"]
-    """[Nm]"""
+    """Torque [Nm]."""
 
 
 class BemQuadrotor(AbstractSubstepDynamics[BemState]):
@@ -62,13 +62,12 @@ class BemQuadrotor(AbstractSubstepDynamics[BemState]):
 
     @classmethod
     def of(cls, vehicle: Vehicle, dt: float, *, thrust_error: float = 0.035) -> "BemQuadrotor":
-        """Build the model of a vehicle.
+        """Return the model of a vehicle.
 
         Args:
-            vehicle: Its constants.
+            vehicle: Constants of the vehicle.
             dt: Control tick [s], a whole number of milliseconds.
-            thrust_error: By how much more than commanded the rotors give, as a share: in still air, u_hover gives
-                (1 + thrust_error) m g.
+            thrust_error: Relative thrust error: in still air, u_hover gives (1 + thrust_error) m g.
 
         T / Omega^2 of a propeller in still air is constant, so one number calibrates the whole range.
         """
@@ -104,7 +103,7 @@ class BemQuadrotor(AbstractSubstepDynamics[BemState]):
         return s.body
 
     def substep(self, s: BemState, u: Command, effects: ExternalEffects) -> BemState:
-        """Advance one millisecond with loads held."""
+        """Advance one millisecond with constant loads."""
         vehicle, b = self.vehicle, s.body
         commanded, integral, wanted_slow = self.loop(vehicle, b, u)
         motors = commanded + (b.motors - commanded) * jnp.exp(-SUBSTEP / vehicle.motor_tau)

@@ -13,7 +13,7 @@ from .vehicle import Vehicle
 
 # Throttle per unit of gain, and per rad/s, rad and rad/s^2: the firmware's scaling of its P, I and D settings.
 P_SCALE, I_SCALE, D_SCALE = 1.818e-3, 14.0e-3, 31.25e-6
-RELAX_RATE, RELAX_CUTOFF = 0.698, 15.0  # [rad/s], [Hz]: where the integral pauses (40 deg/s)
+RELAX_RATE, RELAX_CUTOFF = 0.698, 15.0  # [rad/s], [Hz]; limits at which the integral pauses (40 deg/s)
 
 
 class Betaflight(eqx.Module):
@@ -23,15 +23,15 @@ class Betaflight(eqx.Module):
     ki: Float[Array, "3"]
     kd: Float[Array, "3"]
     integral_max: Float[Array, ""]
-    """Clamp of the integral [rad]."""
+    """Limit of the integral [rad]."""
     thrust_map: Float[Array, ""]
-    """c in Omega = sqrt(F / 4 c): what the controller believes of its propellers [N s^2]."""
+    """Coefficient c in Omega = sqrt(F / 4 c) that the controller assumes for its propellers [N s^2]."""
 
     @classmethod
     def of(cls, thrust_map: Float[Array, ""]) -> "Betaflight":
         """Return the settings of the Agilicious platform: P 40, 40, 30, I 80, 80, 60, D 20, 20, 0.
 
-        The clamp of the integral is the firmware's, 40 % of the throttle.
+        The limit of the integral is that of the firmware, 40 % of the throttle.
         """
         return cls(
             kp=jnp.array([40.0, 40.0, 30.0]),
@@ -44,10 +44,10 @@ class Betaflight(eqx.Module):
     @classmethod
     @eqx.filter_jit
     def suited(cls, vehicle: Vehicle, thrust_map: Float[Array, ""], coefficient: Float[Array, ""]) -> "Betaflight":
-        """Return the settings of :meth:`of` where the vehicle's step response is damped, else settings of its own.
+        """Return the settings of :meth:`of` if the vehicle's step response is damped, otherwise tuned settings.
 
         Args:
-            vehicle: Its constants.
+            vehicle: Constants of the vehicle.
             thrust_map: As in :meth:`of`.
             coefficient: True T / Omega^2 of one rotor [N s^2].
         """

@@ -1,8 +1,8 @@
-"""The command path of a vehicle: what becomes of a command between the controller and the motion.
+"""The command path of a vehicle, from the controller to the motion.
 
 A command acts after a transport delay, and thrust and body rates then follow it as
 :class:`~retrim.physics.actuator_response.ActuatorResponse` describes. Commands wait in a queue of fixed length, so that
-another delay is never another program.
+another delay does not need another compilation.
 """
 
 import math
@@ -16,15 +16,15 @@ from jaxtyping import Array, Float
 from .actuator_response import ActuatorResponse, ActuatorState, strong_array
 from .state import Command
 
-LONGEST_DELAY = 0.2  # [s], that a queue holds unless it is made for a longer one
-ROUNDING = 1e-4  # steps: a delay this close to a whole number of them is one
+LONGEST_DELAY = 0.2  # [s], default of the longest delay that a queue can hold
+ROUNDING = 1e-4  # steps; a delay this close to a whole number of steps counts as whole
 
 
 class CommandQueue(eqx.Module):
     """The commands of the last ticks, in a queue of fixed length."""
 
     commands: Command
-    """Oldest first (leading axis); each was held for a tick."""
+    """Commands, oldest first (leading axis); each was held for a tick."""
 
     @classmethod
     def of(cls, u: Command, dt: float, *, longest: float = LONGEST_DELAY) -> "CommandQueue":
@@ -33,7 +33,7 @@ class CommandQueue(eqx.Module):
         Args:
             u: Command.
             dt: Control tick [s].
-            longest: Longest delay that the queue can answer for [s].
+            longest: Longest delay that the queue can hold [s].
         """
         n = queue_length(dt, longest)
         return cls(jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n, *leaf.shape)), u))
@@ -45,28 +45,28 @@ class CommandQueue(eqx.Module):
 
     @property
     def newest(self) -> Command:
-        """Command that was issued last."""
+        """Last issued command."""
         return jax.tree.map(lambda leaf: leaf[-1], self.commands)  # type: ignore[no-any-return]
 
     def amend(self, u: Command) -> "CommandQueue":
-        """Return the queue where ``u`` takes the place of the command that was issued last."""
+        """Return the queue with ``u`` instead of the last issued command."""
         rows = jax.tree.map(lambda old, new: jnp.concatenate([old[:-1], new[None]]), self.commands, u)
         return CommandQueue(rows)
 
     def arrival(self, delay: Float[Array, ""], dt: float) -> Command:
-        """Return the mean of what arrives during the tick that begins: a mean of two neighbours in the queue.
+        """Return the mean command that arrives during the tick that begins: a mean of two neighbours in the queue.
 
         Args:
-            delay: Transport delay [s], at most the longest that the queue was made for.
+            delay: Transport delay [s], at most the longest that the queue can hold.
             dt: Control tick [s].
         """
         return self.combine(self.weights(delay, dt))
 
     def pieces(self, delay: Float[Array, ""], dt: float) -> tuple[Command, Command, Float[Array, ""]]:
-        """Return the two commands that arrive during the tick that begins, and the time at which they change [s].
+        """Return the two commands that arrive during the tick that begins, and the time of the change [s].
 
         Args:
-            delay: Transport delay [s], at most the longest that the queue was made for.
+            delay: Transport delay [s], at most the longest that the queue can hold.
             dt: Control tick [s].
         """
         ticks = self._age(delay, dt)
@@ -75,10 +75,10 @@ class CommandQueue(eqx.Module):
         return before, after, (ticks - n) * dt
 
     def substeps(self, delay: Float[Array, ""], dt: float, n: int) -> Command:
-        """Return the mean of what arrives in each of ``n`` equal parts of the tick that begins (leading axis).
+        """Return the mean command that arrives in each of ``n`` equal parts of the tick that begins (leading axis).
 
         Args:
-            delay: Transport delay [s], at most the longest that the queue was made for.
+            delay: Transport delay [s], at most the longest that the queue can hold.
             dt: Control tick [s].
             n: Number of parts.
         """
@@ -91,18 +91,18 @@ class CommandQueue(eqx.Module):
         return jax.vmap(self.combine)(shares)
 
     def weights(self, delay: Float[Array, ""], dt: float) -> Float[Array, " n"]:
-        """Return the share of each row in what arrives during the tick that begins; they add up to one."""
+        """Return the share of each row in the mean command during the tick that begins; shares add up to one."""
         return self._hat(self._age(delay, dt))
 
     def combine(self, weights: Float[Array, " n"]) -> Command:
         """Return a weighted sum of the rows."""
-        # No matrix product: accelerators round its factors to fewer digits.
+        # Without a matrix product, since accelerators round its factors to fewer digits.
         c = jnp.sum(weights * self.commands.c)
         return Command(c, jnp.sum(weights[:, None] * self.commands.omega, axis=0))
 
     def _age(self, delay: Float[Array, ""], dt: float) -> Float[Array, ""]:
-        """How many ticks ago the command was issued that arrives when the tick begins."""
-        # Beyond the queue its oldest command acts: a delay that is traced cannot be refused.
+        """Return the age in ticks of the command that arrives when the tick begins."""
+        # Beyond the queue its oldest command acts, since a traced delay cannot be refused.
         return jnp.minimum(whole_steps(delay.astype(self.commands.c.dtype), dt), self.commands.c.shape[0] - 1.0)
 
     def _hat(self, age: Float[Array, ""]) -> Float[Array, " n"]:
@@ -112,7 +112,7 @@ class CommandQueue(eqx.Module):
 
 
 class PathState(eqx.Module):
-    """Commands under way, and what has become of those that arrived."""
+    """Commands under way, and the state of the actuators."""
 
     queue: CommandQueue
     actuators: ActuatorState
@@ -127,11 +127,11 @@ class CommandPath(eqx.Module):
 
     @classmethod
     def of(cls, delay: float | Float[Array, ""] = 0.0, response: ActuatorResponse | None = None) -> "CommandPath":
-        """Build a path.
+        """Return a path.
 
         Args:
             delay: Transport delay [s].
-            response: Of thrust and body rates; None: they follow at once.
+            response: Response of thrust and body rates; None if they follow at once.
         """
         return cls(strong_array(delay), ActuatorResponse.of() if response is None else response)
 
@@ -144,7 +144,7 @@ class CommandPath(eqx.Module):
 
         Args:
             s: State at the beginning of the tick.
-            u: Command that is issued for it.
+            u: Command that is issued for the tick.
             dt: Length of the tick [s].
 
         Returns:
@@ -176,12 +176,12 @@ class CommandPath(eqx.Module):
 
 
 def check_delay(delay: Float[Array, "*batch"], longest: float, name: str) -> None:
-    """Refuse a delay that a queue has no room for; one that is traced, or one of many, is not checked.
+    """Refuse a delay that a queue cannot hold; a traced delay, or an array of delays, is not checked.
 
     Args:
         delay: Transport delay [s].
-        longest: Longest one that the queue is made for [s].
-        name: Of what has the delay, for the message.
+        longest: Longest delay that the queue can hold [s].
+        name: Name of the object with the delay, for the message.
 
     Raises:
         ValueError: The delay is negative or too long.
@@ -193,12 +193,12 @@ def check_delay(delay: Float[Array, "*batch"], longest: float, name: str) -> Non
 
 
 def queue_length(dt: float, longest: float = LONGEST_DELAY) -> int:
-    """Return how many commands a queue holds for delays of up to ``longest`` [s] at a tick of ``dt`` [s]."""
+    """Return the length of a queue for delays of up to ``longest`` [s] at a tick of ``dt`` [s]."""
     return math.ceil(longest / dt - ROUNDING) + 1
 
 
 def whole_steps(time: Float[Array, "*shape"], dt: float) -> Float[Array, "*shape"]:
-    """Return a time in steps of ``dt``, where a number that is whole but for rounding is whole."""
+    """Return a time in steps of ``dt``; a number that is whole except for rounding is made whole."""
     steps = time / dt
     nearest = jnp.round(steps)
     rounding = jnp.where(jnp.abs(steps - nearest) < ROUNDING, nearest - steps, 0.0)

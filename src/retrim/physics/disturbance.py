@@ -1,7 +1,7 @@
-"""Disturbances: functions (t, x) -> :class:`ExternalEffects`. Pushes are here; see also wind and faults.
+"""Disturbances: functions (t, x) -> :class:`ExternalEffects`. This module has pushes; see also wind and faults.
 
-Disturbances belong to the plant; the nominal model does not know them. What is random about one is drawn when it is
-made, so that it is a function of time and repeats.
+Disturbances belong to the plant; the nominal model does not contain them. Their random numbers are drawn at
+construction, so that a disturbance is a function of time and repeatable.
 """
 
 from collections.abc import Callable
@@ -19,7 +19,7 @@ from .state import State
 
 @runtime_checkable
 class Disturbance(Protocol):
-    """Any function of time [s] and state will do."""
+    """Protocol of a disturbance: any function of time [s] and state."""
 
     def __call__(self, t: Float[Array, ""], x: State, /) -> ExternalEffects:
         """Return the external effects at time ``t`` in the state ``x``."""
@@ -34,7 +34,7 @@ def effects_at(times: ArrayLike, x: State, disturbance: Disturbance) -> External
 
 
 class Push(eqx.Module):
-    """Any function (t, x) -> external acceleration, world [m/s^2], as a disturbance."""
+    """A function (t, x) -> external acceleration, world [m/s^2], as a disturbance."""
 
     a_ext: Callable[[Float[Array, ""], State], Float[Array, "3"]]
 
@@ -54,7 +54,7 @@ class Together(eqx.Module):
 
 
 class Held(eqx.Module):
-    """Effects of any kind that stay as they are; who holds them may replace them by others in flight."""
+    """Constant effects of any kind; the owner may replace them with others in flight."""
 
     effects: ExternalEffects
 
@@ -64,7 +64,7 @@ class Held(eqx.Module):
 
 
 class Constant(eqx.Module):
-    """The same acceleration at all times; the paper's none, small and large (Sec. IV-B)."""
+    """A constant acceleration; the cases none, small and large of the paper (Sec. IV-B)."""
 
     a: Float[Array, "3"]
 
@@ -74,14 +74,14 @@ class Constant(eqx.Module):
 
 
 class Step(eqx.Module):
-    """An acceleration that sets in at a time and stays."""
+    """An acceleration that begins at a time and remains."""
 
     a: Float[Array, "3"]
     since: Float[Array, ""]
-    """[s]"""
+    """Time of the beginning [s]."""
 
     def __call__(self, t: Float[Array, ""], x: State) -> ExternalEffects:
-        """Return no push before ``since``, ``a`` [m/s^2] from then on."""
+        """Return a push of zero before ``since``, and ``a`` [m/s^2] from then on."""
         return ExternalEffects.of(x.p.dtype, push=jnp.where(t >= self.since, self.a, jnp.zeros_like(self.a)))
 
 
@@ -90,9 +90,9 @@ class Kick(eqx.Module):
 
     a: Float[Array, "3"]
     since: Float[Array, ""]
-    """[s]"""
+    """Time of the beginning [s]."""
     duration: Float[Array, ""]
-    """[s]"""
+    """Duration [s]."""
 
     def __call__(self, t: Float[Array, ""], x: State) -> ExternalEffects:
         """Return ``a`` [m/s^2] from ``since`` on, for ``duration``."""
@@ -101,7 +101,7 @@ class Kick(eqx.Module):
 
 
 class Reversing(eqx.Module):
-    """``+a`` and ``-a`` by turns, reversed every ``period`` seconds (paper, Sec. IV-B.3: every 15 s)."""
+    """Alternately ``+a`` and ``-a``, reversed every ``period`` seconds (paper, Sec. IV-B.3: every 15 s)."""
 
     a: Float[Array, "3"]
     period: Float[Array, ""]
@@ -118,13 +118,13 @@ class Reversing(eqx.Module):
 
 
 class RandomWalk(eqx.Module):
-    """An acceleration that wanders within ``+-bound`` per axis, linearly between points ``every`` seconds apart.
+    """An acceleration that wanders within ``+-bound`` per axis, linear between points ``every`` seconds apart.
 
     The walk is a Brownian path folded back at the bounds; after its last point it is retraced backwards.
     """
 
     points: Float[Array, "n 3"]
-    """[m/s^2]"""
+    """Points of the walk [m/s^2]."""
     every: Float[Array, ""]
 
     @classmethod

@@ -1,4 +1,4 @@
-"""Models of motion: x_{t+1} = f(x_t, u_t), one control tick at a time.
+"""Models of motion: x_{t+1} = f(x_t, u_t) for one control tick.
 
 The configurations of the paper's runtime study (Sec. IV-C) are expressions, with rotors = LinearDragQuadrotor.of(...)::
 
@@ -39,12 +39,12 @@ class AbstractDynamics(eqx.Module, Generic[X]):
 
     @property
     def settling_ticks(self) -> int | Float[Array, ""]:
-        """Ticks after :meth:`init` until the hidden state has forgotten the hover that it assumed."""
+        """Number of ticks after :meth:`init` until the hidden state no longer depends on the assumed hover."""
         return 0
 
     @abc.abstractmethod
     def init(self, x: State) -> X:
-        """Lift a vehicle's state to the model's: the vehicle hovers at ``x``."""
+        """Return the state of the model for a vehicle that hovers at ``x``."""
 
     @abc.abstractmethod
     def state(self, s: X) -> State:
@@ -52,7 +52,7 @@ class AbstractDynamics(eqx.Module, Generic[X]):
 
     @abc.abstractmethod
     def with_state(self, s: X, x: State) -> X:
-        """Return ``s`` with (p, R, v) replaced; hidden state stays."""
+        """Return ``s`` with (p, R, v) replaced; the hidden state is kept."""
 
     def actuators(self, s: X) -> ActuatorState | None:
         """Return the present thrust and body rates; None for a model that follows commands at once."""
@@ -97,7 +97,7 @@ class PointMass(AbstractDynamics[State]):
         return s
 
     def with_state(self, s: State, x: State) -> State:
-        """Return the new state; nothing is hidden."""
+        """Return the new state, since the model has no hidden state."""
         return x
 
     def step(self, s: State, u: Command, a_ext: Float[Array, "3"]) -> State:
@@ -106,7 +106,7 @@ class PointMass(AbstractDynamics[State]):
         middle = so3.mul(s.R, so3.exp(0.5 * h * u.omega))
         end = so3.mul(s.R, so3.exp(h * u.omega))
         a1 = f_a(s, u, a_ext).v
-        a2 = f_a(State(s.p, middle, s.v), u, a_ext).v  # = a3: the acceleration depends on R, c and a_ext alone
+        a2 = f_a(State(s.p, middle, s.v), u, a_ext).v  # = a3, since the acceleration depends on R, c and a_ext alone
         a4 = f_a(State(s.p, end, s.v), u, a_ext).v
         p = s.p + h * s.v + h**2 / 6.0 * (a1 + 2.0 * a2)
         v = s.v + h / 6.0 * (a1 + 4.0 * a2 + a4)
@@ -115,7 +115,7 @@ class PointMass(AbstractDynamics[State]):
 
 @runtime_checkable
 class Residual(Protocol):
-    """Predicts the acceleration that a model misses, world frame [m/s^2]. Any function of (x, u) will do."""
+    """Predicts the acceleration that a model misses, world frame [m/s^2]. It may be any function of (x, u)."""
 
     def __call__(self, x: State, u: Command, /) -> Float[Array, "3"]:
         """Return the missing acceleration in the state ``x`` while ``u`` acts."""
@@ -138,7 +138,7 @@ class AbstractWrapper(AbstractDynamics[X]):
         return self.base.settling_ticks
 
     def init(self, x: State) -> X:
-        """Lift to the state of the base model."""
+        """Return the state of the base model."""
         return self.base.init(x)
 
     def state(self, s: X) -> State:
@@ -146,7 +146,7 @@ class AbstractWrapper(AbstractDynamics[X]):
         return self.base.state(s)
 
     def with_state(self, s: X, x: State) -> X:
-        """Replace (p, R, v); hidden state stays."""
+        """Replace (p, R, v); the hidden state is kept."""
         return self.base.with_state(s, x)
 
     def actuators(self, s: X) -> ActuatorState | None:
@@ -155,10 +155,10 @@ class AbstractWrapper(AbstractDynamics[X]):
 
 
 class Hybrid(AbstractWrapper[X]):
-    """Any model plus a residual, evaluated once and held over the tick (paper, Sec. III-E).
+    """A model plus a residual, which is evaluated once and held over the tick (paper, Sec. III-E).
 
-    With ``backprop=False`` no gradient flows through the residual: neither to its weights nor, through its inputs,
-    to state and command. That is the paper's back-propagation "through the analytical model only".
+    With ``backprop=False`` gradients do not flow through the residual: neither to its weights nor, through its inputs,
+    to state and command. This is the paper's back-propagation "through the analytical model only".
     """
 
     base: AbstractDynamics[X]
@@ -172,16 +172,16 @@ class Hybrid(AbstractWrapper[X]):
 
 
 class StraightThrough(AbstractDynamics[X]):
-    """The value of one model, the gradient of another: forward ``forward``, backward ``backward``.
+    """The value of one model with the gradient of another: forward ``forward``, backward ``backward``.
 
-    Only (p, R, v) carries a gradient; what is hidden in the forward model's state does not.
+    Only (p, R, v) carries a gradient; the hidden state of the forward model does not.
     """
 
     forward: AbstractDynamics[X]
     backward: AbstractDynamics[State]
 
     def __check_init__(self) -> None:
-        """Raise ``ValueError`` if the two models tick at different rates."""
+        """Raise ``ValueError`` if the two models have different ticks."""
         if self.forward.dt != self.backward.dt:
             raise ValueError(f"StraightThrough: forward.dt = {self.forward.dt} s, backward.dt = {self.backward.dt} s")
 
@@ -196,7 +196,7 @@ class StraightThrough(AbstractDynamics[X]):
         return self.forward.settling_ticks
 
     def init(self, x: State) -> X:
-        """Lift to the state of the forward model."""
+        """Return the state of the forward model."""
         return self.forward.init(x)
 
     def state(self, s: X) -> State:
@@ -204,7 +204,7 @@ class StraightThrough(AbstractDynamics[X]):
         return self.forward.state(s)
 
     def with_state(self, s: X, x: State) -> X:
-        """Replace (p, R, v); hidden state stays."""
+        """Replace (p, R, v); the hidden state is kept."""
         return self.forward.with_state(s, x)
 
     def actuators(self, s: X) -> ActuatorState | None:

@@ -6,22 +6,22 @@ from jaxtyping import Array, Float
 
 
 class ExternalEffects(eqx.Module):
-    """What acts on a vehicle from outside. Effects add up: ``a + b`` holds both."""
+    """External effects on a vehicle. Effects are combined by addition: ``a + b`` contains both."""
 
     push: Float[Array, "3"]
     """External acceleration, world [m/s^2]."""
     wind: Float[Array, "3"]
-    """Velocity of the air where the vehicle is, world [m/s]; acts through the aerodynamics."""
+    """Velocity of the air at the vehicle, world [m/s]; it acts through the aerodynamics."""
     gain: Float[Array, "4"]
-    """Multiplies thrust and torque of each rotor."""
+    """Factor of thrust and torque of each rotor."""
     mass: Float[Array, ""]
-    """Load, in addition to the vehicle's mass [kg]."""
+    """Mass of a load, in addition to that of the vehicle [kg]."""
     inertia: Float[Array, "3"]
-    """Diagonal of the load's inertia, in addition to the vehicle's, body frame [kg m^2]."""
+    """Diagonal of the load's inertia, in addition to that of the vehicle, body frame [kg m^2]."""
 
     @classmethod
     def calm(cls, dtype: jnp.dtype) -> "ExternalEffects":
-        """Return no effect at all."""
+        """Return the effects of an undisturbed vehicle."""
         zero = jnp.zeros(3, dtype=dtype)
         return cls(zero, zero, jnp.ones(4, dtype=dtype), zero[0], zero)
 
@@ -36,7 +36,7 @@ class ExternalEffects(eqx.Module):
         mass: Float[Array, ""] | None = None,
         inertia: Float[Array, "3"] | None = None,
     ) -> "ExternalEffects":
-        """Return the given effects and no others."""
+        """Return only the given effects."""
         calm = cls.calm(dtype)
         return cls(
             calm.push if push is None else push.astype(dtype),
@@ -47,7 +47,7 @@ class ExternalEffects(eqx.Module):
         )
 
     def __add__(self, other: "ExternalEffects") -> "ExternalEffects":
-        """Combine two effects: gains multiply, all else adds."""
+        """Combine two effects: gains are multiplied, all other effects are added."""
         return ExternalEffects(
             self.push + other.push,
             self.wind + other.wind,

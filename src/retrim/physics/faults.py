@@ -1,4 +1,4 @@
-"""What goes wrong with the vehicle itself: a load, a sagging battery, a weak rotor."""
+"""Faults of the vehicle itself: a load, a sagging battery, a weak rotor."""
 
 import equinox as eqx
 import jax
@@ -11,19 +11,19 @@ from .vehicle import payload_inertia
 
 
 class Payload(eqx.Module):
-    """A load picked up at one time and dropped at another; the flight controller does not know of it."""
+    """A load that is picked up at one time and dropped at another, unknown to the flight controller."""
 
     mass: Float[Array, ""]
-    """[kg]"""
+    """Mass of the load [kg]."""
     inertia: Float[Array, "3"]
-    """[kg m^2]"""
+    """Diagonal of the added inertia [kg m^2]."""
     picked: Float[Array, ""]
-    """[s]"""
+    """Time at which the load is picked up [s]."""
     dropped: Float[Array, ""]
-    """[s]; infinity: never"""
+    """Time at which the load is dropped [s]; infinity if it is kept."""
 
     def __check_init__(self) -> None:
-        """Raise ``ValueError`` for a load that weighs nothing, or is dropped before it is picked up."""
+        """Raise ``ValueError`` for a load without mass, or one that is dropped before it is picked up."""
         if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(self)):
             return
         if not self.mass > 0 or not self.dropped > self.picked:
@@ -41,12 +41,12 @@ class Payload(eqx.Module):
 
 
 class BatterySag(eqx.Module):
-    """Thrust falls at a steady rate, down to a floor, as the battery's voltage does."""
+    """Decrease of the thrust with the battery voltage, at a constant rate, down to a floor."""
 
     rate: Float[Array, ""]
     """Share of the thrust lost per second [1/s]."""
     floor: Float[Array, ""]
-    """Share that remains at the end."""
+    """Share of the thrust that remains at the end."""
 
     def __check_init__(self) -> None:
         """Raise ``ValueError`` if the rate is negative or the floor is not between 0 and 1."""
@@ -62,10 +62,10 @@ class BatterySag(eqx.Module):
 
 
 class WeakRotor(eqx.Module):
-    """One rotor gives less thrust and torque than its speed promises: a chipped propeller."""
+    """Reduced thrust and torque of one rotor at a given speed, as with a chipped propeller."""
 
     gain: Float[Array, "4"]
-    """Front-right, back-left, back-right, front-left."""
+    """Gains of the rotors: front-right, back-left, back-right, front-left."""
 
     @classmethod
     def of(cls, rotor: int, share: float) -> "WeakRotor":

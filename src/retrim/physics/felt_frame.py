@@ -1,9 +1,9 @@
-"""The frame of the gravity that a vehicle feels: a constant disturbance is gravity, tilted and scaled.
+"""The frame of the effective gravity: a constant disturbance tilts and scales gravity.
 
-With gamma = g + d, let Q be the smallest rotation that takes -gamma/|gamma| to the vertical, and s = |g| / |gamma|. If
-p, R, v obey Eq. (1) of the paper with the thrust c and the disturbance d, then s Q p, Q R, s Q v obey Eq. (1) with the
-thrust s c and no disturbance: the equation is equivariant under rotations, and under a change of the unit of length
-while time stays.
+With the effective gravity gamma = g + d, let Q be the smallest rotation that takes -gamma/|gamma| to the vertical, and
+s = |g| / |gamma|. If p, R, v satisfy Eq. (1) of the paper with the thrust c and the disturbance d, then s Q p, Q R,
+s Q v satisfy Eq. (1) with the thrust s c and without disturbance: the equation is equivariant under rotations, and
+under a change of the unit of length with an unchanged unit of time.
 """
 
 import equinox as eqx
@@ -21,15 +21,16 @@ class FeltFrame(eqx.Module):
     Q: Float[Array, "3 3"]
     """Rotation into the frame."""
     scale: Float[Array, ""]
-    """A metre of the world is so long in the frame."""
+    """Length in the frame of a metre of the world."""
     d: Float[Array, "3"]
-    """The disturbance that is gravity there, world [m/s^2]."""
+    """Disturbance that is part of the gravity of the frame, world [m/s^2]."""
 
     @classmethod
     def of(cls, d: Float[Array, "3"]) -> "FeltFrame":
         """Return the frame of g + ``d``, world [m/s^2].
 
-        Defined for every ``d`` whose vertical part is smaller than gravity; a weightless vehicle has no such frame.
+        The frame is defined for every ``d`` whose vertical part is smaller than gravity, but not for a weightless
+        vehicle.
         """
         up = -d + jnp.array([0.0, 0.0, STANDARD_GRAVITY], dtype=d.dtype)
         strength = jnp.sqrt(jnp.sum(up * up))
@@ -46,26 +47,26 @@ class FeltFrame(eqx.Module):
         return cls(Q, STANDARD_GRAVITY / strength, d)
 
     def vector(self, y: Float[Array, "3"]) -> Float[Array, "3"]:
-        """Return a position, velocity, acceleration or jerk of the world, in the frame."""
+        """Transform a position, velocity, acceleration or jerk from the world to the frame."""
         return self.scale * so3.act(self.Q, y)
 
     def state(self, x: State) -> State:
-        """Return a state of the world, in the frame."""
+        """Transform a state from the world to the frame."""
         return State(self.vector(x.p), so3.mul(self.Q, x.R), self.vector(x.v))
 
     def world_state(self, x: State) -> State:
-        """Return a state of the frame, in the world."""
+        """Transform a state from the frame to the world."""
         back = so3.mul(self.Q.T, x.R)
         return State(so3.act(self.Q.T, x.p) / self.scale, back, so3.act(self.Q.T, x.v) / self.scale)
 
     def command(self, u: Command) -> Command:
-        """Return a command of the world, in the frame; body rates are the same."""
+        """Transform a command from the world to the frame; body rates are the same."""
         return Command(self.scale * u.c, u.omega)
 
     def actuators(self, s: ActuatorState) -> ActuatorState:
-        """Return thrust and body rates of the world, in the frame; body rates are the same."""
+        """Transform thrust and body rates from the world to the frame; body rates are the same."""
         return ActuatorState(self.command(s.command), s.slope)
 
     def world_command(self, u: Command) -> Command:
-        """Return a command of the frame, in the world."""
+        """Transform a command from the frame to the world."""
         return Command(u.c / self.scale, u.omega)

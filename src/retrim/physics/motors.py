@@ -1,4 +1,4 @@
-"""Rotors that somebody else commands, in the place of a rate controller."""
+"""Externally commanded rotor speeds, instead of a rate controller."""
 
 import equinox as eqx
 from jaxtyping import Array, Float
@@ -9,15 +9,15 @@ from .vehicle import Vehicle
 
 
 class CommandedSpeeds(eqx.Module):
-    """A rate controller in form only: the rotors go as fast as it was told, whatever the command says."""
+    """Replacement of a rate controller: the rotors have the given speeds, independent of the command."""
 
     speeds: Float[Array, "4"]
-    """[rad/s]"""
+    """Rotor speeds [rad/s]."""
     thrust_map: Float[Array, ""]
-    """As that of a rate controller; nothing here depends on it."""
+    """Thrust map as in a rate controller; it is not used."""
 
     def __call__(
         self, vehicle: Vehicle, s: RotorState, u: Command
     ) -> tuple[Float[Array, "4"], Float[Array, "3"], Float[Array, "3"]]:
-        """Return the speeds, and what a rate controller remembers, unchanged."""
+        """Return the speeds, and the unchanged memory of a rate controller."""
         return self.speeds, s.integral, s.wanted_slow

@@ -1,9 +1,9 @@
-"""A family of vehicles: the range of command paths that one policy is trained for, and what is known of one of them.
+"""A family of vehicles: the range of command paths for which one policy is trained, and the belief about a vehicle.
 
-The commands of a policy are thrust per mass and body rates, so that size, mass and inertia of a vehicle show in its
-command path alone: how late a command acts, and how slowly thrust and rates follow it. A path has four coordinates in
-[-1, 1]: delay, logarithm of the rate lag, ringing of the rate loop, logarithm of the thrust lag. What is known of a
-vehicle is an interval of each; see :class:`PathBelief`.
+The commands of a policy are thrust per mass and body rates, so that size, mass and inertia of a vehicle affect its
+command path alone: the delay of a command, and the lag of thrust and rates. A path has four coordinates in [-1, 1]:
+delay, logarithm of the rate lag, ringing of the rate loop, logarithm of the thrust lag. The belief about a vehicle is
+an interval of each; see :class:`PathBelief`.
 """
 
 from typing import Any
@@ -23,7 +23,7 @@ Coordinates = Float[Array, "4"]
 
 
 class PathBelief(eqx.Module):
-    """An interval of each coordinate that contains the vehicle: what a policy of the family observes."""
+    """An interval of each coordinate that contains the vehicle, as observed by a policy of the family."""
 
     centre: Coordinates
     half_width: Coordinates
@@ -36,7 +36,7 @@ class PathBelief(eqx.Module):
 
     @classmethod
     def between(cls, low: Coordinates, high: Coordinates) -> "PathBelief":
-        """Return the belief in an interval; the parts of it outside of the family do not count.
+        """Return the belief of an interval; the parts outside of the family are cut off.
 
         Args:
             low: Lower ends.
@@ -46,7 +46,7 @@ class PathBelief(eqx.Module):
         return cls(0.5 * (low + high), 0.5 * (high - low))
 
     def towards(self, other: "PathBelief", step: float | Float[Array, ""]) -> "PathBelief":
-        """Return the belief after a change to another one whose ends move by ``step`` at most."""
+        """Return the belief after a change towards another one, with ends that move by at most ``step``."""
         ends = [here + jnp.clip(there - here, -step, step) for here, there in zip(self.ends, other.ends, strict=True)]
         return PathBelief.between(*ends)
 
@@ -66,11 +66,11 @@ class Member(eqx.Module):
     path: CommandPath
     belief: PathBelief
     lateness: Float[Array, ""] | None = None
-    """Longest sum of delay and rate lag that the belief allows [s]; None outside of a flight."""
+    """Longest sum of delay and rate lag within the belief [s]; None outside of a flight."""
 
 
 class PathFamily(eqx.Module):
-    """Vehicles by the ranges of their command paths."""
+    """Family of vehicles, defined by the ranges of their command paths."""
 
     delay: Float[Array, "2"]
     """Shortest and longest delay of commands [s]."""
@@ -81,7 +81,7 @@ class PathFamily(eqx.Module):
     thrust_lag: Float[Array, "2"]
     """Smallest and largest time constant of the thrust [s]."""
     least_frequency: Float[Array, ""]
-    """Smallest natural frequency of a rate loop that is drawn [rad/s]; a slower one rings less."""
+    """Smallest natural frequency of a drawn rate loop [rad/s]; a slower loop is drawn with less ringing."""
 
     @classmethod
     def of(
@@ -93,14 +93,14 @@ class PathFamily(eqx.Module):
         thrust_lag: tuple[float, float] = (0.01, 0.15),
         least_frequency: float = 4.0,
     ) -> "PathFamily":
-        """Build a family.
+        """Return a family.
 
         Args:
             delay: Shortest and longest delay of commands [s].
             rate_lag: Smallest and largest time constant of the body rates [s].
             least_damping: Smallest damping ratio of the rate loop; the largest is that of a loop of first order.
             thrust_lag: Smallest and largest time constant of the thrust [s].
-            least_frequency: Smallest natural frequency of a rate loop that is drawn [rad/s].
+            least_frequency: Smallest natural frequency of a drawn rate loop [rad/s].
 
         Raises:
             ValueError: A range is empty, or a lag is not positive.
@@ -124,7 +124,7 @@ class PathFamily(eqx.Module):
         ringing: Float[Array, ""],
         thrust_lag: Float[Array, ""],
     ) -> Coordinates:
-        """Return the coordinates of a path, which lie outside of [-1, 1] for a vehicle outside of the family."""
+        """Return the coordinates of a path, which are outside of [-1, 1] for a vehicle outside of the family."""
         low, high = self._ends
         tiny = 1e-6
         values = jnp.stack(
@@ -133,7 +133,7 @@ class PathFamily(eqx.Module):
         return 2.0 * (values - low) / (high - low) - 1.0
 
     def path(self, at: Coordinates) -> CommandPath:
-        """Return the command path at some coordinates, with gains of one."""
+        """Return the command path at given coordinates, with gains of one."""
         low, high = self._ends
         delay, log_lag, ringing, log_thrust = low + 0.5 * (at + 1.0) * (high - low)
         inverse_damping = jnp.sqrt(2.0 * ringing / (1.0 - ringing))
@@ -141,12 +141,12 @@ class PathFamily(eqx.Module):
         return CommandPath.of(delay, ActuatorResponse.of(thrust_lag, lag, inverse_damping=inverse_damping))
 
     def draw(self, key: Key[Array, ""]) -> Member:
-        """Draw a vehicle and a belief that is true of it; the key is consumed.
+        """Draw a vehicle and a true belief about it; the key is consumed.
 
-        The vehicle is uniform within its belief, so that a belief is neither too narrow nor too wide. Vehicles at the
-        edges of the family and narrow beliefs are more frequent than others, because they are harder to fly. Half of
-        the vehicles are known equally well in all coordinates. A rate loop below the least natural frequency rings
-        less than its belief says: no policy could fly it.
+        The vehicle is uniformly distributed within its belief, so that a belief is neither too narrow nor too wide.
+        Vehicles at the edges of the family and narrow beliefs are more frequent than others, because they are harder to
+        fly. Half of the vehicles are known equally well in all coordinates. A rate loop below the smallest natural
+        frequency rings less than in its belief, since otherwise it could not be flown.
         """
         k_common, k_width, k_centre, k_inside = random.split(key, 4)
         common, alike = random.uniform(k_common, (2,))

@@ -1,7 +1,8 @@
 """A propeller by blade-element momentum theory (NeuroBEM, arXiv 2106.08015; in brackets: numbers of its equations).
 
-Air meets the hub with the speed ``v_hor`` in the rotor's plane and ``v_ver`` along its axis, **positive when
-descending**. All speeds in m/s, rotor speeds in rad/s. Flapping is left out: below 3 m/s nothing visible is lost.
+The air velocity at the hub is ``v_hor`` in the rotor's plane and ``v_ver`` along its axis, **positive when
+descending**. All speeds are in m/s, rotor speeds in rad/s. Flapping is left out, which has no visible effect below
+3 m/s.
 """
 
 from typing import NamedTuple
@@ -13,8 +14,8 @@ from jax import lax
 from jaxtyping import Array, Float
 
 AIR_DENSITY = 1.204  # [kg/m^3], at 20 degrees Celsius
-OMEGA_FLOOR = 10.0  # [rad/s]: below, the model has no meaning
-V_HOR_FLOOR = 1e-6  # [m/s]: keeps square roots differentiable at hover
+OMEGA_FLOOR = 10.0  # [rad/s]; below it the model is not valid
+V_HOR_FLOOR = 1e-6  # [m/s]; keeps square roots differentiable at hover
 
 # Gauss-Legendre on [0, 1], six points: abscissae and weights.
 _RADII = (0.0337652428984, 0.1693953067669, 0.3806904069584, 0.6193095930416, 0.8306046932331, 0.9662347571016)
@@ -30,17 +31,17 @@ class Propeller(eqx.Module):
     radius: Float[Array, ""]
     blades: Float[Array, ""]
     pitch: Float[Array, ""]
-    """theta0, blade pitch at the root."""
+    """Blade pitch theta0 at the root."""
     twist: Float[Array, ""]
-    """theta1, from root to tip."""
+    """Twist theta1 from root to tip."""
     chord_root: Float[Array, ""]
     chord_tip: Float[Array, ""]
     lift: Float[Array, ""]
-    """cl0 [-]"""
+    """Lift coefficient cl0 [-]."""
     drag: Float[Array, ""]
-    """cd0 [-]"""
+    """Drag coefficient cd0 [-]."""
     camber: Float[Array, ""]
-    """eps in cl = cl0 (sin alpha cos alpha + eps) [-]"""
+    """Coefficient eps in cl = cl0 (sin alpha cos alpha + eps) [-]."""
 
     @property
     def area(self) -> Float[Array, ""]:
@@ -49,7 +50,7 @@ class Propeller(eqx.Module):
 
 
 def five_inch() -> Propeller:
-    """5.1 in, three blades: the set that the Agilicious platform publishes for its blade-element model."""
+    """Return the 5.1 in, three-blade propeller that the Agilicious platform publishes for its blade-element model."""
     return Propeller(
         radius=jnp.array(0.06477),
         blades=jnp.array(3.0),
@@ -64,7 +65,7 @@ def five_inch() -> Propeller:
 
 
 def three_inch() -> Propeller:
-    """A proposal for the paper's small quadrotor, whose propeller is unpublished.
+    """Return a proposal for the paper's small quadrotor, whose propeller is unpublished.
 
     The 5.1 in set, scaled in radius and chord, with cd0 such that hover gives the published c_T = 2.05e-7 N s^2 and
     kappa = 0.00804 m.
@@ -88,20 +89,20 @@ class BladeForces(NamedTuple):
     """Forces of one rotor."""
 
     thrust: Float[Array, ""]
-    """T along the axis [N]."""
+    """Thrust T along the axis [N]."""
     in_plane: Float[Array, ""]
-    """H, against the motion of the hub in the rotor's plane [N]."""
+    """Force H against the motion of the hub in the rotor's plane [N]."""
     torque: Float[Array, ""]
-    """Q about the axis [Nm]."""
+    """Torque Q about the axis [Nm]."""
 
 
 class Inflow(eqx.Module):
-    """Induced velocities of one rotor, kept from millisecond to millisecond to start the next search."""
+    """Induced velocities of one rotor, kept between milliseconds as the start of the next search."""
 
     v_i: Float[Array, ""]
     """Induced velocity that solves the momentum balance [m/s]."""
     v_h: Float[Array, ""]
-    """Induced velocity with ``v_ver`` set to zero, in which the vortex-ring rule is written [m/s]."""
+    """Induced velocity with ``v_ver`` set to zero, which the vortex-ring rule uses [m/s]."""
 
     @classmethod
     def above(cls, dtype: jnp.dtype) -> "Inflow":
@@ -150,9 +151,9 @@ def solved(
 ) -> Float[Array, ""]:
     """Solve for the largest root v_i of T(v_i) = 2 rho A v_i sqrt(v_hor^2 + (v_ver - v_i)^2) [5], by Newton's method.
 
-    Right of the largest root the balance falls and is concave, so that Newton's steps fall on the root monotonically;
+    Right of the largest root the balance falls and is concave, so that Newton's steps approach the root monotonically;
     a start just left of it jumps to the right side first. The gradient is that of the root (one differentiable step
-    from it: the implicit function theorem); none flows through ``start``.
+    from it: the implicit function theorem); gradients do not flow through ``start``.
     """
     disk = 2.0 * AIR_DENSITY * prop.area
 
@@ -163,11 +164,11 @@ def solved(
         )
         speed = jnp.sqrt(v_hor**2 + (v_ver - v) ** 2)
         momentum_slope = disk * (speed + v * (v - v_ver) / speed)
-        slope = jnp.minimum(lift_slope, 0.0) - jnp.maximum(momentum_slope, 0.1 * disk)  # never flat, never rising
+        slope = jnp.minimum(lift_slope, 0.0) - jnp.maximum(momentum_slope, 0.1 * disk)  # neither flat nor rising
         return jnp.clip(v - (thrust - disk * v * speed) / lax.stop_gradient(slope), -20.0, 60.0)
 
     v = start
-    if steps > 2:  # many steps are a loop, which compiles in the time of one of them
+    if steps > 2:  # a loop of many steps compiles in the time of one step
         v = lax.fori_loop(0, steps - 2, lambda _, v: step(v), v)
     for _ in range(min(steps, 2)):
         v = step(v)
@@ -175,7 +176,7 @@ def solved(
 
 
 def vortex_ring(inflow: Inflow, v_ver: Float[Array, ""]) -> Float[Array, ""]:
-    """Return the induced velocity [m/s]: of the momentum balance, or in slow descent of the empirical rule [18, 19]."""
+    """Return the induced velocity [m/s]: by the momentum balance, or in slow descent by the empirical rule [18, 19]."""
     v_i, v_h = inflow.v_i, inflow.v_h
     x = v_ver / v_h
     ring = v_h * (1.0 + x * (1.125 + x * (-1.372 + x * (1.718 - 0.655 * x))))
@@ -194,7 +195,8 @@ def rotor(
 ) -> tuple[BladeForces, Inflow]:
     """Return the forces of one rotor and its inflow, after ``steps`` of Newton's method for each root.
 
-    Two are exact to float32 from a millisecond before, in any usual manoeuvre; from :meth:`Inflow.above`, take 16.
+    From the inflow of a millisecond before, two steps are exact to float32 in any usual manoeuvre; from
+    :meth:`Inflow.above`, use 16.
     """
     omega, v_hor = jnp.maximum(omega, OMEGA_FLOOR), jnp.maximum(v_hor, V_HOR_FLOOR)
     found = Inflow(

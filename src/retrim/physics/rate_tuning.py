@@ -1,7 +1,7 @@
-"""Gains of a simulated rate loop: those of the platform where they suit the vehicle, else gains that follow from it.
+"""Gains of a simulated rate loop: those of the platform if they suit the vehicle, otherwise gains from its constants.
 
-About an axis, motors of time constant tau turn the body: tau w'' + w' = A (u + lead u'). The loop u = P e + I int(e) -
-D w' leaves tau s^3 + (1 + b + a lead) s^2 + (a + i lead) s + i, with a, i, b = A P, A I, A D.
+About an axis, motors with the time constant tau turn the body: tau w'' + w' = A (u + lead u'). The loop u = P e +
+I int(e) - D w' has the polynomial tau s^3 + (1 + b + a lead) s^2 + (a + i lead) s + i, with a, i, b = A P, A I, A D.
 """
 
 from typing import NamedTuple
@@ -13,36 +13,36 @@ from .state import STANDARD_GRAVITY
 from .vehicle import Vehicle
 
 LEAST_DAMPING, LEAST_MARGIN = 0.41, 2.7
-"""Of the platform's gains: they overshoot by 40 % where a loop just has both."""
+"""Smallest damping and margin with the platform's gains; a loop that just has both overshoots by 40 %."""
 DAMPING, MARGIN, LEAST_D = 0.8, 20.0, 2.0
-"""Of gains that follow from the vehicle: they overshoot by a tenth."""
+"""Damping, margin and smallest D term of gains from the constants of the vehicle; they overshoot by a tenth."""
 
 
 class Gains(NamedTuple):
     """Gains in units of angular acceleration, per axis."""
 
     a: Float[Array, "3"]
-    """Of the rate error [1/s]."""
+    """Gain of the rate error [1/s]."""
     i: Float[Array, "3"]
-    """Of its integral [1/s^2]."""
+    """Gain of the integral of the rate error [1/s^2]."""
     b: Float[Array, "3"]
-    """Of the measured angular acceleration [-]."""
+    """Gain of the measured angular acceleration [-]."""
 
 
 class Authority(NamedTuple):
-    """What throttle turns a hovering vehicle by, per axis."""
+    """Effect of the throttle on the rotation of a hovering vehicle, per axis."""
 
     alpha: Float[Array, "3"]
-    """A: angular acceleration per throttle [rad/s^2]."""
+    """Angular acceleration A per throttle [rad/s^2]."""
     lead: Float[Array, "3"]
-    """Angular acceleration for a rate of throttle, over A [s]: the reaction of rotors that speed up, about yaw."""
+    """Angular acceleration per rate of throttle, over A [s]: the reaction of accelerating rotors, about yaw."""
 
 
 def authority(vehicle: Vehicle, coefficient: Float[Array, ""]) -> Authority:
-    """Return the authority of a vehicle that hovers.
+    """Return the authority of a hovering vehicle.
 
     Args:
-        vehicle: Its constants.
+        vehicle: Constants of the vehicle.
         coefficient: True T / Omega^2 of one rotor [N s^2].
     """
     hover = jnp.sqrt(vehicle.mass * STANDARD_GRAVITY / (4.0 * coefficient))
@@ -57,13 +57,14 @@ def authority(vehicle: Vehicle, coefficient: Float[Array, ""]) -> Authority:
 def is_damped(
     gains: Gains, lead: Float[Array, "3"], tau: Float[Array, ""], *, least_margin: float = LEAST_MARGIN
 ) -> Bool[Array, "3"]:
-    """Return, per axis, whether a loop has the least damping and the least margin.
+    """Return, per axis, whether a loop has at least the smallest damping and the smallest margin.
 
     Args:
-        gains: Its gains.
-        lead: As that of an :class:`Authority` [s].
+        gains: Gains of the loop.
+        lead: Lead as in an :class:`Authority` [s].
         tau: Time constant of the motors [s].
-        least_margin: How many times as large as at the limit of stability: more for an integral that never pauses.
+        least_margin: Smallest margin, as a multiple of that at the limit of stability; larger for an integral that does
+            not pause.
     """
     a, i, b = gains
     damping = 1.0 + b + a * lead
@@ -73,10 +74,11 @@ def is_damped(
 
 
 def tuned(gains: Gains, tau: Float[Array, ""]) -> Gains:
-    """Return gains that follow from the motors: damping 0.8, and an integral that does not disturb it.
+    """Return gains from the time constant of the motors: damping 0.8, with an integral that does not change it.
 
     Args:
-        gains: The platform's; the D term is never less, nor the ratio of integral and error more.
+        gains: Gains of the platform; the D term is not smaller than theirs, and the ratio of integral and error gain
+            not larger.
         tau: Time constant of the motors [s].
     """
     b = jnp.maximum(gains.b, LEAST_D)

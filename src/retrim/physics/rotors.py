@@ -19,17 +19,17 @@ class RateLoop(eqx.Module):
     """PID on body rates, in units of angular acceleration. All gains are per axis."""
 
     kp: Float[Array, "3"]
-    """[1/s]"""
+    """Gain of the rate error [1/s]."""
     ki: Float[Array, "3"]
-    """[1/s^2]"""
+    """Gain of the integral of the rate error [1/s^2]."""
     kd: Float[Array, "3"]
-    """[-]; acts on the measured angular acceleration"""
+    """Gain of the measured angular acceleration [-]."""
     integral_max: Float[Array, ""]
-    """Clamp of the integral [rad]."""
+    """Limit of the integral [rad]."""
 
 
 def rate_loop(motor_tau: Float[Array, ""]) -> RateLoop:
-    """Return gains that settle in about 0.1 s on both quadrotors of the paper; for slow motors, gains that suit them.
+    """Return gains that settle in about 0.1 s on both quadrotors of the paper, or gains tuned for slow motors.
 
     Args:
         motor_tau: Time constant of the motors [s].
@@ -43,8 +43,9 @@ def rate_loop(motor_tau: Float[Array, ""]) -> RateLoop:
 class LinearDragQuadrotor(AbstractSubstepDynamics[RotorState]):
     """Rotor-level quadrotor under a CTBR command.
 
-    ``thrust_gain`` multiplies the true thrust: the error of the thrust map. ``drag`` [1/s] is the linear rotor drag
-    per body axis at hover speed; it grows in proportion to the rotor speeds (blade-element theory, first order).
+    ``thrust_gain`` is the factor of the true thrust that models the error of the thrust map. ``drag`` [1/s] is the
+    linear rotor drag per body axis at hover speed; it is proportional to the rotor speeds (blade-element theory, first
+    order).
     """
 
     vehicle: Vehicle
@@ -59,12 +60,12 @@ class LinearDragQuadrotor(AbstractSubstepDynamics[RotorState]):
 
     @classmethod
     def of(cls, vehicle: Vehicle, dt: float, *, thrust_error: float = 0.035) -> "LinearDragQuadrotor":
-        """Build the model of a vehicle, with rotor drag of 0.3, 0.3, 0.37 1/s.
+        """Return the model of a vehicle, with rotor drag of 0.3, 0.3, 0.37 1/s.
 
         Args:
-            vehicle: Its constants.
+            vehicle: Constants of the vehicle.
             dt: Control tick [s], a whole number of milliseconds.
-            thrust_error: By how much more than commanded the rotors give, as a share.
+            thrust_error: Relative thrust error; 0.1 means 10 % more thrust than commanded.
         """
         return cls(
             vehicle, rate_loop(vehicle.motor_tau), jnp.array(1.0 + thrust_error), jnp.array([0.3, 0.3, 0.37]), dt
@@ -115,7 +116,7 @@ class LinearDragQuadrotor(AbstractSubstepDynamics[RotorState]):
         return jnp.sqrt(jnp.clip(thrusts, idle, vehicle.thrust_max / 4.0) / vehicle.thrust_coefficient), integral
 
     def mixed(self, thrust: Float[Array, ""], torque: Float[Array, "3"]) -> Float[Array, "4"]:
-        """Return the thrust of each rotor [N] that gives the collective ``thrust`` [N] and the ``torque`` [Nm]."""
+        """Return the thrust of each rotor [N] for the collective ``thrust`` [N] and the ``torque`` [Nm]."""
         arm, kappa = self.vehicle.arm, self.vehicle.torque_ratio
         levers = jnp.stack([arm[1], arm[0], kappa])
         return thrust / 4.0 + signs(thrust.dtype).T @ (torque / levers) / 4.0

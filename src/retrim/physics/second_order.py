@@ -1,7 +1,8 @@
-"""A point mass behind a rate loop of second order: the plant for vehicles whose command path is known as numbers.
+"""A point mass with a second-order rate loop: the plant for vehicles with a numerically known command path.
 
-Thrust and body rates follow their commands as :class:`~retrim.physics.actuator_response.ActuatorResponse` says, exactly
-in each millisecond. There are no rotors, so that every combination of lag, damping and gain exists as a vehicle.
+Thrust and body rates follow their commands as in :class:`~retrim.physics.actuator_response.ActuatorResponse`, exactly
+in each millisecond. The model does not have rotors, so that every combination of lag, damping and gain is a possible
+vehicle.
 """
 
 import equinox as eqx
@@ -29,7 +30,7 @@ class SecondOrderQuadrotor(AbstractSubstepDynamics[SecondOrderState]):
 
     response: ActuatorResponse
     mass: Float[Array, ""]
-    """[kg]; loads add to it."""
+    """Mass without loads [kg]."""
     drag: Float[Array, ""]
     """Linear drag [1/s]."""
     limits: tuple[Command, Command]
@@ -47,7 +48,7 @@ class SecondOrderQuadrotor(AbstractSubstepDynamics[SecondOrderState]):
 
     def init(self, x: State) -> SecondOrderState:
         """Return the state of a vehicle that hovers at ``x``, without rotation."""
-        # Hover is the thrust of 1 g, whatever the gain makes of a hover command.
+        # Hover is a thrust of 1 g, independent of the gain of the hover command.
         return SecondOrderState(x, ActuatorState.at(Command.hover(x.p.dtype)))
 
     def state(self, s: SecondOrderState) -> State:

@@ -7,23 +7,23 @@ angle [rad].
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-_SMALL = 1e-6  # [rad^2]: below it the Taylor series is exact to rounding, also in float32
+_SMALL = 1e-6  # [rad^2]; below it the Taylor series is exact to rounding, also in float32
 
 
 def hat(w: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """Skew-symmetric matrix ``[w]x``, so that ``hat(w) @ y == cross(w, y)``."""
+    """Return the skew-symmetric matrix ``[w]x``, so that ``hat(w) @ y == cross(w, y)``."""
     x, y, z = w
     zero = jnp.zeros_like(x)
     return jnp.stack([jnp.stack([zero, -z, y]), jnp.stack([z, zero, -x]), jnp.stack([-y, x, zero])])
 
 
 def vee(W: Float[Array, "3 3"]) -> Float[Array, "3"]:
-    """Inverse of :func:`hat`; of a general matrix, its skew-symmetric part."""
+    """Return the inverse of :func:`hat`; for a general matrix, that of its skew-symmetric part."""
     return 0.5 * jnp.stack([W[2, 1] - W[1, 2], W[0, 2] - W[2, 0], W[1, 0] - W[0, 1]])
 
 
 def exp(w: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """Rotation by the rotation vector ``w`` [rad] (Rodrigues' formula)."""
+    """Return the rotation by the rotation vector ``w`` [rad] (Rodrigues' formula)."""
     squared = jnp.sum(w * w)
     small = squared < _SMALL
     safe = jnp.where(small, jnp.ones_like(squared), squared)  # double where: no square root near zero, in either branch
@@ -35,17 +35,17 @@ def exp(w: Float[Array, "3"]) -> Float[Array, "3 3"]:
 
 
 def mul(A: Float[Array, "3 3"], B: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
-    """``A @ B`` by sums of products: under ``vmap`` on a CPU several times faster than a batched matrix product."""
+    """Return ``A @ B`` by sums of products, under ``vmap`` on a CPU several times faster than a batched product."""
     return jnp.sum(A[:, :, None] * B[None, :, :], axis=1)
 
 
 def act(A: Float[Array, "3 3"], y: Float[Array, "3"]) -> Float[Array, "3"]:
-    """``A @ y``, likewise."""
+    """Return ``A @ y`` by sums of products, as in :func:`mul`."""
     return jnp.sum(A * y[None, :], axis=1)
 
 
 def log(R: Float[Array, "3 3"]) -> Float[Array, "3"]:
-    """Rotation vector [rad] of ``R``, of length below pi; the inverse of :func:`exp`.
+    """Return the rotation vector [rad] of ``R``, with a length below pi; the inverse of :func:`exp`.
 
     The direction is ill-conditioned within about 1e-3 rad of a half turn.
     """
@@ -59,15 +59,15 @@ def log(R: Float[Array, "3 3"]) -> Float[Array, "3"]:
 
 
 def rotx(angle: Float[Array, ""]) -> Float[Array, "3 3"]:
-    """Rotation about the x axis by ``angle`` [rad]."""
+    """Return the rotation about the x axis by ``angle`` [rad]."""
     return exp(jnp.stack([angle, jnp.zeros_like(angle), jnp.zeros_like(angle)]))
 
 
 def roty(angle: Float[Array, ""]) -> Float[Array, "3 3"]:
-    """Rotation about the y axis by ``angle`` [rad]."""
+    """Return the rotation about the y axis by ``angle`` [rad]."""
     return exp(jnp.stack([jnp.zeros_like(angle), angle, jnp.zeros_like(angle)]))
 
 
 def rotz(angle: Float[Array, ""]) -> Float[Array, "3 3"]:
-    """Rotation about the z axis by ``angle`` [rad]."""
+    """Return the rotation about the z axis by ``angle`` [rad]."""
     return exp(jnp.stack([jnp.zeros_like(angle), jnp.zeros_like(angle), angle]))

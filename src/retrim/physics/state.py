@@ -16,7 +16,7 @@ STANDARD_GRAVITY = 9.81  # [m/s^2], the paper's u_hover = [9.81, 0, 0, 0]
 
 
 class StateDot(eqx.Module):
-    """Rate of change of a :class:`State`; the attitude moves by body rates."""
+    """Rate of change of a :class:`State`; body rates describe that of the attitude."""
 
     p: Float[Array, "3"]
     """Velocity, world [m/s]."""
@@ -50,7 +50,7 @@ class Command(eqx.Module):
     """u = (c, omega): collective thrust and body rates (CTBR), 4 numbers."""
 
     c: Float[Array, ""]
-    """Mass-normalised collective thrust along body z [m/s^2]; 9.81 hovers."""
+    """Mass-normalised collective thrust along body z [m/s^2]; 9.81 for hover."""
     omega: Float[Array, "3"]
     """Body rates [rad/s]."""
 
@@ -59,8 +59,9 @@ class Command(eqx.Module):
         """Return u_hover = [9.81, 0, 0, 0].
 
         Args:
-            dtype: Of its arrays. None for JAX's own, and a thrust of weak type; what is carried from tick to tick needs
-                the type of its successors, or the first tick is a program of its own.
+            dtype: Type of the arrays; None for JAX's default, with a thrust of weak type. A command that is carried
+                from tick to tick needs the type of its successors, since otherwise the first tick is compiled
+                separately.
         """
         return cls(jnp.array(STANDARD_GRAVITY, dtype=dtype), jnp.zeros(3, dtype=dtype))
 
@@ -70,7 +71,7 @@ class Command(eqx.Module):
 
     @classmethod
     def of(cls, vector: Float[Array, "4"]) -> "Command":
-        """Return the command of a vector; the inverse of :meth:`vector`."""
+        """Return the command from a vector; the inverse of :meth:`vector`."""
         return cls(vector[0], vector[1:])
 
     def within(self, low: "Command", high: "Command") -> "Command":

@@ -15,16 +15,16 @@ STEP, LONGEST = 1.0, 2.0  # [rad/s], [s]
 
 
 class StepResponse(NamedTuple):
-    """Answer to a step of 1 rad/s about one axis."""
+    """Response to a step of 1 rad/s about one axis."""
 
     overshoot: float
-    """Largest rate beyond the step, as a share of it."""
+    """Largest rate beyond the step, as a share of the step."""
     rise: float
     """Time to 63 % of the step [s]; infinite if it is not reached within 2 s."""
 
 
 def step_responses(vehicle: Vehicle) -> tuple[StepResponse, StepResponse, StepResponse]:
-    """Return the answers about roll, pitch and yaw of the rate loop that flies a vehicle on the plant ``bem``."""
+    """Return the responses about roll, pitch and yaw of the rate loop of a vehicle on the plant ``bem``."""
     tau, throttle, idle = (float(x) for x in (vehicle.motor_tau, _throttle(vehicle), vehicle.esc.idle))
     room, axes = (1.0 - throttle, throttle - idle), [numbers.tolist() for numbers in _loop(vehicle)]
     roll, pitch, yaw = (_response(*(numbers[k] for numbers in axes), tau=tau, room=room) for k in range(3))
@@ -33,7 +33,7 @@ def step_responses(vehicle: Vehicle) -> tuple[StepResponse, StepResponse, StepRe
 
 @eqx.filter_jit
 def _loop(vehicle: Vehicle) -> tuple[Array, Array, Array, Array, Array]:
-    """P, I and D in throttle, authority and lead, per axis."""
+    """Return P, I and D in throttle, authority and lead, per axis."""
     coefficient = vehicle.thrust_coefficient
     power, loop = authority(vehicle, coefficient), Betaflight.suited(vehicle, coefficient, coefficient)
     p, i, d = (gain / power.alpha for gain in loop.gains(power))
@@ -48,7 +48,7 @@ def _throttle(vehicle: Vehicle) -> Array:
 def _response(
     p: float, i: float, d: float, alpha: float, lead: float, *, tau: float, room: tuple[float, float]
 ) -> StepResponse:
-    """Simulate an axis in steps of 1 ms; two rotors speed up by what two slow down, each within its range."""
+    """Simulate an axis in steps of 1 ms; two rotors speed up as much as two slow down, each within its range."""
     rate = change = integral = acting = slow = largest = 0.0
     rise, keep, follow = math.inf, math.exp(-SUBSTEP / tau), math.exp(-2.0 * math.pi * RELAX_CUTOFF * SUBSTEP)
     for tick in range(round(LONGEST / SUBSTEP)):

@@ -15,25 +15,25 @@ from .state import STANDARD_GRAVITY, Command, State
 
 SUBSTEP = 1e-3  # [s]
 SIGNS = ((-1, 1, -1, 1), (-1, 1, 1, -1), (-1, -1, 1, 1))
-"""How the thrust of each rotor (front-right, back-left, back-right, front-left) turns the body about x, y and z."""
+"""Signs of the torque about x, y and z from each rotor (front-right, back-left, back-right, front-left)."""
 
 X = TypeVar("X")
 
 
 class AbstractSubstepDynamics(AbstractDynamics[X]):
-    """A control tick is a whole number of millisecond steps; each sees the conditions of its instant."""
+    """A model whose control tick is a whole number of millisecond steps, each with the effects of its instant."""
 
     @property
     def command_limits(self) -> tuple[Command, Command] | None:
-        """Smallest and largest command that the vehicle accepts; None for no limits."""
+        """Smallest and largest command that the vehicle accepts; None without limits."""
         return None
 
     def rotor_state(self, s: X) -> "RotorState | None":
-        """Return body rates and rotor speeds, if the model has them."""
+        """Return body rates and rotor speeds; None if the model does not have them."""
         return None
 
     def body_rates(self, s: X) -> Float[Array, "3"] | None:
-        """Return the body rates [rad/s], if the model has them."""
+        """Return the body rates [rad/s]; None if the model does not have them."""
         rotors = self.rotor_state(s)
         return None if rotors is None else rotors.omega
 
@@ -72,7 +72,7 @@ class RotorState(eqx.Module):
     omega_dot: Float[Array, "3"]
     """Body angular acceleration over the last millisecond [rad/s^2], for the D term."""
     wanted_slow: Float[Array, "3"] = eqx.field(default_factory=lambda: jnp.zeros(3))
-    """Commanded body rates, low-passed [rad/s], for controllers that look at how fast commands move."""
+    """Low-pass filtered commanded body rates [rad/s], for controllers that use the rate of change of commands."""
 
 
 def rigid_body(

@@ -1,6 +1,6 @@
-"""Vehicles: the constants of a quadrotor, each with its source.
+"""Vehicles: the constants of quadrotors, each with its source.
 
-The quadrotors are functions rather than constants, since an array made at import would start a JAX backend.
+The quadrotors are functions rather than constants, since creating an array at import would start a JAX backend.
 """
 
 import dataclasses
@@ -16,17 +16,17 @@ from .state import STANDARD_GRAVITY, Command
 
 
 class Esc(eqx.Module):
-    """How speed controllers turn throttle into rotor speed: Omega = base + linear d + root sqrt(d).
+    """Map of the speed controllers from throttle to rotor speed: Omega = base + linear d + root sqrt(d).
 
-    d = throttle (2048 - d_min) + d_min is what the firmware sends.
+    The firmware sends d = throttle (2048 - d_min) + d_min.
     """
 
     base: Float[Array, ""]
-    """[rad/s], at the battery's nominal voltage"""
+    """Coefficient ``base`` at the nominal voltage of the battery [rad/s]."""
     linear: Float[Array, ""]
-    """[rad/s]"""
+    """Coefficient ``linear`` [rad/s]."""
     root: Float[Array, ""]
-    """[rad/s]"""
+    """Coefficient ``root`` [rad/s]."""
     d_min: Float[Array, ""]
     idle: Float[Array, ""]
     """Smallest throttle."""
@@ -37,17 +37,17 @@ class Esc(eqx.Module):
         return self.base + self.linear * d + self.root * jnp.sqrt(d)
 
     def throttle(self, speed: Float[Array, "*rotors"]) -> Float[Array, "*rotors"]:
-        """Return the throttle of a rotor speed; the inverse of :meth:`speed`."""
+        """Return the throttle for a rotor speed; the inverse of :meth:`speed`."""
         rise = jnp.maximum(speed - self.base, 0.0)
         root_d = 2.0 * rise / (self.root + jnp.sqrt(self.root**2 + 4.0 * self.linear * rise))
         return (root_d**2 - self.d_min) / (2048.0 - self.d_min)
 
 
 class Vehicle(eqx.Module):
-    """Constants of a quadrotor in X configuration. Every leaf is an array: a new mass never recompiles."""
+    """Constants of a quadrotor in X configuration. Every leaf is an array, so a new mass does not cause compilation."""
 
     mass: Float[Array, ""]
-    """[kg]"""
+    """Mass [kg]."""
     inertia: Float[Array, "3"]
     """Diagonal of the inertia, body frame [kg m^2]."""
     arm: Float[Array, "2"]
@@ -65,28 +65,28 @@ class Vehicle(eqx.Module):
     rotor_inertia: Float[Array, ""]
     """Inertia of one motor and propeller about its axis [kg m^2]."""
     thrust_coefficient: Float[Array, ""]
-    """c_T in T = c_T Omega^2 of one rotor [N s^2]."""
+    """Coefficient c_T in T = c_T Omega^2 of one rotor [N s^2]."""
     torque_ratio: Float[Array, ""]
-    """kappa in Q = kappa T of one rotor [m]."""
+    """Ratio kappa in Q = kappa T of one rotor [m]."""
     drag_area: Float[Array, "3"]
-    """c A of the body along its axes [m^2]."""
+    """Drag area c A of the body along its axes [m^2]."""
     propeller: Propeller
     esc: Esc
     rate_lag: Float[Array, "3"] | None = None
-    """Time constants of the body rates behind their commands, if they are known [s]. Models of training have them; a
-    plant's follow from motors and rate loop."""
+    """Time constants of the body rates behind their commands, if they are known [s]. Training models use them; those of
+    a plant follow from motors and rate loop."""
     rate_damping: Float[Array, "3"] | None = None
-    """Damping ratios of the rate loops; None: they are of first order."""
+    """Damping ratios of the rate loops; None for first-order loops."""
 
     def __check_init__(self) -> None:
-        """Raise ``ValueError``, naming the field, where no such vehicle can exist; traced values are not checked."""
+        """Raise ``ValueError`` with the field if such a vehicle cannot exist; traced values are not checked."""
         if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(self)):
             return
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
             if value is None or isinstance(value, eqx.Module):
                 continue
-            numbers = value.tolist() if value.ndim else [value.item()]  # no program is compiled for a check
+            numbers = value.tolist() if value.ndim else [value.item()]  # avoids a compilation for a check
             if not all(math.isfinite(number) and number > 0 for number in numbers):
                 raise ValueError(f"Vehicle.{field.name} = {value} must be positive and finite")
         if self.thrust_max <= self.mass * STANDARD_GRAVITY:
@@ -108,7 +108,7 @@ class Vehicle(eqx.Module):
 
     @property
     def hover_speed(self) -> Float[Array, ""]:
-        """Rotor speed that carries the weight, by c_T [rad/s]."""
+        """Rotor speed that carries the weight, from c_T [rad/s]."""
         return jnp.sqrt(self.mass * STANDARD_GRAVITY / (4.0 * self.thrust_coefficient))
 
 
@@ -117,7 +117,8 @@ def small() -> Vehicle:
 
     Mass, inertia, arm length 0.06 m, thrust and motor time constant: Table IV of the paper (inertia to three digits:
     the description published with it). Rate limits, c_T, kappa, speeds, rotor inertia and the speed controllers'
-    curve at 17 V: the same description. Propeller: :func:`three_inch`. Drag area: the kingfisher's, by arm squared.
+    curve at 17 V: the same description. Propeller: :func:`three_inch`. Drag area: that of the kingfisher, scaled with
+    the square of the arm.
     """
     return Vehicle(
         mass=jnp.array(0.19),
@@ -144,9 +145,9 @@ def small() -> Vehicle:
 
 
 def kingfisher() -> Vehicle:
-    """Return the Agilicious platform's research quadrotor: every constant as published with that platform.
+    """Return the Agilicious platform's research quadrotor, with all constants as published with that platform.
 
-    kappa alone is blade-element theory's for these 5.1 in rotors (the description lists 0.022 m).
+    Only kappa is from blade-element theory for these 5.1 in rotors (the description lists 0.022 m).
     """
     return Vehicle(
         mass=jnp.array(0.752),
@@ -176,7 +177,7 @@ def large() -> Vehicle:
     """Return the paper's large quadrotor.
 
     Mass, inertia, arm length 0.13 m (with the kingfisher's aspect), thrust and motor time constant: Table IV of the
-    paper. All else is the kingfisher's, from which it was built.
+    paper. All other constants are those of the kingfisher, from which it was built.
     """
     return dataclasses.replace(
         kingfisher(),
@@ -198,9 +199,9 @@ def payload_inertia(mass: float, *, side: float = 0.05, below: float = 0.03) -> 
 
 
 def with_payload(vehicle: Vehicle, mass: float) -> Vehicle:
-    """Return a vehicle whose command includes a load: 0.07 kg make the paper's small quadrotor 0.26 kg.
+    """Return a vehicle with a load that its commands include: with 0.07 kg, the paper's small quadrotor has 0.26 kg.
 
-    Its thrust command is normalised by the mass of both. For a load that the vehicle does not know of, see
+    The thrust command is normalised by the total mass. For a load that is unknown to the vehicle, see
     :class:`retrim.physics.Payload`.
     """
     return dataclasses.replace(vehicle, mass=vehicle.mass + mass, inertia=vehicle.inertia + payload_inertia(mass))

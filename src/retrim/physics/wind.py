@@ -15,10 +15,10 @@ FEET = 0.3048  # [m]
 
 
 class SteadyWind(eqx.Module):
-    """The same wind at all times and places."""
+    """A wind that is constant in time and space."""
 
     wind: Float[Array, "3"]
-    """World [m/s]."""
+    """Velocity of the wind, world [m/s]."""
 
     def __call__(self, t: Float[Array, ""], x: State) -> ExternalEffects:
         """Return the wind."""
@@ -32,7 +32,7 @@ class Turbulence(eqx.Module):
     """
 
     rate: Float[Array, "n 3"]
-    """[rad/s]"""
+    """Angular frequency of each sinusoid [rad/s]."""
     phase: Float[Array, "n 3"]
     sigma: Float[Array, "3"]
     """Standard deviation per axis [m/s]."""
@@ -47,7 +47,7 @@ class Turbulence(eqx.Module):
         key: Key[Array, ""],
         n: int = 64,
     ) -> "Turbulence":
-        """Draw frozen eddies of scale ``length`` [m], carried past at ``speed`` [m/s].
+        """Draw frozen eddies with the scale ``length`` [m] that pass at ``speed`` [m/s].
 
         Sinusoid k has a frequency from the k-th n-quantile of the spectrum, so that each carries the same energy:
         with s = L omega / V, the energy below s is 2 atan(s) / pi along the wind, and (2 atan(s) - s / (1 + s^2)) / pi
@@ -57,7 +57,7 @@ class Turbulence(eqx.Module):
         return cls(rate, phase, sigma)
 
     def __call__(self, t: Float[Array, ""]) -> Float[Array, "3"]:
-        """Return the gust at ``t``: along, across and up [m/s]."""
+        """Return the gust at ``t``: components along, across and up [m/s]."""
         n = self.rate.shape[0]
         amplitude = self.sigma * math.sqrt(2.0 / n)
         return amplitude * jnp.sum(jnp.cos(self.rate * t + self.phase), axis=0)
@@ -67,13 +67,13 @@ class Turbulence(eqx.Module):
 def _eddies(
     speed: Float[Array, ""], length: Float[Array, "3"], key: Key[Array, ""], n: int
 ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
-    """Rate [rad/s] and phase of each sinusoid."""
+    """Return rate [rad/s] and phase of each sinusoid."""
     k_quantile, k_phase = random.split(key)
     share = (jnp.arange(n, dtype=float)[:, None] + random.uniform(k_quantile, (n, 3))) / n
     grid = jnp.tan(jnp.linspace(0.0, 1.0, 2001)[:-1] * jnp.pi / 2)
     across = (2.0 * jnp.arctan(grid) - grid / (1.0 + grid**2)) / jnp.pi
     s = jnp.stack([jnp.tan(share[:, 0] * jnp.pi / 2), *(jnp.interp(share[:, i], across, grid) for i in (1, 2))], axis=1)
-    fastest = 200.0  # [rad/s]: a millisecond step resolves no more
+    fastest = 200.0  # [rad/s], limit of the resolution of a millisecond step
     rate = jnp.minimum(s * speed / length[None], fastest)
     return rate, 2.0 * jnp.pi * random.uniform(k_phase, (n, 3))
 
@@ -90,14 +90,14 @@ class Dryden(eqx.Module):
     """A mean wind with Dryden gusts, low-altitude model (MIL-F-8785C)."""
 
     mean: Float[Array, "3"]
-    """World [m/s]."""
+    """Mean velocity of the wind, world [m/s]."""
     turbulence: Turbulence
 
     @classmethod
     def of(cls, mean: Float[Array, "3"], *, key: Key[Array, ""], altitude: float = 10.0 * FEET) -> "Dryden":
         """Draw the gusts of a horizontal mean wind at an ``altitude`` of at least 3.048 m.
 
-        sigma_w = 0.1 of the wind at 20 ft, here ``mean``; lengths and the other sigmas by the altitude in feet.
+        sigma_w = 0.1 of the wind at 20 ft, here ``mean``; lengths and the other sigmas depend on the altitude in feet.
         """
         speed = float(jnp.linalg.norm(mean))
         if not speed > 0 or float(mean[2]) != 0.0 or altitude < 10.0 * FEET - 1e-9:
@@ -119,20 +119,20 @@ class Dryden(eqx.Module):
 class Fan(eqx.Module):
     """A round jet in space with a turbulent part: the force depends on position, attitude and velocity.
 
-    Far from the outlet a jet widens in proportion to the distance, and its momentum flux stays: speed times width is
-    constant. The profile across is a Gaussian.
+    Far from the outlet a jet widens in proportion to the distance, and its momentum flux is constant: speed times width
+    is constant. The profile across the jet is a Gaussian.
     """
 
     outlet: Float[Array, "3"]
-    """World [m]."""
+    """Position of the outlet, world [m]."""
     direction: Float[Array, "3"]
-    """Where it blows; not vertical."""
+    """Direction of the jet; not vertical."""
     speed: Float[Array, ""]
-    """At the outlet, on the axis [m/s]."""
+    """Speed at the outlet, on the axis [m/s]."""
     width: Float[Array, ""]
     """Standard deviation of the profile at the outlet [m]."""
     turbulence: Turbulence
-    """Relative to the jet's speed where the vehicle is [-]."""
+    """Turbulence relative to the speed of the jet at the vehicle [-]."""
 
     SPREAD = 0.1  # growth of the width per metre, free round jets
 
@@ -147,7 +147,7 @@ class Fan(eqx.Module):
         key: Key[Array, ""],
         intensity: float = 0.15,
     ) -> "Fan":
-        """Draw a jet with gusts of ``intensity`` times its speed and eddies as large as the outlet is wide."""
+        """Draw a jet with gusts of ``intensity`` times its speed and eddies of the width of the outlet."""
         if not (speed > 0 and width > 0 and 0 <= intensity < 1) or float(jnp.linalg.norm(direction[:2])) == 0.0:
             raise ValueError(
                 f"Fan: speed = {speed}, width = {width}, intensity = {intensity}, direction = {direction} cannot be"

@@ -23,7 +23,7 @@ class Scheduled(NamedTuple):
 
 
 class AdaptivePilot(Pilot):
-    """A pilot that learns as it flies. ``state`` is what has been learnt and published so far."""
+    """A pilot that learns in flight. ``state`` holds the latest published policy and residual."""
 
     def __init__(
         self,
@@ -37,11 +37,12 @@ class AdaptivePilot(Pilot):
         """Build a pilot.
 
         Args:
-            controller: What flies, given what was learnt; the memory of one goes on in the next.
+            controller: Returns the controller for a learner state; each new controller takes over the memory of the
+                last one.
             state: Policy and residual at the start.
-            learners: They are offered windows in this order.
+            learners: Learners, in the order in which they are offered windows.
             dt: Control tick [s].
-            window: Ticks of flight that learners see.
+            window: Ticks of flight in the window for the learners.
         """
         self.controller_of = controller
         self.dt: float = dt
@@ -57,7 +58,7 @@ class AdaptivePilot(Pilot):
         self.events: list[Event] = []
 
     def reset(self, measurement: Measurement) -> None:
-        """Start a flight: what was learnt stays; the buffer and what is under way do not."""
+        """Start a flight: keep the learner state; clear the buffer and cancel computations under way."""
         self._buffer.clear()
         self._start, self._ticks_offered = measurement.t, [0] * len(self.learners)
         for learner, _ in self.learners:
@@ -65,14 +66,14 @@ class AdaptivePilot(Pilot):
         self._pilot.reset(measurement)
 
     def warm_up(self, measurement: Measurement) -> None:
-        """Compile the programs of flight and of every learner; what they learn from one tick is dropped."""
+        """Compile the programs of flight and of every learner; the updates from this one tick are dropped."""
         super().warm_up(measurement)
         for learner, _ in self.learners:
             learner.submit(self._buffer.window(), 0)
             learner.reset()
 
     def act(self, measurement: Measurement) -> Command:
-        """Apply updates that are visible, fly one tick, offer windows that are due."""
+        """Apply the visible updates, fly one tick and offer the windows that are due."""
         t = measurement.t - self._start
         tick = round(t / self.dt)
         self._apply(t, tick)
@@ -85,7 +86,7 @@ class AdaptivePilot(Pilot):
             for i in due:
                 self._ticks_offered[i] = tick // self.periods[i]
                 self.learners[i].learner.submit(window, tick)
-            self._apply(t, tick)  # skips are known at once
+            self._apply(t, tick)  # a skip is visible at the tick of its offer
         return u
 
     def accepted(self, u: Command) -> None:
@@ -94,11 +95,11 @@ class AdaptivePilot(Pilot):
         self._pilot.accepted(u)
 
     def learn(self, state: LearnerState, t: float) -> None:
-        """Fly what was learnt elsewhere from now on, and let the learners go on from it.
+        """Fly a learner state from another source from now on, and let the learners continue from it.
 
         Args:
             state: Policy and residual.
-            t: Time of the newest measurement behind them [s].
+            t: Time of the newest measurement from which they were learned [s].
         """
         self._publish(ResidualUpdate(t, 0.0, state.residual))
         self._publish(PolicyUpdate(t, 0.0, 0.0, state.policy))

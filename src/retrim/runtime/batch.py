@@ -1,4 +1,4 @@
-"""A flight of a simulated plant as one program: one vehicle in the code, ``jax.vmap`` for many."""
+"""A flight of a simulated plant as one program. The code handles one vehicle; use ``jax.vmap`` for many."""
 
 from typing import Any
 
@@ -16,17 +16,17 @@ from ..plants.sim import SimState, Simulation
 
 
 class InFlight(eqx.Module):
-    """Everything that a flight remembers between two ticks."""
+    """State of a flight between two ticks."""
 
     sim: SimState
     memory: Any
-    """Of the controller."""
+    """Memory of the controller."""
     tick: Int[Array, ""]
-    """Ticks flown."""
+    """Number of ticks so far."""
 
 
 class Ticks(eqx.Module):
-    """What was flown, with a leading time axis: one row per tick."""
+    """Record of a flight, with a leading time axis: one row per tick."""
 
     true: State
     """True state at the end of the tick."""
@@ -37,9 +37,9 @@ class Ticks(eqx.Module):
     accepted: Command
     """Command that the plant accepted for the tick."""
     condition: Condition | None
-    """Of the controller after its command; None for a controller that never steps back."""
+    """Condition of the controller after its command; None for a controller that never steps back."""
     vehicle: VehicleReport | None = None
-    """Vehicle that the controller has identified; None for one that identifies none."""
+    """Vehicle that the controller has identified; None for a controller that does not identify the vehicle."""
 
 
 def take_off(simulation: Simulation, controller: AbstractController[Any], x0: State) -> InFlight:
@@ -52,9 +52,9 @@ def in_flight(controller: AbstractController[Any], sim: SimState, measured: Stat
     """Return a flight of a simulation that has been launched.
 
     Args:
-        controller: What decides.
-        sim: The simulation.
-        measured: What is measured of it.
+        controller: The controller.
+        sim: State of the simulation.
+        measured: Measured state of the vehicle.
     """
     return InFlight(sim, controller.init(measured), jnp.array(0))
 
@@ -67,20 +67,20 @@ def fly_ticks(
     *,
     room: int,
 ) -> tuple[InFlight, Ticks]:
-    """Fly one vehicle on for some ticks; the controller may be another one, with the same memory, than before.
+    """Continue the flight of one vehicle for some ticks.
 
-    The physics is the same, tick for tick, as flying :class:`retrim.SimPlant` with a
-    :class:`retrim.ControllerPilot`. A flight never terminates.
+    The controller may differ from the previous one if its memory has the same structure. The physics equals, tick for
+    tick, that of a :class:`retrim.SimPlant` with a :class:`retrim.ControllerPilot`. A flight never terminates.
 
     Args:
-        simulation: What flies.
-        controller: What decides.
+        simulation: The simulated plant.
+        controller: The controller.
         flight: The flight so far.
-        ticks: How far to go on; it may be traced.
-        room: Number of rows that are returned; those beyond ``ticks`` are zero.
+        ticks: Number of ticks to fly; it may be traced.
+        room: Number of rows that are returned; rows beyond ``ticks`` are zero.
 
     Returns:
-        The flight, and what was flown.
+        The flight after these ticks, and their record.
     """
 
     controller = controller.with_age(simulation.age)
@@ -112,11 +112,11 @@ def fly_ticks(
 
 
 def batch_flight(simulation: Simulation, controller: AbstractController[Any], x0: State, *, ticks: int) -> Ticks:
-    """Fly one vehicle from its start; ``jax.vmap`` or ``lax.map`` this over vehicles, starts or policies.
+    """Fly one vehicle from its start; apply ``jax.vmap`` or ``lax.map`` for many vehicles, starts or policies.
 
     Args:
-        simulation: What flies; a :class:`retrim.SimPlant` has one.
-        controller: What decides.
+        simulation: The simulated plant; a :class:`retrim.SimPlant` has one.
+        controller: The controller.
         x0: State at the start.
         ticks: Length of the flight.
     """

@@ -1,7 +1,7 @@
-"""Learning beside a batch of flights, on the virtual clock.
+"""Learning for a batch of flights, on the virtual clock.
 
-When learners are offered windows, and when their updates become visible, follows from periods and latencies alone. So
-between two such instants all flights are one program, and so are the fits and the updates of all flights.
+Periods and latencies alone determine when learners are offered windows and when their updates become visible. So
+between two such instants all flights run as one program, and so do the fits and the updates of all flights.
 """
 
 from collections.abc import Callable, Sequence
@@ -29,15 +29,15 @@ from .batched import Batch
 from .events import Event
 from .lockstep import LockstepLearner
 
-AT_ONCE = 4  # updates of a core, at most
-IN_CACHE = 750_000  # bytes of the policies that a core trains at once, beside what they compute
+AT_ONCE = 4  # largest number of updates that a core computes at once
+IN_CACHE = 750_000  # bytes of the policies that a core trains at once, without their activations
 RESIDUAL, POLICY = 0, 1
 LAYERS: tuple[Layer, Layer] = ("residual", "policy")
-"""In the order in which a pilot asks them."""
+"""Layers, in the order in which a pilot polls their learners."""
 
 
 class Offer(NamedTuple):
-    """A window that is offered to a learner, and what comes of it."""
+    """A window that is offered to a learner, and the time of its update."""
 
     tick: int
     visible: int | None
@@ -49,7 +49,7 @@ def offers(period: int, latency: int, ticks: int) -> list[Offer]:
 
     Args:
         period: Time between offers [ticks].
-        latency: From an offer to its update [ticks].
+        latency: Time from an offer to its update [ticks].
         ticks: Length of the flight.
     """
     found, free = list[Offer](), 0
@@ -62,20 +62,20 @@ def offers(period: int, latency: int, ticks: int) -> list[Offer]:
 
 @dataclass(frozen=True)
 class Plan:
-    """How a pilot of the virtual clock learns, as values."""
+    """Settings of a pilot that learns on the virtual clock, as values."""
 
     learner: OnlineLearner
     controller: Callable[[LearnerState], AbstractController[Any]]
     key: Key[Array, ""]
-    """Seed of its updates."""
+    """Seed of the policy updates."""
     window: int
     periods: tuple[int, int]
-    """Of the two layers [ticks]."""
+    """Periods of the two layers [ticks]."""
     latencies: tuple[int, int]
 
     @classmethod
     def of(cls, pilot: AdaptivePilot) -> "Plan | None":
-        """Return the plan of a pilot; None if it has other learners, or is charged what the clock shows."""
+        """Return the plan of a pilot; None if it has other learners, or if its latencies are measured by the clock."""
         match [each.learner for each in pilot.learners]:
             case [
                 LockstepLearner(worker=ResidualWorker(learner=other), latency_s=float(first)) as fit,
@@ -88,7 +88,7 @@ class Plan:
                 return None
 
     def same_as(self, other: "Plan") -> bool:
-        """Return whether two plans differ in their seeds only."""
+        """Return whether two plans are equal, except for their seeds."""
         mine, theirs = ((p.controller, p.window, p.periods, p.latencies) for p in (self, other))
         return self.learner is other.learner and mine == theirs
 
@@ -100,12 +100,12 @@ def fly_and_learn(
 
     Args:
         batch: Flights that have not begun.
-        plans: One for each flight, the same but for their seeds.
-        state: What each has learnt before (leading axis flights).
-        cold: Programs are not compiled yet; those of flight and of learning are at the same time.
+        plans: One for each flight, equal except for their seeds.
+        state: Learner state of each flight at its start (leading axis flights).
+        cold: If true, the programs are not compiled yet: compile those of flight and of learning at the same time.
 
     Returns:
-        What each has learnt, and the events of each flight.
+        The learner state of each flight at its end, and the events of each flight.
     """
     plan, keys = plans[0], spread(jnp.stack([each.key for each in plans]))
     batch.controllers = _controllers(plan, state)
@@ -142,17 +142,17 @@ def fly_and_learn(
 
 
 def _learn_from_nothing(learner: OnlineLearner, state: LearnerState, window: Window, keys: Key[Array, " n"]) -> None:
-    """Compile the programs of learning; what they learn is dropped."""
+    """Compile the programs of learning; their results are dropped."""
     _fitted(learner, state, window)
     _updated(learner, state, window, keys)
 
 
 class _Instant(NamedTuple):
-    """Something that happens beside the flights; sorted, they are in the order of a pilot."""
+    """An offer or a publication during the flights; sorted instants are in the order of a pilot."""
 
     tick: int
     order: int
-    """0: an update is published, before the tick is flown; 1: a window is offered, after the command."""
+    """0: an update is published, before the tick; 1: a window is offered, after the command."""
     layer: int
     offer: Offer
 
@@ -176,7 +176,7 @@ def _controllers(plan: Plan, state: LearnerState) -> Any:
 
 
 def _fitted(learner: OnlineLearner, state: LearnerState, window: Window) -> tuple[Any, list[Update]]:
-    """Fit the residual of every flight; return the states, and what each flight is told, with the states of all."""
+    """Fit the residual of every flight; return the states, and an update for each flight that holds all states."""
     states, reports = fit_all(learner, state.residual, window)
     reports, t = jax.device_get((reports, window.t[:, -1]))
     return states, [residual_update(float(t[i]), states, row(reports, i)) for i in range(len(t))]
@@ -185,7 +185,7 @@ def _fitted(learner: OnlineLearner, state: LearnerState, window: Window) -> tupl
 def _updated(
     learner: OnlineLearner, state: LearnerState, window: Window, keys: Key[Array, " n"]
 ) -> tuple[Key[Array, " n"], Any, list[Update]]:
-    """Re-train the policy of every flight; a flight keeps its own where the gate refused the new one."""
+    """Re-train the policy of every flight; a flight keeps its old policy where the gate refused the new one."""
     keys, now = _next_keys(keys)
     trained, verdicts = update_all(learner, state, window, now)
     verdicts, t = jax.device_get((verdicts, window.t[:, -1]))
@@ -193,7 +193,7 @@ def _updated(
 
 
 def row(tree: Any, i: int) -> Any:
-    """Return what arrays of NumPy with a leading axis of flights say of one flight."""
+    """Return the entry of one flight from NumPy arrays with a leading axis of flights."""
     return jax.tree.map(lambda leaf: leaf[i], tree)
 
 
@@ -211,11 +211,11 @@ def update_all(
     """Re-train the policy of each flight; every array has a leading axis of flights.
 
     Args:
-        learner: How.
-        state: What each goes on from.
-        windows: Of each flight.
-        keys: Consumed.
-        flown: Policies that fly, where these are others than those of ``state``.
+        learner: The learner of all flights.
+        state: State of each learner before the update.
+        windows: Window of each flight.
+        keys: Random keys, consumed.
+        flown: Policies in flight, if they differ from those of ``state``.
 
     Returns:
         The trained policy, or the old one where the gate refused it, and the verdicts.
@@ -228,7 +228,7 @@ def update_all(
     if jax.default_backend() != "cpu" or jax.device_count() > 1:
         updated: tuple[PolicyState, Verdict] = eqx.filter_vmap(update)(state, windows, keys, flown)
         return updated
-    # A core is fastest with a few at once, whose activations stay in its cache; the last few are filled up.
+    # A core is fastest with a few updates at once, whose activations stay in its cache; the last group is padded.
     arrays, rest = eqx.partition((state, windows, keys, flown), eqx.is_array)
     n = keys.shape[0]
     few = at_once(n, sum(leaf.nbytes for leaf in jax.tree.leaves(eqx.filter(state.policy.policy, eqx.is_array))) // n)
@@ -244,11 +244,11 @@ def update_all(
 
 
 def at_once(n: int, size: int) -> int:
-    """Return how many updates a core makes at once: as many as stay in its cache, and few of them in vain.
+    """Return the number of updates that a core computes at once: it fits into the cache and needs little padding.
 
     Args:
-        n: How many there are.
-        size: Of a policy [bytes].
+        n: Number of updates.
+        size: Size of a policy [bytes].
     """
     most = min(n, AT_ONCE, IN_CACHE // size)
     return max(range(2, most + 1), key=lambda few: (-(-n % few), few), default=1)
@@ -256,6 +256,6 @@ def at_once(n: int, size: int) -> int:
 
 @jax.jit
 def _next_keys(keys: Key[Array, " n"]) -> tuple[Key[Array, " n"], Key[Array, " n"]]:
-    """Return the keys to go on with, and those of an update."""
+    """Return the keys to continue with, and those of an update."""
     both = jax.vmap(random.split)(keys)
     return both[:, 0], both[:, 1]

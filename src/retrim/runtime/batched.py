@@ -1,4 +1,4 @@
-"""Flights in step: arrays with a leading axis of flights, and the record that they leave."""
+"""Flights that advance in step: arrays with a leading axis of flights, and their record."""
 
 import threading
 from collections.abc import Callable, Sequence
@@ -20,11 +20,11 @@ from .flight import FlightStopped, Log, States
 
 T = TypeVar("T")
 
-ROOM = 50  # ticks of one call; progress is told, and a stop is seen, so often
+ROOM = 50  # ticks of one call; the period of progress reports and of checks for a stop
 
 
 class Batch:
-    """Flights in the air, and what they have left so far. Every array has a leading axis of flights."""
+    """Flights in progress, and their record so far. Every array has a leading axis of flights."""
 
     def __init__(
         self,
@@ -37,10 +37,10 @@ class Batch:
     ) -> None:
         self.ticks, self.dt = ticks, dt
         self.controllers: Any = None
-        """They fly; the next one takes over the memory of the last."""
+        """Controllers of the flights; new ones take over the memory of the last ones."""
         self._simulations, self._starts = stacked(simulations), stacked(starts)
         self._progress, self._stop = progress, stop
-        # Without their disturbances plants of one make are alike whatever disturbs them: one program launches them all.
+        # Without disturbances, plants of one kind have the same structure: one program launches all of them.
         self._on_the_ground = stacked([simulation.undisturbed() for simulation in simulations])
         self._flights: InFlight | None = None
         self._flown = 0
@@ -48,7 +48,7 @@ class Batch:
         self._rows: Any = None
 
     def fly_to(self, tick: int) -> None:
-        """Fly on until so many ticks are flown.
+        """Continue the flights up to a tick.
 
         Raises:
             FlightStopped: The flights were given up.
@@ -68,7 +68,7 @@ class Batch:
             self._progress(self._flown / self.ticks)
 
     def blank_window(self, size: int) -> Window:
-        """Return windows of the shapes of a flight, of vehicles that hover where they start."""
+        """Return windows with the shapes of those of a flight, for vehicles that hover at their starts."""
         n = self._starts.p.shape[0]
         x = jax.tree.map(lambda leaf: jax.device_put(np.repeat(np.asarray(leaf)[:, None], size, axis=1)), self._starts)
         hover = Command.hover(x.p.dtype)
@@ -78,7 +78,7 @@ class Batch:
         return blank
 
     def window(self, tick: int, size: int) -> Window:
-        """Return the windows that learners are offered at ``tick``; it has been flown."""
+        """Return the windows that learners are offered at ``tick``, which the flights must have passed."""
         wanted = np.arange(tick - size + 1, tick + 1)
         at = np.maximum(wanted, 0)
         x = jax.tree.map(lambda leaf: jax.device_put(leaf[:, at]), self._measured)
@@ -117,7 +117,7 @@ class Batch:
 
 
 def stacked(trees: Sequence[T]) -> T:
-    """Return trees of one structure as one, with a leading axis that the devices share."""
+    """Return trees of one structure as one tree, with a leading axis that is divided among the devices."""
     arrays = [eqx.filter(tree, eqx.is_array) for tree in trees]
     together = jax.tree.map(lambda *leaves: _stack(leaves), *arrays)
     whole: T = spread(eqx.combine(together, eqx.filter(trees[0], eqx.is_array, inverse=True)))
@@ -125,13 +125,13 @@ def stacked(trees: Sequence[T]) -> T:
 
 
 def one(tree: T, i: int) -> T:
-    """Return one of :func:`stacked` trees."""
+    """Return one tree of those that :func:`stacked` has stacked."""
     found: T = jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf)[i]), tree)
     return found
 
 
 def _stack(leaves: Sequence[Any]) -> Array:
-    """Stack arrays, without a program to compile for every shape."""
+    """Stack arrays in NumPy, which does not compile a program for every shape."""
     if jnp.issubdtype(leaves[0].dtype, jax.dtypes.prng_key):
         return jnp.stack(leaves)
     stacked: Array = jax.device_put(np.stack([np.asarray(leaf) for leaf in leaves]))
@@ -139,7 +139,7 @@ def _stack(leaves: Sequence[Any]) -> Array:
 
 
 def _recorded(record: Any, flown: Any, at: int, size: int, *, rows: int) -> Any:
-    """Write the first rows of what was flown into a record of the whole flight, at a tick; the second axis is time."""
+    """Write the first rows of ``flown`` into a record of the whole flight, at a tick; the second axis is time."""
     if record is None:
         record = jax.tree.map(lambda leaf: np.empty((leaf.shape[0], size, *leaf.shape[2:]), leaf.dtype), flown)
 

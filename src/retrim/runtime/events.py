@@ -1,4 +1,4 @@
-"""Events of a flight, and observers that follow it."""
+"""Events and observers of a flight."""
 
 import json
 from pathlib import Path
@@ -18,15 +18,15 @@ ROUNDING = 1e-3  # [s]
 
 
 class Event(NamedTuple):
-    """Something that adaptation did, or the end of a flight that was terminated."""
+    """An action of the adaptation, or the termination of the flight."""
 
     t: float
-    """Time since the start of the flight at which it became visible [s]."""
+    """Time at which the event became visible, since the start of the flight [s]."""
     kind: str
     """``residual``, ``policy``, ``rejected`` (a result that must not be used), ``skipped`` (the learner was busy),
     ``stage`` (the controller stepped back, or returned), ``vehicle`` (the identified vehicle) or ``terminated``."""
     note: str
-    """One line."""
+    """Description in one line."""
 
     @classmethod
     def of(cls, t: float, update: Update) -> "Event":
@@ -38,7 +38,7 @@ def stage_events(conditions: Condition | None, t: Float[np.ndarray, " n"]) -> li
     """Return an event for each change of the stage of a controller.
 
     Args:
-        conditions: Of each tick (leading axis n); None for a controller that never steps back.
+        conditions: Condition at each tick (leading axis n); None for a controller that never steps back.
         t: Times of the ticks since the start of the flight [s].
     """
     if conditions is None:
@@ -49,10 +49,10 @@ def stage_events(conditions: Condition | None, t: Float[np.ndarray, " n"]) -> li
 
 
 def vehicle_events(vehicles: VehicleReport | None, t: Float[np.ndarray, " n"]) -> list[Event]:
-    """Return the events in which the identified vehicle is reported.
+    """Return the events that report the identified vehicle.
 
     Args:
-        vehicles: Of each tick (leading axis n); None for a controller that identifies none.
+        vehicles: Vehicle at each tick (leading axis n); None for a controller that does not identify the vehicle.
         t: Times of the ticks since the start of the flight [s].
     """
     if vehicles is None:
@@ -67,7 +67,7 @@ class Observer(Protocol):
     """Follows a flight. It must not block."""
 
     def measurement(self, measurement: Measurement, u: Command) -> None:
-        """Receive each measurement and the command accepted for the tick that it ended; hover for the first one."""
+        """Receive each measurement and the command accepted for the tick that it ends; hover for the first one."""
         ...
 
     def event(self, event: Event) -> None:
@@ -76,14 +76,14 @@ class Observer(Protocol):
 
 
 class JsonlObserver:
-    """Writes events as lines of JSON, at once."""
+    """Writes each event at once, as a line of JSON."""
 
     def __init__(self, path: Path, **about: object) -> None:
-        """Open ``path`` to append; ``about`` stands in each line."""
+        """Open ``path`` to append; each line contains the fields of ``about``."""
         self._file, self._about = path.open("a"), about
 
     def measurement(self, measurement: Measurement, u: Command) -> None:
-        """Ignore it."""
+        """Ignore the measurement."""
 
     def event(self, event: Event) -> None:
         """Write one line."""

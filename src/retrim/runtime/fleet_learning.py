@@ -1,4 +1,4 @@
-"""Learning for many vehicles at once: whatever is due, as one program; and a base that all of them share."""
+"""Learning for many vehicles at once: one program for all updates that are due, and a base that all vehicles share."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -27,19 +27,20 @@ from .batched import one, stacked
 def learn_together(
     workers: Sequence[Worker], windows: Sequence[Window], base: PolicyState | None = None
 ) -> list[Update]:
-    """Learn from a window for each of several vehicles; the result of each is that of its worker alone, to rounding.
+    """Learn from one window for each of several vehicles.
 
-    Programs are compiled for powers of two; what is missing to the next one is computed twice and dropped, so that any
-    number of vehicles may be due.
+    The result of each vehicle equals that of its worker alone, up to rounding. Programs are compiled for powers of two;
+    the batch is padded to the next one with copies whose results are dropped, so that any number of vehicles may be
+    due.
 
     Args:
         workers: One for each vehicle, of one layer and one learner, with states of one structure.
-        windows: What each learns from.
-        base: The base that low-rank policies put their deltas on from now on; each its own by default. The gate
-            compares what comes of it with what flies.
+        windows: The window of each worker.
+        base: The base to which low-rank policies add their deltas from now on; by default each keeps its own. The gate
+            compares the result with the policy in flight.
 
     Returns:
-        The update of each.
+        The update of each vehicle.
     """
     first, n = workers[0], len(workers)
     filled = [*range(n), *[0] * (room_for(n) - n)]
@@ -58,7 +59,7 @@ def learn_together(
 
 
 def shared_base(learner: OnlineLearner, state: LearnerState) -> PolicyState:
-    """Return the base of a low-rank policy as what all vehicles that start from it share, with a fresh optimiser."""
+    """Return the base of a low-rank policy, for all vehicles that start from it, with a fresh optimiser."""
     policy = state.policy.policy
     assert isinstance(policy, LoraPolicy)
     return PolicyState(policy.base, _optimiser(learner).init(policy.base.params))
@@ -69,17 +70,17 @@ def learn_base(
 ) -> PolicyState:
     """Take one optimiser step of a shared base, along the mean of the gradients of several vehicles.
 
-    Each vehicle's gradient is that of its own policy, base and delta, in its own corrected model. Since the delta is
-    added to the base, it is the gradient of the base, too.
+    The gradient of each vehicle is that of its own policy, base plus delta, in its own corrected model. Since the delta
+    is added to the base, this is also the gradient of the base.
 
     Args:
         workers: One for each vehicle, with low-rank policies.
-        windows: Their flights.
+        windows: The window of each vehicle.
         base: The base, and its optimiser.
-        key: Consumed.
+        key: Random key, consumed.
 
     Returns:
-        The base after the step; the same one if the gradient is not finite.
+        The base after the step; the base unchanged if the gradient is not finite.
     """
     n = len(workers)
     filled = [*range(n), *[0] * (room_for(n) - n)]
@@ -91,7 +92,7 @@ def learn_base(
 
 
 def refused_by_all(updates: Sequence[Update]) -> bool:
-    """Return whether no vehicle has found its update better than what it flies: then a shared base is taken back."""
+    """Return whether every vehicle has refused its update; the step of the shared base is then undone."""
     return not any(isinstance(update, PolicyUpdate) for update in updates)
 
 
@@ -115,7 +116,7 @@ def _base_step(
 
 
 def _optimiser(learner: OnlineLearner) -> optax.GradientTransformation:
-    """Return one Adam for the whole flight, with the rate of all weights: no update of the base begins anew."""
+    """Return one Adam for the whole flight, with the rate of all weights: updates of the base do not reset it."""
     clip = optax.clip_by_global_norm(learner.optimiser.max_grad_norm)
     return optax.chain(clip, optax.scale_by_adam(), optax.scale_by_learning_rate(learner.optimiser.rate))
 

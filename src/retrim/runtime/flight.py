@@ -1,4 +1,4 @@
-"""The flight loop and the record that every flight leaves."""
+"""The flight loop and the record of a flight."""
 
 import threading
 from collections.abc import Callable, Sequence
@@ -17,43 +17,43 @@ from .pilot import Pilot
 
 
 class FlightStopped(RetrimError):
-    """A flight was given up because its stop token was set."""
+    """The flight was aborted because its stop token was set."""
 
 
 class States(NamedTuple):
     """States of a flight as NumPy arrays with a leading time axis."""
 
     p: np.ndarray
-    """World [m]."""
+    """Positions, world [m]."""
     R: np.ndarray
-    """Body to world."""
+    """Attitudes, body to world."""
     v: np.ndarray
-    """World [m/s]."""
+    """Velocities, world [m/s]."""
 
     def as_state(self) -> State:
-        """Return the same as a :class:`State` of JAX arrays."""
+        """Return the same states as a :class:`State` of JAX arrays."""
         state: State = jax.vmap(State)(*map(jnp.asarray, self))
         return state
 
 
 class Log(NamedTuple):
-    """A flight as it was. Row 0 is the start; a flight of n ticks has n + 1 rows."""
+    """Record of a flight. Row 0 is the start; a flight of n ticks has n + 1 rows."""
 
     t: np.ndarray
     """Time since the start of the flight [s]."""
     true: States
-    """True states, where the plant knows them; else the measured ones."""
+    """True states if the plant provides them; otherwise the measured ones."""
     measured: States
-    """What the pilot was shown."""
+    """Measured states, the input of the pilot."""
     u: np.ndarray
     """Command accepted for the tick that ended in each row: c [m/s^2], omega [rad/s]; hover in row 0."""
     dt: float
     """Control tick of the plant [s]."""
     terminated: bool
-    """The vehicle left the task's bounds; the flight ended there."""
+    """True if the vehicle left the bounds of the task, which ended the flight."""
     events: tuple[Event, ...] = ()
     age: np.ndarray | float = 0.0
-    """How old each row's measurement was [s]."""
+    """Age of the measurement in each row [s]."""
 
     @property
     def p(self) -> np.ndarray:
@@ -72,18 +72,18 @@ class Log(NamedTuple):
 
     @property
     def missed_ticks(self) -> int:
-        """Ticks for which there is no measurement, by the plant's clock."""
+        """Number of ticks without a measurement, by the clock of the plant."""
         return int(np.sum(np.maximum(np.round(np.diff(self.t) / self.dt).astype(int) - 1, 0)))
 
     def window(self, ticks: int, *, end: int | None = None) -> Window:
-        """Return what a learner saw: measured states, each with the command that *followed* it.
+        """Return the input of a learner: measured states, each with the command that *followed* it.
 
         Args:
             ticks: Length of the window.
-            end: Row after its last one; by default the window ends with the flight.
+            end: Row after the last row of the window; by default the window ends with the flight.
 
         Raises:
-            ValueError: The flight has no such rows.
+            ValueError: The flight does not have these rows.
         """
         last = len(self.t) - 1 if end is None else end
         if not 0 < ticks <= last < len(self.t):
@@ -103,7 +103,7 @@ class Recorder:
         self._events: list[Event] = []
 
     def measurement(self, measurement: Measurement, u: Command) -> None:
-        """Keep a measurement, and the command accepted for the tick that it ended."""
+        """Keep a measurement, and the command accepted for the tick that it ends."""
         self._rows.append((measurement.t, measurement.true_state, measurement.x, u, measurement.age))
 
     def event(self, event: Event) -> None:
@@ -111,7 +111,7 @@ class Recorder:
         self._events.append(event)
 
     def log(self, dt: float, *, terminated: bool) -> Log:
-        """Return what was recorded."""
+        """Return the recorded flight."""
         times, true, measured, commands, ages = zip(*self._rows, strict=True)
         t = np.array(times)
         u = np.stack([as_numpy(command) for command in commands])
@@ -128,22 +128,23 @@ def fly(
     observers: Sequence[Observer] = (),
     stop: threading.Event | None = None,
 ) -> Log:
-    """Fly a plant with a pilot. The plant is stopped whatever happens.
+    """Fly a plant with a pilot. The plant is always stopped at the end, also after an error.
 
     Args:
-        plant: What flies; its clock may start anywhere.
-        pilot: What decides.
-        x0: State in which the flight starts; None for where the vehicle is.
+        plant: The vehicle to fly; its clock may start at any time.
+        pilot: Source of the commands.
+        x0: State at the start of the flight; None for the present state of the vehicle.
         ticks: Length of the flight in ticks of the plant's clock; a missed tick counts.
-        terminated: Ends the flight early: a function of the time since its start [s] and of the true state.
-        observers: Receive every measurement and event.
-        stop: Set from another thread to give the flight up.
+        terminated: Function of the time since the start [s] and of the true state that returns whether to end the
+            flight early.
+        observers: They receive every measurement and event.
+        stop: Event that aborts the flight; set it from another thread.
 
     Returns:
-        The log, with one row more than ticks flown.
+        The log, with one more row than ticks.
 
     Raises:
-        ConfigError: Pilot and plant tick at different rates.
+        ConfigError: Pilot and plant have different control periods.
         PlantError: The plant refused a command or was lost.
         FlightStopped: ``stop`` was set.
     """

@@ -1,4 +1,4 @@
-"""What an adaptive pilot needs from a learner, in whichever clock or process it works."""
+"""Interface between an adaptive pilot and its learners, for any clock or process."""
 
 import abc
 
@@ -7,11 +7,11 @@ from ..learn.window import Window
 
 
 class Learner(abc.ABC):
-    """Takes windows of flight, gives updates. Messages go both ways; no call refers to the pilot."""
+    """Receives windows of flight and returns updates. It exchanges messages and never calls the pilot."""
 
     @abc.abstractmethod
     def submit(self, window: Window, tick: int) -> None:
-        """Offer a window; ``tick`` counts from the start of the flight. A learner that is busy notes a skip."""
+        """Offer a window; ``tick`` counts from the start of the flight. A learner that is busy records a skip."""
 
     @abc.abstractmethod
     def poll(self, tick: int) -> list[Update]:
@@ -19,8 +19,8 @@ class Learner(abc.ABC):
 
     @abc.abstractmethod
     def receive(self, update: Update) -> None:
-        """Take note of an update that the pilot has published, of this learner or another."""
+        """Receive an update that the pilot has published, from this learner or another one."""
 
     @abc.abstractmethod
     def reset(self) -> None:
-        """Drop what is under way: a new flight starts."""
+        """Drop the computation under way, since a new flight starts."""

@@ -1,7 +1,7 @@
-"""Learning on a virtual clock: what a live run does, but repeatable bit for bit.
+"""Learning on a virtual clock: equivalent to a live run, but repeatable bit for bit.
 
-Compute time is charged to flight time. A window that is submitted at a tick is learnt from at once; the result becomes
-visible only after the latency of the computation, as if the learner had worked beside the flight.
+Compute time is charged to flight time. The learner processes a window at the tick of its submission; the result becomes
+visible only after the latency of the computation, as if the learner had run in parallel with the flight.
 """
 
 import math
@@ -14,14 +14,14 @@ from .learner import Learner
 
 
 class LockstepLearner(Learner):
-    """One worker on the virtual clock: at most one window under way, whose update appears later."""
+    """One worker on the virtual clock, with at most one window under way, whose update becomes visible later."""
 
     def __init__(self, worker: Worker, latency_s: float | None, dt: float) -> None:
         """Build a learner.
 
         Args:
-            worker: What learns.
-            latency_s: Flight time from a window to its update [s]; None: as long as the worker takes by the clock.
+            worker: Worker that learns from the windows.
+            latency_s: Flight time from a window to its update [s]; None for the measured compute time of the worker.
             dt: Control tick [s]; latencies are rounded up to whole ticks.
         """
         self.worker, self.latency_s, self._dt = worker, latency_s, dt
@@ -29,7 +29,7 @@ class LockstepLearner(Learner):
         self._skipped: list[Update] = []
 
     def submit(self, window: Window, tick: int) -> None:
-        """Learn from ``window`` now; note a skip if the last update is not visible yet."""
+        """Learn from ``window`` now; record a skip if the last update is not visible yet."""
         if self._ready is not None:
             self._skipped.append(Skip(float(window.t[-1]), self.worker.layer))
             return
@@ -39,7 +39,7 @@ class LockstepLearner(Learner):
         self._ready = (tick + self.ticks(seconds), update)
 
     def ticks(self, seconds: float) -> int:
-        """Return after how many ticks the update of a computation that takes ``seconds`` is visible: at least one."""
+        """Return the number of ticks, at least one, until the update of a computation of ``seconds`` is visible."""
         return max(1, math.ceil(seconds / self._dt - 1e-6))
 
     def poll(self, tick: int) -> list[Update]:
@@ -54,5 +54,5 @@ class LockstepLearner(Learner):
         self.worker.receive(update)
 
     def reset(self) -> None:
-        """Drop what is under way."""
+        """Drop the update under way."""
         self._ready, self._skipped = None, []

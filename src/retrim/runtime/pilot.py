@@ -1,4 +1,4 @@
-"""Pilots: what decides the next command of a flight, tick by tick."""
+"""Pilots: they compute the command of a flight at each tick."""
 
 import abc
 from collections.abc import Callable
@@ -17,17 +17,17 @@ from .events import ROUNDING, Event
 
 
 class Pilot(abc.ABC):
-    """Flies one vehicle. It may hold whatever it needs to."""
+    """Flies one vehicle. A pilot may hold state."""
 
     dt: float | None = None
-    """Control period that it was made for [s]; None for any."""
+    """Control period for which the pilot was built [s]; None for any."""
 
     @abc.abstractmethod
     def reset(self, measurement: Measurement) -> None:
-        """Start a flight. What was learnt before stays; what was remembered of an earlier flight does not.
+        """Start a flight. Keep learned parameters, and drop the memory of earlier flights.
 
         Args:
-            measurement: The first one of the flight. Its time, by the plant's clock, is the flight's time zero.
+            measurement: First measurement of the flight. Its time, by the plant's clock, is time zero of the flight.
         """
 
     @abc.abstractmethod
@@ -35,31 +35,31 @@ class Pilot(abc.ABC):
         """Return the command for the next tick."""
 
     def warm_up(self, measurement: Measurement) -> None:
-        """Compile every program of a flight, before the first one: by a tick that nobody flies.
+        """Compile every program of a flight before the first flight, by one tick whose command is not used.
 
         Args:
-            measurement: Of any state of the vehicle.
+            measurement: Measurement of any state of the vehicle.
         """
         self.reset(measurement)
         self.act(measurement)
 
     def accepted(self, u: Command) -> None:
-        """Take note that the plant accepted ``u`` instead of the command that was issued last."""
+        """Receive the command ``u`` that the plant accepted instead of the last issued one."""
         del u
 
     def take_events(self) -> list[Event]:
-        """Return what happened since the last call, and forget it."""
+        """Return the events since the last call, and clear them."""
         return []
 
 
 class FunctionPilot(Pilot):
-    """Any function of the measurement as a pilot."""
+    """Pilot that calls a function of the measurement."""
 
     def __init__(self, function: Callable[[Measurement], Command]) -> None:
         self._function = function
 
     def reset(self, measurement: Measurement) -> None:
-        """Do nothing: a function remembers nothing."""
+        """Do not change anything, since a function has no memory."""
 
     def act(self, measurement: Measurement) -> Command:
         """Call the function."""
@@ -67,9 +67,9 @@ class FunctionPilot(Pilot):
 
 
 class ControllerPilot(Pilot):
-    """Any controller as a pilot. ``controller`` may be replaced in flight; its memory goes on.
+    """Pilot that calls a controller. ``controller`` may be replaced in flight; the new one takes over the memory.
 
-    Each change of the controller's stage is an event, and so is the vehicle that it has identified.
+    It issues an event for each change of the controller's stage and for the vehicle that the controller has identified.
     """
 
     def __init__(self, controller: AbstractController[Any]) -> None:
@@ -105,7 +105,7 @@ class ControllerPilot(Pilot):
         self._memory = self.controller.accepted(self._memory, u)
 
     def take_events(self) -> list[Event]:
-        """Return the changes of the controller's stage since the last call."""
+        """Return the events since the last call: changes of the controller's stage, and identified vehicles."""
         found, self._events = self._events, []
         return found
 

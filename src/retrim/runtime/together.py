@@ -1,4 +1,4 @@
-"""Many flights at once: a batch in step, the same flights as each flown alone with its own pilot."""
+"""Many flights at once, as a batch in step. The flights equal those of each pilot alone."""
 
 import threading
 from collections.abc import Callable, Sequence
@@ -19,9 +19,9 @@ from .pilot import ControllerPilot, Pilot
 
 
 def can_fly_together(plants: Sequence[Plant], pilots: Sequence[Pilot]) -> bool:
-    """Return whether flights can be one batch: simulated plants of one make, and pilots of one kind.
+    """Return whether flights can be one batch: simulated plants of one structure, and pilots of one kind.
 
-    Such pilots fly one kind of controller, or learn by one learner on the virtual clock, with fixed latencies.
+    Such pilots have controllers of one structure, or share one learner on the virtual clock, with fixed latencies.
     """
     simulations = [plant.simulation for plant in plants if type(plant) is SimPlant]
     interrupted = any(each.fault is not None and each.fault.interrupts for each in simulations)
@@ -46,19 +46,19 @@ def fly_together(
     stop: threading.Event | None = None,
     cold: bool = False,
 ) -> list[Log]:
-    """Fly a batch. Nothing terminates a flight; pilots that learn have learnt when it is over.
+    """Fly a batch. Flights never terminate early; afterwards, adaptive pilots hold their new learner states.
 
     Args:
         plants: One for each flight.
-        pilots: One for each flight; :func:`can_fly_together` said so.
+        pilots: One for each flight; :func:`can_fly_together` must be true for them.
         starts: States at the start.
         ticks: Length of the flights.
-        progress: Called now and then with the share that was flown.
-        stop: Set from another thread to give the flights up.
-        cold: No such batch was flown yet: programs of flight and of learning are compiled at the same time.
+        progress: Called from time to time with the completed share of the flights.
+        stop: Event that aborts the flights; set it from another thread.
+        cold: If true, this is the first such batch: compile the programs of flight and of learning at the same time.
 
     Returns:
-        A log for each flight, with one row more than ticks.
+        A log for each flight, with one more row than ticks.
 
     Raises:
         FlightStopped: ``stop`` was set.
@@ -79,7 +79,7 @@ def fly_together(
 
 
 def _alike(trees: Sequence[Any]) -> bool:
-    """Return whether trees can be stacked: the same structure, shapes and types, and all else equal."""
+    """Return whether trees can be stacked: equal structures, shapes, types and static parts."""
     kinds = [eqx.partition(tree, eqx.is_array) for tree in trees]
     shapes = [[(leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(arrays)] for arrays, _ in kinds]
     return all(bool(eqx.tree_equal(static, kinds[0][1])) for _, static in kinds) and all(s == shapes[0] for s in shapes)

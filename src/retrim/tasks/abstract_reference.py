@@ -1,4 +1,4 @@
-"""What follows a trajectory sees of it: a point at a time, how far it is, and how it looks in another frame."""
+"""Interface of a trajectory: a point at a time, the distance from it, and the trajectory in another frame."""
 
 import abc
 from typing import TYPE_CHECKING, NamedTuple
@@ -17,19 +17,19 @@ class Point(NamedTuple):
     """A reference at one instant."""
 
     p: Float[Array, "3"]
-    """World [m]."""
+    """Position, world [m]."""
     v: Float[Array, "3"]
-    """World [m/s]."""
+    """Velocity, world [m/s]."""
     u: Float[Array, "4"]
-    """Command that a point mass needs (differential flatness): c [m/s^2], body rates [rad/s]; hover at a jump."""
+    """Command for a point mass (differential flatness): c [m/s^2], body rates [rad/s]; hover at a jump."""
     heading: Float[Array, ""]
-    """[rad]"""
+    """Heading [rad]."""
     a: Float[Array, "3"]
-    """Acceleration, world [m/s^2]; zero where ``u`` is hover, as is what follows."""
+    """Acceleration, world [m/s^2]; this and the following fields are zero where ``u`` is hover."""
     jerk: Float[Array, "3"]
-    """World [m/s^3]."""
+    """Jerk, world [m/s^3]."""
     heading_rate: Float[Array, ""]
-    """[rad/s]"""
+    """Rate of the heading [rad/s]."""
 
 
 class AbstractReference(eqx.Module):
@@ -39,7 +39,7 @@ class AbstractReference(eqx.Module):
 
         @property
         def lap(self) -> Float[Array, "2"]:
-            """Start and end of the lap that repeats [s]; the same twice: the end is held."""
+            """Start and end of the lap that repeats [s]; two equal values if the end is held."""
 
         @property
         def joins(self) -> Float[Array, "m 2"]:
@@ -54,31 +54,31 @@ class AbstractReference(eqx.Module):
 
     @abc.abstractmethod
     def distance(self, p: Float[Array, "3"]) -> Float[Array, ""]:
-        """Return the cross-track error: from ``p`` to the nearest point of the lap, or of all without a lap [m]."""
+        """Return the cross-track error: from ``p`` to the nearest point of the lap, or of the whole trajectory [m]."""
 
     @abc.abstractmethod
     def in_frame(self, frame: FeltFrame) -> "AbstractReference":
-        """Return the same trajectory as it is in ``frame``."""
+        """Return the same trajectory in the coordinates of ``frame``."""
 
 
 class TurnedReference(AbstractReference):
-    """A reference in the frame of the gravity that a vehicle feels; its command is that of flatness there."""
+    """A reference in the frame of the effective gravity; its command follows from flatness in this frame."""
 
     reference: AbstractReference
     frame: FeltFrame
 
     @property
     def lap(self) -> Float[Array, "2"]:
-        """Times are the same in the frame [s]."""
+        """Lap of the reference [s]; times are the same in the frame."""
         return self.reference.lap
 
     @property
     def joins(self) -> Float[Array, "m 2"]:
-        """Times are the same in the frame [s]."""
+        """Spans of the reference [s]; times are the same in the frame."""
         return self.reference.joins
 
     def __call__(self, t: Float[Array, ""]) -> Point:
-        """Turn and scale the reference at ``t``; headings are about the vertical of the frame."""
+        """Return the turned and scaled reference at ``t``; headings are about the vertical of the frame."""
         here, vector = self.reference(t), self.frame.vector
         a, jerk = vector(here.a), vector(here.jerk)
         thrust = a + jnp.array([0.0, 0.0, STANDARD_GRAVITY], dtype=a.dtype)
@@ -90,5 +90,5 @@ class TurnedReference(AbstractReference):
         return self.frame.scale * self.reference.distance(so3.act(self.frame.Q.T, p) / self.frame.scale)
 
     def in_frame(self, frame: FeltFrame) -> "TurnedReference":
-        """Turn it once more."""
+        """Return the reference in another frame on top of this one."""
         return TurnedReference(self, frame)

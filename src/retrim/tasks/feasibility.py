@@ -1,4 +1,4 @@
-"""What of a trajectory a vehicle cannot fly, in words."""
+"""Description of the parts of a trajectory that a vehicle cannot fly."""
 
 import numpy as np
 
@@ -6,8 +6,8 @@ from ..physics.state import STANDARD_GRAVITY
 from ..physics.vehicle import Vehicle
 from .flatness import JUMP
 
-REST = 0.3  # [m/s]: a smaller velocity is within the noise with which flights start
-GAP = 0.02  # [m]: a lap whose ends are farther apart does not close
+REST = 0.3  # [m/s]; smaller velocities are within the noise at the start of flights
+GAP = 0.02  # [m]; a lap whose ends are farther apart does not close
 
 
 def unflyable(rows: np.ndarray, every: float, lap: tuple[float, float], vehicle: Vehicle) -> list[str]:
@@ -17,11 +17,11 @@ def unflyable(rows: np.ndarray, every: float, lap: tuple[float, float], vehicle:
         rows: Position [m], velocity [m/s], command [m/s^2, rad/s] and heading [rad] at each instant, as in
             :class:`retrim.tasks.Reference`.
         every: Time between rows [s].
-        lap: Start and end of the lap that repeats [s]; the same twice if the end is held.
-        vehicle: Vehicle that is to fly it.
+        lap: Start and end of the lap that repeats [s]; two equal values if the end is held.
+        vehicle: Vehicle that is to fly the table.
 
     Returns:
-        One sentence without a full stop for each reason; none if all of it can be flown.
+        One sentence without a full stop for each reason; empty if the vehicle can fly the whole table.
     """
     return [
         *_not_at_rest(rows, lap),
@@ -43,7 +43,7 @@ def _not_at_rest(rows: np.ndarray, lap: tuple[float, float]) -> list[str]:
 
 
 def _standing_alone(rows: np.ndarray, every: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the accelerations between rows [m/s^2], and which of them are jumps of velocity."""
+    """Return the accelerations between rows [m/s^2], and whether each is a jump of velocity."""
     accelerations = np.diff(rows[:, 3:6], axis=0) / every
     leaps = np.linalg.norm(accelerations, axis=1)
     k = np.arange(len(leaps))
@@ -69,12 +69,12 @@ def _open_lap(rows: np.ndarray, every: float, lap: tuple[float, float]) -> list[
     gap, leap = np.linalg.norm(rows[-1, :3] - first[:3]), np.linalg.norm(rows[-1, 3:6] - first[3:6])
     if gap > GAP:
         return [f"its lap does not close: its end is {gap:.2f} m from its start"]
-    slack = REST + 2.0 * np.linalg.norm(rows[k + 1, 3:6] - rows[k, 3:6])  # a corner at the seam lies within a row
+    slack = REST + 2.0 * np.linalg.norm(rows[k + 1, 3:6] - rows[k, 3:6])  # a corner at the seam is within a row
     return [f"its velocity jumps by {leap:.2f} m/s from lap to lap"] if leap > slack else []
 
 
 def beyond_limits(rows: np.ndarray, every: float, vehicle: Vehicle) -> list[str]:
-    """Return what of a table is beyond the thrust and the rates of a vehicle; see :func:`unflyable`."""
+    """Return the reasons why a table exceeds thrust and rates of a vehicle; see :func:`unflyable`."""
     found = list[str]()
     accelerations, alone = _standing_alone(rows, every)
     lift = np.where(alone, np.inf, accelerations[:, 2] + STANDARD_GRAVITY)

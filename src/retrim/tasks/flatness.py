@@ -10,13 +10,13 @@ from jaxtyping import Array, Float
 from ..physics.state import STANDARD_GRAVITY
 
 Path3 = Callable[[float], Sequence[float] | np.ndarray]
-"""Time since take-off [s] -> position x, y, z [m], and heading [rad] if there is a fourth number."""
+"""Time since take-off [s] -> position x, y, z [m], and heading [rad] as an optional fourth number."""
 
-JUMP = 30.0  # [m/s^2]: an acceleration beyond is a jump of velocity, which no command flies
-STEP = 1e-3  # [s], of the differences that give velocity and acceleration
-NO_THRUST = 1e-3  # [m/s^2]: a smaller thrust has no direction, and the attitude is undefined
+JUMP = 30.0  # [m/s^2]; a larger acceleration is a jump of velocity, which cannot be flown
+STEP = 1e-3  # [s], step of the differences for velocity and acceleration
+NO_THRUST = 1e-3  # [m/s^2]; for a smaller thrust the attitude is undefined
 UP = np.array([0.0, 0.0, STANDARD_GRAVITY])
-FULL_TURN = 2.0 * math.pi  # [rad]: headings that differ by it are the same
+FULL_TURN = 2.0 * math.pi  # [rad]; headings that differ by it are the same
 
 
 def flat_rows(path: Path3, times: np.ndarray, last: float) -> np.ndarray:
@@ -26,9 +26,9 @@ def flat_rows(path: Path3, times: np.ndarray, last: float) -> np.ndarray:
     thrust), the command is that of hover.
 
     Args:
-        path: Position, world [m], and heading [rad] if wanted, by time [s]; a heading may jump by whole turns.
-        times: When [s], shape (n,).
-        last: End of what may be evaluated [s]; infinite for a path that repeats.
+        path: Position, world [m], and optionally heading [rad], by time [s]; a heading may jump by whole turns.
+        times: Instants [s], shape (n,).
+        last: End of the range in which the path is defined [s]; infinite for a path that repeats.
 
     Returns:
         Eighteen numbers for each instant, shape (n, 18): position [m] and velocity [m/s] in the world frame, collective
@@ -37,7 +37,7 @@ def flat_rows(path: Path3, times: np.ndarray, last: float) -> np.ndarray:
         hover.
 
     Raises:
-        ValueError: The path does not give 3 or 4 finite numbers.
+        ValueError: The path does not return 3 or 4 finite numbers.
     """
     h = STEP
     here = _points(path, times)
@@ -47,7 +47,7 @@ def flat_rows(path: Path3, times: np.ndarray, last: float) -> np.ndarray:
     v = (around[3] - around[1])[:, :3] / (2.0 * h)
     accelerations = [(around[k + 1] - 2.0 * around[k] + around[k - 1])[:, :3] / h**2 for k in (1, 2, 3)]
     closer = (near[0] - 2.0 * around[2] + near[1])[:, :3] / (0.1 * h) ** 2
-    # A jump does not look the same from nearer.
+    # At a jump, the differences change with the step.
     jumps = np.max([np.linalg.norm(a - closer, axis=1) for a in accelerations], axis=0) > JUMP
     frames = [_attitudes(a, point[:, 3]) for a, point in zip(accelerations, around[1:4], strict=True)]
     (R_before, before), (R, now), (R_after, after) = frames
@@ -61,7 +61,7 @@ def flat_rows(path: Path3, times: np.ndarray, last: float) -> np.ndarray:
     turned = (around[3] - around[1])[:, 3:]
     heading_rate = (turned - FULL_TURN * np.round(turned / FULL_TURN)) / (2.0 * h)
     moving = np.where(defined, np.concatenate([accelerations[1], jerk, heading_rate], axis=1), 0.0)
-    # A table is interpolated, and a heading between two rows that differ by a turn would point anywhere.
+    # A table is interpolated, so a heading between two rows that differ by a turn would be arbitrary.
     return np.concatenate([here[:, :3], v, u, np.unwrap(here[:, 3:], axis=0), moving], axis=1)
 
 
@@ -72,9 +72,9 @@ def flat_command(
 
     Args:
         thrust: Mass-normalised thrust that it needs, a vector that is not zero and not horizontal [m/s^2].
-        jerk: Its rate [m/s^3].
-        heading: Where the nose points [rad].
-        heading_rate: Its rate [rad/s].
+        jerk: Rate of the thrust [m/s^3].
+        heading: Direction of the nose [rad].
+        heading_rate: Rate of the heading [rad/s].
 
     Returns:
         Collective thrust [m/s^2] and body rates [rad/s].
@@ -104,9 +104,9 @@ def _points(path: Path3, times: np.ndarray) -> np.ndarray:
 
 
 def _attitudes(a: np.ndarray, heading: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return body axes as columns: z along the thrust that each acceleration needs, x towards the heading.
+    """Return body axes as columns: z along the thrust for each acceleration, x towards the heading.
 
-    The second array says where they are defined.
+    The second array is true where they are defined.
     """
     thrust = np.linalg.norm(a + UP, axis=1)
     z = (a + UP) / np.maximum(thrust, NO_THRUST)[:, None]

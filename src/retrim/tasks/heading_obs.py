@@ -12,21 +12,21 @@ from ..physics.state import Command, State
 from .observation import AbstractObservation
 
 M = TypeVar("M")
-SMALLEST = 1e-6  # of the length of the heading; it is zero where the vehicle is upside down
+SMALLEST = 1e-6  # regularises the length of the heading, which is zero if the vehicle is upside down
 
 
 class HeadingObs(AbstractObservation[M]):
-    """Show the state turned about the vertical through ``origin``, so that the heading is zero.
+    """Turns the state about the vertical through ``origin``, so that the heading is zero.
 
-    Hover looks the same from every heading: thrust and body rates are commands in body axes, and the reward does not
-    depend on the heading. A policy that observes headings must learn each of them, and it oscillates at some headings
-    and rests at others. The heading is the twist of the attitude about the vertical, which is smooth up to a tilt of
+    Hover is the same for every heading: thrust and body rates are commands in body axes, and the reward does not depend
+    on the heading. A policy that observes headings must learn each of them, and it oscillates at some headings and
+    rests at others. The heading is the twist of the attitude about the vertical, which is smooth up to a tilt of
     180 degrees.
     """
 
     inner: AbstractObservation[M]
     origin: Float[Array, "3"]
-    """A point of the vertical, world [m]."""
+    """Point on the vertical, world [m]."""
 
     @property
     def size(self) -> int:
@@ -38,7 +38,7 @@ class HeadingObs(AbstractObservation[M]):
         return self.inner.init(self._turned(x))
 
     def __call__(self, memory: M, t: Float[Array, ""], x: State, last: Command) -> tuple[Float[Array, " o"], M]:
-        """Observe the turned state."""
+        """Return the observation of the turned state."""
         return self.inner(memory, t, self._turned(x), last)
 
     def in_frame(self, frame: FeltFrame) -> "HeadingObs[M]":

@@ -23,20 +23,20 @@ class AbstractHover(AbstractTask):
     """Fly to ``goal`` and stay. Subclasses differ in their reward.
 
     A vehicle farther than ``box`` [m] from the goal along any axis is terminated. The box is wide, since in a tight one
-    a strong disturbance ends every flight and leaves nothing to learn from.
+    a strong disturbance ends every flight before the learner has data.
     """
 
     goal: Float[Array, "3"]
-    """Where to hover, world [m]."""
+    """Hover position, world [m]."""
     observation: AbstractObservation[Any]
     box: Float[Array, ""]
-    """Half its side [m]."""
+    """Half the side of the box [m]."""
     heading: Float[Array, ""]
-    """Starts head within +- this angle of the x axis [rad]; pi for anywhere."""
+    """Largest angle between the heading of a start and the x axis [rad]; pi for any heading."""
     dt: float = eqx.field(static=True, default=0.02)
     horizon: int = eqx.field(static=True, default=150)
     in_flight: AbstractObservation[Any] | None = None
-    """Observation in flight, where it differs from that of training."""
+    """Observation in flight; None for that of training."""
 
     @property
     def observation_in_flight(self) -> AbstractObservation[Any]:
@@ -48,7 +48,7 @@ class AbstractHover(AbstractTask):
         return self.goal
 
     def target(self, t: Float[Array, ""]) -> Float[Array, "3"]:
-        """Return the goal, world [m]; a subclass may move it, and reward, bounds and error follow."""
+        """Return the goal, world [m]; a subclass may move it, and reward, bounds and error use the moved goal."""
         return self.goal
 
     def reset(self, key: Key[Array, ""]) -> Start:
@@ -60,7 +60,7 @@ class AbstractHover(AbstractTask):
         return Start(jnp.zeros_like(p[0]), State(p, R, 0.1 * random.normal(kv, (3,))))
 
     def terminated(self, t: Float[Array, ""], x: State) -> Bool[Array, ""]:
-        """Return whether the vehicle is outside the box, or its state not finite."""
+        """Return whether the vehicle is outside the box, or its state is not finite."""
         return ~within(self.box, x, self.target(t))
 
     def error(self, t: Float[Array, ""], x: State) -> Float[Array, ""]:
@@ -92,7 +92,7 @@ class Hover(AbstractHover):
 
 
 class L2Hover(AbstractHover):
-    """Hover with a reward that has a tip at the goal: the paper's is flat there and leaves an error of centimetres."""
+    """Hover with a tip of the reward at the goal; the paper's is flat there and leaves an error of centimetres."""
 
     def reward(self, t: Float[Array, ""], x: State, u: Command) -> Float[Array, ""]:
         """Return the paper's reward - 3 (sqrt(|p - goal|^2 + (1 cm)^2) - 1 cm)."""
@@ -101,7 +101,7 @@ class L2Hover(AbstractHover):
 
 
 class StiffHover(AbstractHover):
-    """Hover with a reward for stiffness: commands and velocity cost a tenth and a fifth of what the paper takes.
+    """Hover with a reward for stiffness: the costs of commands and velocity are a tenth and a fifth of the paper's.
 
     A stiff policy moves less under a push. It needs a model with the delay and the lag of the vehicle.
     """
@@ -116,7 +116,7 @@ class StiffHover(AbstractHover):
 
 
 def _printed(goal: Float[Array, "3"], x: State, u: Command) -> Float[Array, ""]:
-    """The paper's reward."""
+    """Return the paper's reward."""
     r_pos = -1.0 * huber(5.0 * (x.p - goal))
     r_vel = -0.1 * huber(x.v) - 0.1 * huber(u.omega)
     r_act = -0.5 * huber(u.vector() - Command.hover().vector())

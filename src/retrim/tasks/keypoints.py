@@ -20,11 +20,11 @@ from .observation import AbstractObservation
 Statistics = tuple[Float[Array, "70"], Float[Array, "70 70"]]
 """Mean and whitening matrix of pixels."""
 PATTERN = ((0.5, 0.5), (0.5, -0.5), (-0.5, -0.5), (-0.5, 0.5), (-0.5, 0.0), (0.0, 0.5), (0.5, 0.0))
-"""The points, relative to the one below the goal [m]: a square's corners and three mid-points of its sides."""
+"""Keypoints, relative to the point below the goal [m]: corners of a square and three mid-points of its sides."""
 BELOW = 1.0  # [m], from the goal to the ground
 FRAMES, COMMANDS = 5, 3
 FRAME_TIME = 0.06  # [s] between frames, as published
-FAR = 2.5  # pixels (normalised) farther than this from where they are at the goal are cut off there
+FAR = 2.5  # limit at which pixel coordinates (normalised) are clipped
 FEATURE_LIMIT = 5.0  # whitened features are clipped at this many standard deviations
 
 
@@ -32,19 +32,19 @@ class KeypointMemory(NamedTuple):
     """Memory of the observation."""
 
     frames: Float[Array, "depth 14"]
-    """Newest last."""
+    """Pixels of the last ticks, newest last."""
     commands: Float[Array, "3 4"]
     key: Key[Array, ""]
 
 
 class Keypoints(AbstractObservation[KeypointMemory]):
-    """o = [whitened pixels of five frames, which points are visible now, the last three commands]: 89 numbers.
+    """o = [whitened pixels of five frames, present visibility of the points, last three commands]: 89 numbers.
 
-    Every point is observed, wherever it is, as in the paper's code; :class:`retrim.tasks.OccludedKeypoints` is what a
-    camera can see of it.
+    Every point is observed at any position, as in the paper's code; :class:`retrim.tasks.OccludedKeypoints` uses only
+    the points that a camera can see.
 
-    ``noise`` is the standard deviation of a pixel coordinate [px]. It is drawn from a key that follows from the start,
-    so that roll-outs repeat.
+    ``noise`` is the standard deviation of a pixel coordinate [px]. It is drawn from a key that depends on the start, so
+    that roll-outs are repeatable.
     """
 
     camera: Camera
@@ -56,18 +56,18 @@ class Keypoints(AbstractObservation[KeypointMemory]):
     dt: float = eqx.field(static=True, default=0.02)
 
     def __check_init__(self) -> None:
-        """Raise ``ValueError`` if frames are no whole number of ticks apart."""
+        """Raise ``ValueError`` if the time between frames is not a whole number of ticks."""
         if abs(FRAME_TIME / self.dt - round(FRAME_TIME / self.dt)) > 1e-6:
             raise ValueError(f"Keypoints: dt = {self.dt} s must divide the frame time, {FRAME_TIME} s")
 
     @property
     def stride(self) -> int:
-        """Ticks between two frames."""
+        """Number of ticks between two frames."""
         return round(FRAME_TIME / self.dt)
 
     @property
     def depth(self) -> int:
-        """Ticks of pixels that are remembered."""
+        """Number of ticks of pixels in the memory."""
         return (FRAMES - 1) * self.stride + 1
 
     @classmethod
@@ -80,7 +80,7 @@ class Keypoints(AbstractObservation[KeypointMemory]):
         whitened: bool = True,
         dt: float = 0.02,
     ) -> "Keypoints":
-        """Build the observation, by default with pixels whitened over random short motions (always the same ones)."""
+        """Return the observation, by default with pixels whitened over random short motions (always the same ones)."""
         plain = cls(Camera.published(), goal, omega_max, jnp.array(noise), jnp.zeros(70), jnp.eye(70), dt)
         if not whitened:
             return plain
@@ -95,9 +95,9 @@ class Keypoints(AbstractObservation[KeypointMemory]):
         return 14 * FRAMES + 7 + 4 * COMMANDS
 
     def init(self, x: State) -> KeypointMemory:
-        """Return the memory of a vehicle that came in a straight line, without turning, under hover commands.
+        """Return the memory of a vehicle that has moved in a straight line, without turning, under hover commands.
 
-        It is that of a tick ago: the first call adds the frame of ``x``.
+        It is the memory of one tick ago, since the first call adds the frame of ``x``.
         """
         commands = jnp.zeros((COMMANDS, 4), dtype=x.p.dtype)
         before = State(x.p - self.dt * x.v, x.R, x.v)
@@ -113,11 +113,11 @@ class Keypoints(AbstractObservation[KeypointMemory]):
         return jax.vmap(frame)(ago)
 
     def at_rest(self, x: State) -> Float[Array, " o"]:
-        """Return what a camera without noise sees."""
+        """Return the observation at rest, without noise."""
         return AbstractObservation.at_rest(dataclasses.replace(self, noise=jnp.zeros_like(self.noise)), x)
 
     def in_frame(self, frame: FeltFrame) -> "Keypoints":
-        """Return what a camera would show in ``frame``, in which the ground is level."""
+        """Return the observation of a camera in ``frame``, in which the ground is level."""
         return dataclasses.replace(self, goal=frame.vector(self.goal))
 
     def stacked(self, frames: Float[Array, "depth 14"]) -> Float[Array, "70"]:
@@ -125,16 +125,16 @@ class Keypoints(AbstractObservation[KeypointMemory]):
         return frames[:: -self.stride].reshape(-1)
 
     def features(self, stacked: Float[Array, "70"]) -> Float[Array, "70"]:
-        """Return whitened frames, clipped where they fit no motion, as when points come into sight."""
+        """Return whitened frames, clipped where they do not fit any motion, such as when points come into sight."""
         return jnp.clip(self.whiten @ (stacked - self.mean), -FEATURE_LIMIT, FEATURE_LIMIT)
 
     def pixels(self, x: State) -> tuple[Float[Array, "7 2"], Bool[Array, " 7"]]:
-        """Return the projections of the points, clipped far outside the image, and which are visible."""
+        """Return the projections of the points, clipped far outside the image, and whether each is visible."""
         seen = jax.vmap(self.camera.project)(in_camera(x, self.ground()))
         return jnp.clip(seen.pixel, -FAR, FAR), seen.visible
 
     def ground(self) -> Float[Array, "7 3"]:
-        """Return the points, world [m]."""
+        """Return the keypoints on the ground, world [m]."""
         flat = jnp.array(PATTERN, dtype=self.goal.dtype)
         return self.goal[None] + jnp.concatenate([flat, jnp.full((7, 1), -BELOW, dtype=flat.dtype)], axis=1)
 
@@ -155,7 +155,7 @@ class Keypoints(AbstractObservation[KeypointMemory]):
         return (2.0 * self.noise / self.camera.size)[None] * random.normal(key, (7, 2), dtype)
 
     def command(self, scaled: Float[Array, "4"]) -> Command:
-        """Return the command that was remembered as ``scaled``."""
+        """Return the command of the scaled numbers ``scaled``."""
         return Command((scaled[0] + 1.0) * STANDARD_GRAVITY, scaled[1:] * self.omega_max)
 
     def scaled(self, u: Command) -> Float[Array, "4"]:
@@ -170,7 +170,7 @@ def key_of(x: State) -> Key[Array, ""]:
 
 @functools.cache
 def _whitening_at(goal: tuple[float, float, float], dt: float, x64: bool) -> Statistics:
-    """Motions of training never change: they are looked at once per process, goal, tick and precision."""
+    """Return the statistics of :func:`_whitening`, computed once per process, goal, tick and precision."""
     plain = Keypoints.of(jnp.array(goal, float), jnp.ones(3), whitened=False, dt=dt)
     found: Statistics = _whitening(plain)
     return found
@@ -183,7 +183,7 @@ def _whitening(plain: Keypoints) -> Statistics:
     frames = jax.vmap(lambda k: plain.stacked(plain.history(*NEAR.draw(k, plain.goal))))(keys)
     mean = jnp.mean(frames, axis=0)
     centred = frames - mean[None]
-    # symmetric: unique, so that a policy means the same on every machine; the floor is one pixel's variance
+    # The symmetric matrix is unique, so that a policy is the same on every machine; the floor is one pixel's variance.
     lam, V = jnp.linalg.eigh(centred.T @ centred / frames.shape[0])
     scale = (jnp.maximum(lam, 0.0) + 1e-5) ** -0.5
     return mean, (V * scale[None]) @ V.T

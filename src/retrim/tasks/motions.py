@@ -1,4 +1,4 @@
-"""Random motions near a goal, without a roll-out: what a camera may see before a policy has flown."""
+"""Random motions near a goal, without a roll-out: possible views of a camera before the first flight of a policy."""
 
 from typing import NamedTuple
 
@@ -13,11 +13,11 @@ class Motions(NamedTuple):
     """A distribution of states and body rates."""
 
     box: float
-    """Positions lie within this of the goal, per axis [m]."""
+    """Largest distance of positions from the goal, per axis [m]."""
     tilt: float
     """Standard deviation of the attitude about each axis [rad]."""
     turn: float
-    """Standard deviation of the heading, in addition [rad]."""
+    """Standard deviation of an additional heading [rad]."""
     speed: float
     """Standard deviation of the velocity, per axis [m/s]."""
     rates: float
@@ -34,8 +34,8 @@ class Motions(NamedTuple):
 
 
 NEAR = Motions(box=1.2, tilt=0.2, turn=0.4, speed=0.7, rates=1.0)
-"""As a policy that hovers moves."""
+"""Motions of a hovering policy."""
 WILD = Motions(box=1.5, tilt=0.5, turn=0.4, speed=2.0, rates=2.0)
-"""About as widely as a random policy moves, on whose flights the authors pretrain."""
+"""Motions about as wide as those of the random policy on whose flights the authors pretrain."""
 MOTIONS = {"near": NEAR, "wild": WILD}
-"""By the names that presets call them."""
+"""Motions by their names in presets."""

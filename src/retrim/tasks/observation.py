@@ -1,4 +1,4 @@
-"""Observations o = h(x). The same function serves roll-outs, evaluation and flight."""
+"""Observations o = h(x). Roll-outs, evaluation and flight use the same function."""
 
 import abc
 from typing import Generic, TypeVar
@@ -20,7 +20,7 @@ VELOCITY_SCALE = 5.0  # [m/s], the same
 
 
 class AbstractObservation(eqx.Module, Generic[M]):
-    """h(x) and what it must remember between ticks (``M``, of fixed shape)."""
+    """h(x) and its memory between ticks (``M``, of fixed shape)."""
 
     @property
     @abc.abstractmethod
@@ -33,10 +33,10 @@ class AbstractObservation(eqx.Module, Generic[M]):
 
     @abc.abstractmethod
     def __call__(self, memory: M, t: Float[Array, ""], x: State, last: Command) -> tuple[Float[Array, " o"], M]:
-        """Observe once; called at every tick.
+        """Return one observation; called at every tick.
 
         Args:
-            memory: What :meth:`init` or the last call returned.
+            memory: Result of :meth:`init` or of the last call.
             t: Time of the task [s].
             x: State.
             last: Command issued one tick ago.
@@ -46,21 +46,21 @@ class AbstractObservation(eqx.Module, Generic[M]):
         """
 
     def at_rest(self, x: State) -> Float[Array, " o"]:
-        """Return what a vehicle sees that has rested in ``x``; an observation with noise overrides it, to show none."""
+        """Return the observation of a vehicle at rest in ``x``; observations with noise override it to omit noise."""
         o, _ = self(self.init(x), jnp.zeros_like(x.p[0]), x, Command.hover(x.p.dtype))
         return o
 
     def with_belief(self, belief: PathBelief) -> "AbstractObservation[M]":
-        """Return the same observation of a vehicle of which more is known; by default the policy does not observe it.
+        """Return the same observation with a belief about the vehicle; by default the belief is not observed.
 
         Args:
-            belief: What is known of the command path.
+            belief: Belief about the command path.
         """
         del belief
         return self
 
     def with_actuators(self, actuators: ActuatorState) -> "AbstractObservation[M]":
-        """Return the same observation while thrust and rates act that no command says; by default it has none of them.
+        """Return the same observation with the present thrust and rates; by default they are not observed.
 
         Args:
             actuators: Present thrust and body rates.
@@ -72,7 +72,7 @@ class AbstractObservation(eqx.Module, Generic[M]):
         """Return the same observation for states and commands of ``frame``.
 
         Raises:
-            FrameError: It cannot be turned.
+            FrameError: The observation does not support other frames.
         """
         raise FrameError(f"{type(self).__name__} cannot be turned into another frame")
 

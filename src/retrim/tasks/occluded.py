@@ -1,4 +1,4 @@
-"""Observation in flight, from keypoints that a camera can see: some are out of the image, noisy, or missed."""
+"""Observation in flight, from keypoints in a camera image: some are outside the image, noisy, or missed."""
 
 import dataclasses
 from typing import NamedTuple
@@ -15,28 +15,28 @@ from ..physics.state import Command, State
 from .keypoints import COMMANDS, Keypoints, key_of
 from .observation import AbstractObservation
 
-LEAST_NOISE = 0.5  # [px], that the filter takes a camera to have
+LEAST_NOISE = 0.5  # [px], smallest noise that the filter assumes for a camera
 
 
 class OccludedMemory(NamedTuple):
     """Memory of the observation."""
 
     commands: Float[Array, "3 4"]
-    """Of the world, newest last."""
+    """Commands in the world frame, newest last."""
     pose: PoseFilter
     poses: State
-    """Poses of the last ticks, newest last, as they are known now."""
+    """Present estimates of the poses of the last ticks, newest last."""
     key: Key[Array, ""]
 
 
 class OccludedKeypoints(AbstractObservation[OccludedMemory]):
-    """The observation of :class:`Keypoints`, made of what a camera sees.
+    """The observation of :class:`Keypoints`, reconstructed from the image of a camera.
 
-    A point outside the image is not observed, and one inside is missed with probability ``dropout``. From the others
-    and the commands a filter estimates the pose; the policy is shown the picture that belongs to that estimate, and
-    what it is shown of the past follows each correction, so that a correction does not look like motion.
+    A point outside the image is not observed, and one inside is missed with probability ``dropout``. A filter estimates
+    the pose from the other points and the commands. The policy receives the image that belongs to the estimated pose.
+    Each correction also changes the past images, so that a correction does not look like motion.
 
-    It is for flight: no gradient passes through the filter.
+    Use it in flight only, since gradients do not pass through the filter.
     """
 
     full: Keypoints
@@ -44,14 +44,14 @@ class OccludedKeypoints(AbstractObservation[OccludedMemory]):
     dropout: Float[Array, ""]
     """Probability that a visible point is missed in a frame."""
     lag: Command | None = None
-    """Time constants of the actuators that the filter knows of [s]."""
+    """Time constants of the actuators in the filter [s]; None for actuators without lag."""
     frame: FeltFrame | None = None
-    """The picture is what a camera would show in this frame; the filter and ``full`` stay in the world."""
+    """Frame of the image of the observation; the filter and ``full`` remain in the world."""
     delay_ticks: int = eqx.field(static=True, default=0)
-    """Declared command delay of the plant [ticks]: the filter predicts under the command that acted."""
+    """Declared command delay of the plant [ticks]; the filter predicts with the command that acted."""
 
     def __check_init__(self) -> None:
-        """Raise ``ValueError`` if the delay outlasts the memory."""
+        """Raise ``ValueError`` if the delay is longer than the memory."""
         if not 0 <= self.delay_ticks <= COMMANDS:
             raise ValueError(f"OccludedKeypoints: delay_ticks = {self.delay_ticks} must be 0 to {COMMANDS}")
 
@@ -61,13 +61,13 @@ class OccludedKeypoints(AbstractObservation[OccludedMemory]):
         return self.full.size
 
     def in_frame(self, frame: FeltFrame) -> "OccludedKeypoints":
-        """Return what a camera would show in ``frame``, in which the ground is level."""
+        """Return the observation of a camera in ``frame``, in which the ground is level."""
         return dataclasses.replace(self, frame=frame)
 
     def init(self, x: State) -> OccludedMemory:
-        """Return the memory of a vehicle that came in a straight line, without turning, under hover commands.
+        """Return the memory of a vehicle that has moved in a straight line, without turning, under hover commands.
 
-        It is that of a tick ago: the first call adds the frame of ``x``.
+        It is the memory of one tick ago, since the first call adds the frame of ``x``.
         """
         key, k_pose = random.split(key_of(x))
         pose = PoseFilter.near(State(x.p - self.full.dt * x.v, x.R, x.v), k_pose)
@@ -107,7 +107,7 @@ class OccludedKeypoints(AbstractObservation[OccludedMemory]):
         return jnp.concatenate([features, visible[0].astype(features.dtype), commands.reshape(-1)])
 
     def _corrected(self, poses: State, prior: State, new: State) -> State:
-        """Return the poses of the past as the correction from ``prior`` to ``new`` moves them, and ``new``."""
+        """Return the past poses, moved by the correction from ``prior`` to ``new``, and ``new``."""
         turn, dp, dv = new.R @ prior.R.T, new.p - prior.p, new.v - prior.v
 
         def moved(x: State, ago: Float[Array, ""]) -> State:
@@ -118,5 +118,5 @@ class OccludedKeypoints(AbstractObservation[OccludedMemory]):
         return poses
 
     def _ago(self, x: State) -> Float[Array, " depth"]:
-        """Return how old the poses of the memory are, newest last [s]."""
+        """Return the ages of the poses in the memory, newest last [s]."""
         return self.full.dt * jnp.arange(self.full.depth - 1, -1, -1, dtype=x.p.dtype)

@@ -19,14 +19,15 @@ JERK_SCALE = 20.0  # [m/s^3]
 class Preview(AbstractObservation[Float[Array, "history 4"]]):
     """o = [p_ref(t + 0 ... 0.4 s) - p, v_ref(t, t + 0.2 s) - v, R, v, heading, last commands].
 
-    No absolute position: one policy can fly the same shape anywhere. Every entry is scaled to order one.
+    The observation does not contain the absolute position, so that one policy can fly the same shape anywhere. Every
+    entry is scaled to order one.
     """
 
     reference: AbstractReference
     omega_max: Float[Array, "3"]
     history: int = eqx.field(static=True, default=2)
     accelerations: tuple[float, ...] = eqx.field(static=True, default=())
-    """Also show the acceleration and jerk of the reference so far ahead [s]."""
+    """Times ahead at which acceleration and jerk of the reference are also observed [s]."""
 
     @property
     def size(self) -> int:
@@ -43,7 +44,7 @@ class Preview(AbstractObservation[Float[Array, "history 4"]]):
         """Return the reference relative to the vehicle, in world axes, with attitude, velocity and commands."""
         scaled = jnp.concatenate([(last.c / STANDARD_GRAVITY - 1.0)[None], last.omega / self.omega_max])
         memory = jnp.concatenate([memory, scaled[None]])[1:]
-        # All instants at once: each evaluation of a reference would be compiled anew.
+        # Evaluate all instants at once, since each separate evaluation of a reference would be compiled again.
         first, second = len(POSITIONS), len(POSITIONS) + len(VELOCITIES)
         ahead = jax.vmap(self.reference)(t + jnp.array((*POSITIONS, *VELOCITIES, *self.accelerations), dtype=t.dtype))
         heading = ahead.heading[0]
@@ -60,5 +61,5 @@ class Preview(AbstractObservation[Float[Array, "history 4"]]):
         return jnp.concatenate(seen), memory
 
     def in_frame(self, frame: FeltFrame) -> "Preview":
-        """Return the observation of the turned reference."""
+        """Return the observation of the reference in ``frame``."""
         return Preview(self.reference.in_frame(frame), self.omega_max, self.history, self.accelerations)

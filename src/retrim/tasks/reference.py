@@ -1,7 +1,7 @@
-"""Trajectories to track: position, velocity, heading and the command that flies them, as functions of time.
+"""Trajectories to track: position, velocity, heading and the required command, as functions of time.
 
-Every reference is a table of one type, so that a policy takes it as data: another trajectory never recompiles, and one
-policy can be trained over a family and fly a member that it never saw.
+Every reference is a table of one type, so that a policy takes it as data: another trajectory does not need another
+compilation, and a policy that was trained on a family can fly a member that was not in its training.
 """
 
 import math
@@ -21,18 +21,18 @@ from .abstract_reference import AbstractReference, Point, TurnedReference
 from .feasibility import unflyable
 from .flatness import STEP, Path3, flat_rows
 
-POINTS = 1024  # of a table
+POINTS = 1024  # number of rows of a table
 
 
 class Reference(AbstractReference):
     """A trajectory, sampled evenly; see :meth:`of`."""
 
     rows: Float[Array, "n 18"]
-    """As in :class:`Point`."""
+    """Rows with the fields of :class:`Point`."""
     every: Float[Array, ""]
     """Time between rows [s]."""
     lap: Float[Array, "2"]
-    """Start and end of the lap that repeats [s]; the same twice: the last row is held."""
+    """Start and end of the lap that repeats [s]; two equal values if the last row is held."""
     joins: Float[Array, "m 2"]
     """Spans of time in which a roll-out may start [s]; each is equally likely."""
     since: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros(()))
@@ -43,18 +43,18 @@ class Reference(AbstractReference):
         """Sample a path.
 
         Args:
-            path: Function of the time since take-off [s]: x, y, z, world [m], and the heading [rad] if it is not 0,
-                which may jump by whole turns. It is evaluated in [0, ``seconds``], and a few milliseconds beyond where
-                there is a lap.
-            seconds: Where the table ends [s].
-            lap: From here to the end the path repeats for ever [s]; None if the end is held.
-            points: Number of rows. References of as many rows share one compiled program.
+            path: Function of the time since take-off [s] that returns x, y, z, world [m], and the heading [rad] if it
+                is not 0, which may jump by whole turns. It is evaluated in [0, ``seconds``], and a few milliseconds
+                beyond if there is a lap.
+            seconds: End of the table [s].
+            lap: Start of the lap, which repeats from here to the end [s]; None if the end is held.
+            points: Number of rows. References with the same number of rows share one compiled program.
 
         Returns:
-            The table, with velocities and commands by differences of the path.
+            The table, with velocities and commands from differences of the path.
 
         Raises:
-            ValueError: The sizes cannot be; or the path is not 3 or 4 finite numbers, with the time.
+            ValueError: The sizes are invalid; or the path does not return 3 or 4 finite numbers, with the time.
         """
         if not (seconds > 0 and points >= 2 and (lap is None or 0 <= lap < seconds)):
             raise ValueError(f"Reference: seconds = {seconds}, lap = {lap}, points = {points} cannot be")
@@ -66,7 +66,7 @@ class Reference(AbstractReference):
         return cls(jnp.asarray(rows), jnp.array(times[1]), jnp.array(ends), jnp.array(joins))
 
     def __call__(self, t: Float[Array, ""]) -> Point:
-        """Return the reference at time ``t`` [s], linearly between rows; hover once the end is held."""
+        """Return the reference at time ``t`` [s], interpolated linearly between rows; hover once the end is held."""
         start, end = self.lap[0], self.lap[1]
         length = end - start
         folded = start + (t - start) % jnp.where(length > 0, length, 1.0)
@@ -83,7 +83,7 @@ class Reference(AbstractReference):
         return Point(row[:3], v, u, row[10], moving[:3], moving[3:6], moving[6])
 
     def distance(self, p: Float[Array, "3"]) -> Float[Array, ""]:
-        """Return the cross-track error: from ``p`` to the polygon of rows of the lap, or of all without a lap [m].
+        """Return the cross-track error: from ``p`` to the polygon of rows of the lap, or of all rows without a lap [m].
 
         Args:
             p: Position, world [m].
@@ -98,17 +98,17 @@ class Reference(AbstractReference):
         return jnp.min(jnp.where(on_lap, away, jnp.inf))
 
     def in_frame(self, frame: FeltFrame) -> TurnedReference:
-        """Return the trajectory as it is in ``frame``."""
+        """Return the trajectory in the coordinates of ``frame``."""
         return TurnedReference(self, frame)
 
     def infeasibility(self, vehicle: Vehicle) -> str | None:
-        """Return what the vehicle cannot fly of this, in words; None if it can fly all of it.
+        """Return the reasons why the vehicle cannot fly the reference, in words; None if it can fly all of it.
 
         Reasons are: a start or end at speed, jumps of velocity, a lap that does not close, thrust, falling faster than
         free fall, body rates, and positions below the ground.
 
         Args:
-            vehicle: Vehicle that is to fly it.
+            vehicle: Vehicle that is to fly the reference.
         """
         lap = (float(self.lap[0] - self.since), float(self.lap[1] - self.since))
         return "; ".join(unflyable(np.asarray(self.rows, dtype=float), float(self.every), lap, vehicle)) or None
@@ -123,10 +123,10 @@ def joined(references: Sequence[AbstractReference], *, seconds: float = 20.0, ev
         every: Time between rows [s].
 
     Returns:
-        A reference without a lap. A roll-out starts in any member, and never within 5 s of its end.
+        A reference without a lap. A roll-out starts in any member, but not within 5 s of its end.
 
     Raises:
-        ValueError: There is no member, or the time is too short.
+        ValueError: The family is empty, or the time is too short.
     """
     if not references or seconds < 6.0:
         raise ValueError(f"joined: {len(references)} references of {seconds} s; at least 1, of at least 6 s")
@@ -142,5 +142,5 @@ def joined(references: Sequence[AbstractReference], *, seconds: float = 20.0, ev
 @eqx.filter_jit
 def _sampled(reference: AbstractReference, times: Float[Array, " n"]) -> Float[Array, "n 18"]:
     points = jax.vmap(reference)(times)
-    points = points._replace(heading=jnp.unwrap(points.heading))  # from lap to lap it may jump by whole turns
+    points = points._replace(heading=jnp.unwrap(points.heading))  # it may jump by whole turns between laps
     return jnp.concatenate([leaf.reshape(times.shape[0], -1) for leaf in points], axis=1)

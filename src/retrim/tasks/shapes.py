@@ -5,16 +5,16 @@ from collections.abc import Callable
 
 from .reference import Reference
 
-RAMP = 3.0  # [s], of a smooth start
-SIDEWAYS = 12.0  # [m/s^2]: shapes flown at a chosen speed grow until they need no more
+RAMP = 3.0  # [s], duration of a smooth start
+SIDEWAYS = 12.0  # [m/s^2], largest acceleration of shapes at a chosen speed, which are enlarged to satisfy it
 
 
 def smooth_start(t: float, ramp: float = RAMP) -> float:
-    """Slow the time along a lap so that it starts from rest (7th-order smooth step).
+    """Return the time along a lap that starts smoothly from rest (7th-order smooth step).
 
     Args:
         t: Time since take-off [s].
-        ramp: Time until the lap is flown at its own speed [s].
+        ramp: Time until the lap has its full speed [s].
 
     Returns:
         Time along the lap [s]; from ``ramp`` on it is ``t - ramp / 2``.
@@ -57,7 +57,7 @@ def figure8(length: float = 3.0, width: float = 1.0, period: float = 5.0, ramp: 
 
 
 def star(radius: float = 1.0, period: float = 6.0, ramp: float = RAMP) -> Reference:
-    """Return a horizontal pentagram about (radius, 0, 1), from (0, 0, 1), at constant speed once it is spun up.
+    """Return a horizontal pentagram about (radius, 0, 1), from (0, 0, 1), at constant speed after the smooth start.
 
     Args:
         radius: Circumradius [m].
@@ -77,7 +77,7 @@ def star(radius: float = 1.0, period: float = 6.0, ramp: float = RAMP) -> Refere
 
 
 def lissajous(period: float = 5.5, ramp: float = RAMP) -> Reference:
-    """Return a horizontal figure-8 of 2 m x 1 m from (0, 0, 1), the size that RAPTOR was flown at (5.5 s, 10 s).
+    """Return a horizontal figure-8 of 2 m x 1 m from (0, 0, 1), the size in the flights of RAPTOR (5.5 s, 10 s).
 
     Args:
         period: Time of a lap [s].
@@ -87,13 +87,13 @@ def lissajous(period: float = 5.5, ramp: float = RAMP) -> Reference:
 
 
 def circle_at(speed: float) -> Reference:
-    """Return the circle, flown at ``speed`` [m/s]; it is as large as the vehicle's acceleration needs."""
+    """Return the circle at ``speed`` [m/s]; its radius grows to limit the acceleration of the vehicle."""
     radius = max(1.0, speed**2 / SIDEWAYS)
     return circle(radius, 2.0 * math.pi * radius / speed, ramp=max(RAMP, speed))
 
 
 def figure8_at(speed: float, length: float = 3.0, width: float = 1.0) -> Reference:
-    """Return a figure-8 with a top speed; it grows until the vehicle's acceleration suffices.
+    """Return a figure-8 with a top speed; its size grows to limit the acceleration of the vehicle.
 
     Args:
         speed: Top speed [m/s].
@@ -109,12 +109,12 @@ def figure8_at(speed: float, length: float = 3.0, width: float = 1.0) -> Referen
 
 
 def lissajous_at(speed: float) -> Reference:
-    """Return :func:`lissajous` with a top speed of ``speed`` [m/s]; it grows as :func:`figure8_at` does."""
+    """Return :func:`lissajous` with a top speed of ``speed`` [m/s]; its size grows as in :func:`figure8_at`."""
     return figure8_at(speed, 2.0, 1.0)
 
 
 def star_at(speed: float) -> Reference:
-    """Return the star of 1 m, flown at ``speed`` [m/s], through its corners, too."""
+    """Return the star of 1 m at ``speed`` [m/s], also through its corners."""
     edge = 2.0 * math.sin(math.radians(72.0))
     return star(1.0, 5.0 * edge / speed)
 
@@ -125,12 +125,12 @@ REFERENCES: dict[str, Callable[[], Reference]] = {
     "lissajous": lissajous,
     "star": star,
 }
-"""What makes each built-in trajectory, by name."""
+"""Factories of the built-in trajectories, by name."""
 AT_SPEED: dict[str, Callable[[float], Reference]] = {
     "circle": circle_at,
     "figure8": figure8_at,
     "lissajous": lissajous_at,
     "star": star_at,
 }
-"""What makes it with a top speed [m/s]."""
+"""Factories of the built-in trajectories with a given top speed [m/s], by name."""
 FASTEST = 20.0  # [m/s]

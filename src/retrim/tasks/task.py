@@ -1,4 +1,4 @@
-"""A task: where it starts, what it rewards, when it ends, and how its error is measured."""
+"""A task: its starts, reward, termination and error."""
 
 import abc
 from typing import TYPE_CHECKING, Any
@@ -17,13 +17,13 @@ from .observation import AbstractObservation
 
 
 class Start(eqx.Module):
-    """Where and when a roll-out starts."""
+    """State and time at the start of a roll-out."""
 
     t: Float[Array, ""]
-    """Time of the task [s]: a reference may be joined anywhere."""
+    """Time of the task [s], since a roll-out may join a reference at any time."""
     x: State
     member: Member | None = None
-    """Vehicle that flies, and what its policy knows of it; None for the vehicle of the model."""
+    """Vehicle of the roll-out, and the belief of its policy about it; None for the vehicle of the model."""
 
 
 class AbstractTask(eqx.Module):
@@ -37,11 +37,11 @@ class AbstractTask(eqx.Module):
 
         @property
         def horizon(self) -> int:
-            """Ticks of one training roll-out; static."""
+            """Number of ticks of one training roll-out; static."""
 
         @property
         def observation(self) -> AbstractObservation[Any]:
-            """h(x), the observation of training."""
+            """Observation h(x) of training."""
     else:
         dt: eqx.AbstractVar[float]
         horizon: eqx.AbstractVar[int]
@@ -49,7 +49,7 @@ class AbstractTask(eqx.Module):
 
     @property
     def observation_in_flight(self) -> AbstractObservation[Any]:
-        """Observation used in flight; that of training unless a task says otherwise."""
+        """Observation used in flight; by default that of training."""
         return self.observation
 
     @property
@@ -64,7 +64,7 @@ class AbstractTask(eqx.Module):
 
     @property
     def steady_seconds(self) -> float:
-        """A flight is scored by its mean error over this long at its end [s]."""
+        """Length of the final part of a flight over which its error is averaged as its score [s]."""
         return 2.0
 
     @abc.abstractmethod
@@ -72,11 +72,11 @@ class AbstractTask(eqx.Module):
         """Return the position around which flights start, world [m]."""
 
     def target(self, t: Float[Array, ""]) -> Float[Array, "3"]:
-        """Return where the vehicle should be at time ``t`` [s], world [m]."""
+        """Return the target position of the vehicle at time ``t`` [s], world [m]."""
         return self.home()
 
     def wanted(self, t: Float[Array, ""]) -> Point:
-        """Return the reference at time ``t`` [s], for controllers that follow one: here, rest at the target."""
+        """Return the reference at time ``t`` [s], for controllers that follow one; by default rest at the target."""
         p = self.target(t)
         rest, none = jnp.zeros_like(p), jnp.zeros_like(p[0])
         hover = jnp.zeros(4, dtype=p.dtype).at[0].set(STANDARD_GRAVITY)
@@ -102,23 +102,23 @@ class AbstractTask(eqx.Module):
 
     @abc.abstractmethod
     def error(self, t: Float[Array, ""], x: State) -> Float[Array, ""]:
-        """Return the distance from where the vehicle should be [m]."""
+        """Return the distance from the target position [m]."""
 
     def in_frame(self, frame: FeltFrame) -> "AbstractTask":
         """Return the same task for states and commands of ``frame``.
 
         Raises:
-            FrameError: It cannot be turned.
+            FrameError: The task does not support other frames.
         """
         raise FrameError(f"{type(self).__name__} cannot be turned into another frame")
 
     def cross_track(self, x: State) -> Float[Array, ""] | None:
-        """Return the distance from the nearest point of the reference [m]; None for a task without one."""
+        """Return the distance from the nearest point of the reference [m]; None for a task without a reference."""
         return None
 
 
 def within(box: Float[Array, ""], x: State, centre: Float[Array, "3"]) -> Bool[Array, ""]:
-    """Return whether ``x`` is finite, and no farther than ``box`` [m] from ``centre`` (world) along any axis."""
+    """Return whether ``x`` is finite, and at most ``box`` [m] from ``centre`` (world) along every axis."""
     finite = jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(x)])
     inside: Bool[Array, ""] = jnp.all(jnp.abs(x.p - centre) <= box) & jnp.all(finite)
     return inside
@@ -127,8 +127,8 @@ def within(box: Float[Array, ""], x: State, centre: Float[Array, "3"]) -> Bool[A
 def huber(y: Float[Array, " n"]) -> Float[Array, ""]:
     """Return the Huber loss with threshold 1 of the 2-norm of ``y``: |y|^2 / 2 up to 1, |y| - 1/2 beyond.
 
-    The paper says "the Huber loss" of a vector and leaves open whether of its norm or of each component; the norm does
-    not depend on the choice of axes. Exact, with an exact gradient, at zero.
+    The paper uses "the Huber loss" of a vector and leaves open whether it applies to the norm or to each component; the
+    norm does not depend on the choice of axes. Value and gradient are exact at zero.
     """
     squared = jnp.sum(y * y)
     inside = squared <= 1.0

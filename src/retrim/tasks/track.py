@@ -20,7 +20,7 @@ NOISE = 0.1 * math.pi  # [rad]
 
 
 class AbstractTrack(AbstractTask):
-    """Be where the reference is, when it is there; subclasses differ in their reward.
+    """Follow a reference in space and time; subclasses differ in their reward.
 
     A vehicle farther than ``box`` [m] from the reference along an axis is terminated.
     """
@@ -28,14 +28,14 @@ class AbstractTrack(AbstractTask):
     reference: AbstractReference
     observation: AbstractObservation[Any]
     spread: Float[Array, ""]
-    """Starts lie within +- this of the reference along each axis [m]."""
+    """Largest distance of starts from the reference along each axis [m]."""
     box: Float[Array, ""]
     """Half the side of the box that moves with the reference [m]."""
     dt: float = eqx.field(static=True, default=0.02)
     horizon: int = eqx.field(static=True, default=150)
 
     def reset(self, key: Key[Array, ""]) -> Start:
-        """Draw a start anywhere on the reference, within the spread of it, 0.3 m/s and 18 degrees."""
+        """Draw a start at any time of the reference, with a deviation of ``spread``, 0.3 m/s and 18 degrees."""
         k_join, k_time, kp, ka, kv = random.split(key, 5)
         joins = self.reference.joins
         span = joins[random.randint(k_join, (), 0, joins.shape[0])]
@@ -52,13 +52,13 @@ class AbstractTrack(AbstractTask):
 
     @property
     def flight_seconds(self) -> float:
-        """Default length of a flight [s]: the paper's; less where the reference does not repeat and ends earlier."""
+        """Default length of a flight [s]: that of the paper, or less if the reference ends earlier without a lap."""
         start, end = (round(float(t), 3) for t in self.reference.lap)
         return 60.0 if start < end else min(60.0, max(end, 3.0))
 
     @property
     def steady_seconds(self) -> float:
-        """A flight is scored by its mean error over this long at its end [s]."""
+        """Length of the final part of a flight over which its error is averaged as its score [s]."""
         return 10.0
 
     def home(self) -> Float[Array, "3"]:
@@ -66,7 +66,7 @@ class AbstractTrack(AbstractTask):
         return _start(self.reference)
 
     def target(self, t: Float[Array, ""]) -> Float[Array, "3"]:
-        """Return where the reference is at time ``t`` [s], world [m]."""
+        """Return the position of the reference at time ``t`` [s], world [m]."""
         return self.reference(t).p
 
     def wanted(self, t: Float[Array, ""]) -> Point:
@@ -74,11 +74,11 @@ class AbstractTrack(AbstractTask):
         return self.reference(t)
 
     def terminated(self, t: Float[Array, ""], x: State) -> Bool[Array, ""]:
-        """Return whether the vehicle is outside the box around the reference, or its state not finite."""
+        """Return whether the vehicle is outside the box around the reference, or its state is not finite."""
         return ~within(self.box, x, self.reference(t).p)
 
     def error(self, t: Float[Array, ""], x: State) -> Float[Array, ""]:
-        """Return the distance from where the reference is at ``t`` [m]."""
+        """Return the distance from the position of the reference at ``t`` [m]."""
         return jnp.sqrt(jnp.sum((x.p - self.reference(t).p) ** 2))
 
     def cross_track(self, x: State) -> Float[Array, ""]:
@@ -86,7 +86,7 @@ class AbstractTrack(AbstractTask):
         return self.reference.distance(x.p)
 
     def in_frame(self, frame: FeltFrame) -> "AbstractTrack":
-        """Return tracking of the turned reference."""
+        """Return the task with the reference in ``frame``."""
         observation = self.observation.in_frame(frame)
         return dataclasses.replace(self, reference=self.reference.in_frame(frame), observation=observation)
 
@@ -108,7 +108,7 @@ class Track(AbstractTrack):
 class L2Track(AbstractTrack):
     """Tracking with a reward five times as steep in position, around the reference's own command.
 
-    The paper's trades centimetres for tilt, even without any disturbance.
+    The paper's reward trades centimetres for tilt, even without a disturbance.
     """
 
     def reward(self, t: Float[Array, ""], x: State, u: Command) -> Float[Array, ""]:
@@ -122,10 +122,10 @@ class L2Track(AbstractTrack):
 
 
 class SharpTrack(L2Track):
-    """Tracking with a reward that also has a tip at the reference: what is quadratic is flat near zero."""
+    """Tracking with a reward that also has a tip at the reference, since a quadratic reward is flat near zero."""
 
     def reward(self, t: Float[Array, ""], x: State, u: Command) -> Float[Array, ""]:
-        """Return that of :class:`L2Track` - 3 (sqrt(|p - p_ref|^2 + (1 cm)^2) - 1 cm)."""
+        """Return the reward of :class:`L2Track` - 3 (sqrt(|p - p_ref|^2 + (1 cm)^2) - 1 cm)."""
         here = self.reference(t)
         tip = jnp.sqrt(jnp.sum((x.p - here.p) ** 2) + 0.01**2) - 0.01
         return self._reward(here, x, u) - 3.0 * tip

@@ -1,7 +1,7 @@
 """Observations of a tracking policy that contain the tracking error: state-based tracking as in the paper.
 
-The paper prints o = [p, R, v] for hover and tracking alike. Read literally for tracking, the policy has no information
-about the phase of its reference (the observation ``blind``). The two classes here are the other readings.
+The paper prints o = [p, R, v] for both hover and tracking. Read literally for tracking, the policy does not have
+information about the phase of its reference (the observation ``blind``). The two classes here are the other readings.
 """
 
 import equinox as eqx
@@ -17,7 +17,7 @@ from .observation import POSITION_SCALE, VELOCITY_SCALE, AbstractObservation, St
 class RelativeObs(AbstractObservation[Float[Array, "history 4"]]):
     """o = [p - p_ref(t), R, v - v_ref(t)] and the last ``history`` commands: 15 + 4 ``history`` numbers.
 
-    The policy knows its error and cannot know where on the reference it is, so it cannot anticipate.
+    The policy observes its error, but not its position on the reference, so it cannot anticipate.
     """
 
     reference: AbstractReference
@@ -46,15 +46,15 @@ class RelativeObs(AbstractObservation[Float[Array, "history 4"]]):
         return StateObs(jnp.zeros_like(self.omega_max), self.omega_max, self.history)
 
     def in_frame(self, frame: FeltFrame) -> "RelativeObs":
-        """Return the observation relative to the turned reference."""
+        """Return the observation relative to the reference in ``frame``."""
         return RelativeObs(self.reference.in_frame(frame), self.omega_max, self.history)
 
 
 class StateAndErrorObs(AbstractObservation[Float[Array, "history 4"]]):
     """o = [p, R, v, the last ``history`` commands, p - p_ref(t), v - v_ref(t)]: 21 + 4 ``history`` numbers.
 
-    Position, velocity and error together tell the policy where on its reference it is. It can learn one reference by
-    heart and anticipate its corners; a reference that crosses itself is told apart by the velocity.
+    Position, velocity and error together determine the position on the reference. The policy can memorise one reference
+    and anticipate its corners; the velocity resolves the ambiguity of a reference that crosses itself.
     """
 
     reference: AbstractReference
@@ -78,5 +78,5 @@ class StateAndErrorObs(AbstractObservation[Float[Array, "history 4"]]):
         return jnp.concatenate([seen, (x.p - here.p) / POSITION_SCALE, (x.v - here.v) / VELOCITY_SCALE]), memory
 
     def in_frame(self, frame: FeltFrame) -> "StateAndErrorObs":
-        """Return the observation of the turned reference."""
+        """Return the observation of the reference in ``frame``."""
         return StateAndErrorObs(self.reference.in_frame(frame), self.state.in_frame(frame))

@@ -1,4 +1,4 @@
-"""Text files of a trajectory: separators, comments, header, numbers; every fault is named with its line."""
+"""Text files of a trajectory: separators, comments, header, numbers; errors contain the line of the fault."""
 
 import csv
 import math
@@ -19,7 +19,7 @@ LEFT_OUT = re.compile(
     r"|(?:v|vel|velocity|a|acc|accel|acceleration|a_lin|a_rot|j|jerk|s|snap|w|omega|rates?|alpha|tau|torque)[_.]?[xyz]"
     r"|(?:q|quat|orientation)[_.]?[wxyz]|q[0-3]|u[_.]?\d|thrust|roll|pitch|yaw_?(?:rate|dot)|d?heading_?rate"
 )
-"""Columns that the positions and the yaw determine, by their usual names, and those whose name begins with _."""
+"""Usual names of columns that the positions and the yaw determine, and names that begin with _."""
 UNITS = {
     "t": ("s", "sec", "second", "seconds"),
     **dict.fromkeys("xyz", ("m", "meter", "meters", "metre", "metres")),
@@ -27,30 +27,31 @@ UNITS = {
 }
 MAX_BYTES = 32 * 2**20
 FARTHEST = 1000.0  # [m]
-LARGEST_YAW = 2.0 * math.pi + 0.1  # [rad]: what is beyond looks like degrees
+LARGEST_YAW = 2.0 * math.pi + 0.1  # [rad]; larger values look like degrees
 LONGEST = 600.0  # [s]
 FASTEST = 100.0  # [m/s] between points
-SAME_TIME, SAME_PLACE, SAME_YAW = 1e-6, 1e-3, 0.02  # [s], [m], [rad]: a point that is nearer to the last repeats it
-SLOWEST = 0.02  # [m/s]: a vehicle of 20 m/s whose times are in ms seems to be slower
+SAME_TIME, SAME_PLACE, SAME_YAW = 1e-6, 1e-3, 0.02  # [s], [m], [rad]; a point within these of the last repeats it
+SLOWEST = 0.02  # [m/s]; a vehicle of up to 20 m/s whose times are in ms seems to be slower
 
 
 def read_table(file: Path) -> np.ndarray:
     """Read the points of a trajectory file.
 
     Args:
-        file: UTF-8 text with one point a line. Columns are separated by comma, semicolon, tab or spaces; ``#`` starts a
-            comment; blank lines, quotes and separators at the end of a line do not count. A header names the columns,
-            in any order: t (time, timestamp), x, y, z (p_x, pos_x, position.x), yaw (heading, psi), with units in
-            brackets or without. Columns of velocities, accelerations, quaternions, rates and thrusts by their usual
-            names, and columns whose name begins with ``_``, are not read: the positions determine them. Without a
-            header the order is t, x, y, z[, yaw]. A comment of column names before the first point is a header, too. A
-            point that repeats the one before, as where two segments meet, is left out.
+        file: UTF-8 text with one point per line. Columns are separated by comma, semicolon, tab or spaces; ``#`` starts
+            a comment; blank lines, quotes and separators at the end of a line are ignored. A header names the columns,
+            in any order: t (time, timestamp), x, y, z (p_x, pos_x, position.x), yaw (heading, psi), with or without
+            units in brackets. Columns of velocities, accelerations, quaternions, rates and thrusts by their usual
+            names, and columns whose name begins with ``_``, are not read, since the positions determine them. Without a
+            header the order is t, x, y, z[, yaw]. A comment of column names before the first point is also a header. A
+            point that repeats the one before, for example where two segments meet, is left out.
 
     Returns:
-        One row a point: time since the first point [s], x, y, z, world [m], and yaw [rad], unwrapped; 0 without yaw.
+        One row per point: time since the first point [s], x, y, z, world [m], and unwrapped yaw [rad]; 0 without yaw.
 
     Raises:
-        ConfigError: The file cannot be read as that, with the line; times do not rise; or values are not plausible.
+        ConfigError: The file does not have this format, with the line; times do not increase; or values are not
+            plausible.
         OSError: The file cannot be opened.
     """
     if file.exists() and not file.is_file():
@@ -94,14 +95,14 @@ def read_table(file: Path) -> np.ndarray:
 
 
 def _repeats(point: list[float], last: list[float]) -> bool:
-    """Return whether a point has the time, the place and the heading of the last."""
+    """Return whether a point has the time, the position and the heading of the last one."""
     turned = math.remainder(point[4] - last[4], 2.0 * math.pi) if len(point) > 4 else 0.0
     near = math.dist(point[1:4], last[1:4]) <= SAME_PLACE and abs(turned) <= SAME_YAW
     return near and abs(point[0] - last[0]) <= SAME_TIME
 
 
 def _lines(text: str) -> Iterator[tuple[int, str, bool]]:
-    """Yield number and content of every line that has any, and whether all of it is a comment."""
+    """Yield number and content of every line that is not blank, and whether the whole line is a comment."""
     for number, line in enumerate(text.splitlines(), start=1):
         content, _, comment = line.partition("#")
         if content.strip():
@@ -111,7 +112,7 @@ def _lines(text: str) -> Iterator[tuple[int, str, bool]]:
 
 
 def _words(line: str) -> list[str]:
-    """Split a line at its separator: a tab, semicolon or comma if there is one, else spaces.
+    """Split a line at its separator: a tab, semicolon or comma if it contains one, otherwise spaces.
 
     Raises:
         ConfigError: A quoted field is too long to be a number.
@@ -129,10 +130,10 @@ def _words(line: str) -> list[str]:
 
 
 def _header(words: list[str], *, comment: bool) -> list[str] | None:
-    """Return the columns that a header names; None if the line is no header.
+    """Return the columns that a header names; None if the line is not a header.
 
     Raises:
-        ConfigError: It names what is not expected, or not all that is needed.
+        ConfigError: The header contains an unexpected column, or lacks a required one.
     """
     if not words or any(_number(word) is not None for word in words):
         return None
@@ -167,10 +168,10 @@ def _number(word: str) -> float | None:
 
 
 def _point(words: list[str], columns: list[str]) -> list[float]:
-    """Return t, x, y, z and, if there is one, yaw.
+    """Return t, x, y, z and, if there is a column for it, yaw.
 
     Raises:
-        ConfigError: They are not that many plausible numbers.
+        ConfigError: The words are not the expected number of plausible numbers.
     """
     shown = ", ".join(words) if len(words) <= 6 else ", ".join(words[:6]) + ", ..."
     if len(words) != len(columns):

@@ -1,4 +1,4 @@
-"""From one reference to another in flight, without a jump of position, velocity, acceleration or jerk."""
+"""Transition from one reference to another in flight, without jumps of position, velocity, acceleration or jerk."""
 
 from collections.abc import Sequence
 
@@ -16,24 +16,24 @@ from .feasibility import beyond_limits
 from .flatness import FULL_TURN, flat_command
 from .reference import Reference
 
-BEFORE = 1.0  # [s] of the old reference in the table of a transition
-LASTING = (2.0, 3.0, 4.0, 6.0, 8.0)  # [s], of which the first is taken that the vehicle can fly
+BEFORE = 1.0  # [s], part of the old reference in the table of a transition
+LASTING = (2.0, 3.0, 4.0, 6.0, 8.0)  # [s], possible durations; the first one that the vehicle can fly is used
 
 
 def transition_between(old: Reference, new: Reference, at: float, vehicle: Vehicle) -> Reference:
-    """Return the reference that is ``old`` until a time, goes over to ``new``, and stays that.
+    """Return a reference that equals ``old`` until ``at``, then changes to ``new`` and remains there.
 
-    ``new`` begins at ``at``, from rest, while its share grows by a 7th-order smooth step: as slowly as it takes for the
-    vehicle to fly it, but within eight seconds.
+    ``new`` begins at ``at``, from rest, while its share grows by a 7th-order smooth step. The step is slow enough for
+    the vehicle to fly it, but lasts at most eight seconds.
 
     Args:
-        old: What is followed before.
-        new: What is followed afterwards; its table begins at 0 s.
-        at: When the transition begins [s].
-        vehicle: Vehicle that flies.
+        old: Reference before the transition.
+        new: Reference after the transition; its table begins at 0 s.
+        at: Start of the transition [s].
+        vehicle: Vehicle of the flight.
 
     Returns:
-        A table of the sizes of ``old``, so that it takes its place in a compiled program. It begins a second before
+        A table with the sizes of ``old``, so that it can replace it in a compiled program. It begins a second before
         ``at``; a roll-out may start in the lap of ``new``.
     """
     for lasting in LASTING:
@@ -44,43 +44,43 @@ def transition_between(old: Reference, new: Reference, at: float, vehicle: Vehic
 
 
 class Spliced(AbstractReference):
-    """What was followed one after another, as one reference; see :func:`spliced`."""
+    """Successive references of a flight as one reference; see :func:`spliced`."""
 
     pieces: Reference
     """Tables of one size; every leaf has a leading axis."""
     began: Float[Array, " k"]
-    """Since when each is followed [s], in order."""
+    """Time from which each piece is followed [s], in order."""
 
     @property
     def lap(self) -> Float[Array, "2"]:
-        """That of the last piece [s]."""
+        """Lap of the last piece [s]."""
         return self.pieces.lap[-1]
 
     @property
     def joins(self) -> Float[Array, "m 2"]:
-        """Those of the last piece [s]."""
+        """Spans of the last piece [s]."""
         return self.pieces.joins[-1]
 
     def __call__(self, t: Float[Array, ""]) -> Point:
-        """Return the reference that is followed at time ``t`` [s]."""
+        """Return the active reference at time ``t`` [s]."""
         now = jnp.maximum(jnp.sum(self.began <= t) - 1, 0)
         piece: Reference = jax.tree.map(lambda leaf: leaf[now], self.pieces)
         return piece(t)
 
     def distance(self, p: Float[Array, "3"]) -> Float[Array, ""]:
-        """Return the distance from ``p`` to the nearest lap of them all [m]."""
+        """Return the distance from ``p`` to the nearest lap of all pieces [m]."""
         return jnp.min(jax.vmap(lambda piece: piece.distance(p))(self.pieces))
 
     def in_frame(self, frame: FeltFrame) -> TurnedReference:
-        """Return the same as it is in ``frame``."""
+        """Return the same reference in the coordinates of ``frame``."""
         return TurnedReference(self, frame)
 
 
 def spliced(pieces: Sequence[tuple[float, Reference]]) -> Spliced:
-    """Join what was followed in a flight.
+    """Return the successive references of a flight as one reference.
 
     Args:
-        pieces: Since when [s], in order, which reference was followed; tables of one size.
+        pieces: Time from which each reference was followed [s], in order, and the reference; tables of one size.
     """
     began, tables = zip(*pieces, strict=True)
     together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *tables)
@@ -113,7 +113,7 @@ def _mixed(
     old: Reference, new: Reference, times: Float[Array, " n"], at: Float[Array, ""], lasting: Float[Array, ""]
 ) -> Float[Array, "n 18"]:
     first, last = jax.vmap(old)(times), jax.vmap(new)(jnp.maximum(times - at, 0.0))
-    # From lap to lap a heading may jump by whole turns, and a share of such a jump is no turn.
+    # A heading may jump by whole turns between laps, and a share of such a jump is not a whole turn.
     first, last = (points._replace(heading=jnp.unwrap(points.heading)) for points in (first, last))
     away = (first.heading - last.heading)[jnp.sum(times < at)]
     turns = FULL_TURN * jnp.round(away / FULL_TURN)  # the shortest way round

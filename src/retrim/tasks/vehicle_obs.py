@@ -16,11 +16,11 @@ M = TypeVar("M")
 
 
 class VehicleObs(AbstractObservation[M]):
-    """o = [o of the task, thrust, body rates and their slope, belief]: 15 more numbers than the task shows.
+    """o = [o of the task, thrust, body rates and their slope, belief]: 15 more numbers than that of the task.
 
-    The task should show as many past commands as the longest delay has ticks: they tell what is still under way. A slow
-    vehicle goes on turning for long after the last of them, hence thrust and rates. The belief is the centre and the
-    half width of the interval of each coordinate of the command path; see
+    The observation of the task should contain as many past commands as the longest delay has ticks, since these may
+    still be under way. A slow vehicle continues to turn long after the last of them, so thrust and rates are also
+    observed. The belief is the centre and the half width of the interval of each coordinate of the command path; see
     :class:`~retrim.physics.path_family.PathBelief`.
     """
 
@@ -39,13 +39,13 @@ class VehicleObs(AbstractObservation[M]):
         Args:
             inner: Observation of the task.
             omega_max: Scale of body rates [rad/s].
-            belief: What is known of the vehicle.
+            belief: Belief about the vehicle.
         """
         return cls(inner, omega_max, belief, ActuatorState.at(Command.hover()))
 
     @property
     def size(self) -> int:
-        """Length of the observation: that of the task's, and 15."""
+        """Length of the observation: that of the task, plus 15."""
         return self.inner.size + 7 + 2 * COORDINATES
 
     def init(self, x: State) -> M:
@@ -53,7 +53,7 @@ class VehicleObs(AbstractObservation[M]):
         return self.inner.init(x)
 
     def __call__(self, memory: M, t: Float[Array, ""], x: State, last: Command) -> tuple[Float[Array, " o"], M]:
-        """Return the scaled numbers."""
+        """Return the observation of the task, and the scaled actuators and belief."""
         seen, memory = self.inner(memory, t, x, last)
         acting, slope = self.actuators.command, self.actuators.slope
         thrust = (acting.c / STANDARD_GRAVITY - 1.0)[None]
@@ -75,6 +75,6 @@ class VehicleObs(AbstractObservation[M]):
         return still(self.init(x), jnp.zeros_like(x.p[0]), x, hover)[0]
 
     def in_frame(self, frame: FeltFrame) -> "VehicleObs[M]":
-        """Return the observation in ``frame``; the actuators that it is given are of that frame, too."""
+        """Return the observation in ``frame``; its actuators must also be in that frame."""
         turned: AbstractObservation[Any] = self.inner.in_frame(frame)
         return dataclasses.replace(self, inner=turned)

@@ -1,9 +1,9 @@
 """Recursive sums of one channel of the command path: roll and pitch rates, yaw rate, or thrust.
 
-A measurement is z = g h(theta) . f + D n + noise, with the features f of the commands, the response h that delay, lag
-and damping give, the gain g, and further features n. Sums of products of whitened features and measurements are
-sufficient for every theta at once, so that no grid is stored. Measurements enter as differences from the present
-prediction, because single precision cannot hold the small difference of large sums.
+A measurement is z = g h(theta) . f + D n + noise, with the features f of the commands, the response h from delay, lag
+and damping, the gain g, and further features n. Sums of products of whitened features and measurements are sufficient
+for every theta at once, so that a grid does not need to be stored. Measurements enter as differences from the present
+prediction, because single precision cannot represent the small difference of large sums.
 """
 
 import dataclasses
@@ -16,23 +16,23 @@ from jaxtyping import Array, Bool, Float, Int
 from .noise import KINDS, Whitening
 
 GATE = 6.0  # standard deviations of the prediction beyond which a measurement does not count
-DOUBT_TAU, DOUBTFUL = 0.3, 0.5  # [s], and the share of recent measurements: if so many miss, the prediction is wrong
+DOUBT_TAU, DOUBTFUL = 0.3, 0.5  # [s], and share of recent measurements beyond GATE that shows a wrong prediction
 
 
 class Sample(eqx.Module):
     """One measurement of a channel."""
 
     value: Float[Array, " axes"]
-    """Mean over ``width``, as a difference from hover."""
+    """Measured mean over ``width``, as a difference from hover."""
     other: Float[Array, "axes n"]
-    """Features beside the commands."""
+    """Features in addition to the commands."""
     usable: Bool[Array, ""]
     kinds: Float[Array, "kinds 2"]
-    """Possible kinds of its noise."""
+    """Possible kinds of the noise."""
     age: Float[Array, ""]
     """Time since the end of the mean [s]."""
     width: Float[Array, ""]
-    """Length of the mean [s]; zero for a value."""
+    """Length of the mean [s]; zero for an instantaneous value."""
 
 
 class Region(eqx.Module):
@@ -57,11 +57,11 @@ class PathPosterior(NamedTuple):
     noise: Float[Array, ""]
     kind: Int[Array, ""]
     region: Region
-    """Where the next grid lies."""
+    """Region of the next grid."""
 
 
 class Channel(eqx.Module):
-    """Sums, and what predicts the next measurement."""
+    """Sums, and the prediction of the next measurement."""
 
     whitening: Whitening
     products: Float[Array, "kinds axes columns columns"]
@@ -71,11 +71,11 @@ class Channel(eqx.Module):
     count: Float[Array, ""]
     """Sum of the weights of the measurements."""
     squares: Float[Array, ""]
-    """Sum of their squares."""
+    """Sum of the squared weights."""
     response: Float[Array, " m"]
     """Gain times response of the present estimate."""
     spread: Float[Array, "m m"]
-    """Its covariance."""
+    """Covariance of ``response``."""
     noise: Float[Array, ""]
     """Standard deviation of the white noise."""
     kind: Int[Array, ""]
@@ -85,7 +85,7 @@ class Channel(eqx.Module):
     age: Float[Array, ""]
     width: Float[Array, ""]
     region: Region
-    """Where the posterior lies."""
+    """Region of the posterior."""
 
     @classmethod
     def start(
@@ -100,12 +100,12 @@ class Channel(eqx.Module):
         """Return the channel before the first measurement.
 
         Args:
-            axes: Number of axes that share all parameters but their disturbances.
-            others: Number of features beside the commands.
+            axes: Number of axes that share all parameters except for their disturbances.
+            others: Number of features in addition to the commands.
             response: Mean of gain times response before any flight.
-            spread: Its covariance.
+            spread: Covariance of ``response``.
             noise: Standard deviation of the noise before any flight.
-            region: Where the prior lies.
+            region: Region of the prior.
         """
         columns, zero = response.shape[0] + others + 1, jnp.zeros(())
         return cls(
@@ -120,8 +120,8 @@ class Channel(eqx.Module):
 
         Args:
             features: Features of the commands of each axis.
-            sample: The measurement; if it is not usable, only time passes.
-            keep: Weight that earlier measurements keep.
+            sample: The measurement; if it is not usable, only the time advances.
+            keep: Remaining weight of earlier measurements.
             dt: Control tick [s].
         """
         row = jnp.concatenate([features, sample.other, sample.value[:, None]], axis=1)
@@ -151,7 +151,7 @@ class Channel(eqx.Module):
         )  # fmt: skip
 
     def predicted_by(self, posterior: PathPosterior) -> "Channel":
-        """Return the channel with another prediction, from which measurements differ by something else."""
+        """Return the channel with another prediction, and with its sums relative to that prediction."""
         m = self.response.shape[0]
         change = posterior.response - self.response
         misfit = self.products[..., -1] - self.products[..., :m] @ change

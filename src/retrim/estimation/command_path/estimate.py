@@ -10,12 +10,12 @@ from .channel import PathPosterior
 from .prior import LONGEST_DELAY, MOST_RINGING
 from .response import damping_of, first_order_equivalent
 
-NINETY = 1.645  # standard deviations on each side of a normal distribution that hold 90 %
-EXCITED = 0.6  # share of the deviation before any flight; a parameter with more is not excited
+NINETY = 1.645  # standard deviations on each side of a normal distribution that contain 90 %
+EXCITED = 0.6  # share of the prior deviation; a parameter with a larger deviation is not excited
 
 
 class Estimate(eqx.Module):
-    """One parameter."""
+    """Estimate of one parameter."""
 
     mean: Float[Array, ""]
     deviation: Float[Array, ""]
@@ -25,22 +25,22 @@ class Estimate(eqx.Module):
     high: Float[Array, ""]
     """Upper end of the 90 % interval."""
     excited: Bool[Array, ""]
-    """Whether the flight says more than was known before: the deviation is below 60 % of that of the prior."""
+    """Whether the flight has provided information: the deviation is below 60 % of that of the prior."""
 
 
 class PathEstimate(eqx.Module):
-    """What is known of the command path."""
+    """Estimate of the command path."""
 
     delay: Estimate
-    """Of all commands [s]."""
+    """Delay of all commands [s]."""
     rate_lag: Estimate
-    """2 zeta / omega_n of the roll and pitch rates, the delay of a ramp [s]."""
+    """Lag of the roll and pitch rates, 2 zeta / omega_n, which is the delay of a ramp [s]."""
     rate_damping: Estimate
     """Damping ratio zeta of the roll and pitch rates [-]; a large one means first order."""
     rate_gain: Estimate
     """Body rate per commanded body rate, roll and pitch [-]."""
     yaw_lag: Estimate
-    """Likewise of the yaw rate [s]."""
+    """The same lag of the yaw rate [s]."""
     yaw_gain: Estimate
     thrust_lag: Estimate
     """First-order lag of the thrust [s]."""
@@ -48,7 +48,7 @@ class PathEstimate(eqx.Module):
     """Thrust per commanded thrust [-]."""
 
     def first_order(self) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """Return delay and lag [s] of the first-order path that turns most like this one."""
+        """Return delay and lag [s] of the first-order path with the most similar turning response."""
         return first_order_equivalent(self.delay.mean, self.rate_lag.mean, self.rate_damping.mean)
 
 
@@ -57,7 +57,7 @@ def normal_estimate(mean: Float[Array, ""], deviation: Float[Array, ""], before:
 
     Args:
         mean: Mean of the posterior.
-        deviation: Its standard deviation.
+        deviation: Standard deviation of the posterior.
         before: Standard deviation of the prior.
     """
     reach = NINETY * deviation
@@ -72,7 +72,7 @@ def delay_estimate(posterior: PathPosterior) -> Estimate:
 
 
 def lag_estimate(posterior: PathPosterior, before: Float[Array, ""]) -> Estimate:
-    """Return the estimate of the lag [s], whose logarithm is taken for normal; ``before`` is its prior deviation."""
+    """Return the estimate of the lag [s], with a log-normal posterior; ``before`` is its prior deviation."""
     mean, deviation = _moments(posterior.cells[:, 1], posterior.weight)
     value, reach = jnp.exp(mean + 0.5 * deviation**2), NINETY * deviation
     off = value * jnp.sqrt(jnp.expm1(deviation**2))

@@ -24,8 +24,8 @@ from .noise import DIFFERENCE, DIRECT
 from .posterior import channel_before, path_posterior
 from .prior import Prior, delay_belief, full_belief
 
-SETTLING = 0.1  # [s] at the start of a flight in which the thrust depends on commands before it
-FADING = (0.03, 0.08)  # [s]: afterwards, what is left of them fades about so fast
+SETTLING = 0.1  # [s], start of a flight, during which the thrust depends on commands before it
+FADING = (0.03, 0.08)  # [s], time constants with which their remaining effect fades afterwards
 
 
 class Channels(NamedTuple):
@@ -35,25 +35,25 @@ class Channels(NamedTuple):
     """Roll and pitch."""
     yaw: Channel
     thrust: Channel
-    """Thrust by differences of velocities."""
+    """Thrust from differences of velocities."""
     force: Channel
-    """Thrust by accelerations."""
+    """Thrust from accelerations."""
 
 
 class Reading(NamedTuple):
-    """What one sensor says in a tick."""
+    """Reading of one sensor in a tick."""
 
     value: Float[Array, " axes"]
     usable: Bool[Array, ""]
     kinds: tuple[tuple[float, float], ...]
-    """Possible kinds of its noise."""
+    """Possible kinds of the noise."""
     age: Float[Array, ""]
-    """Age [s]."""
+    """Age of the reading [s]."""
     width: float
     """Length of the mean [s]."""
 
     def sample(self, axes: slice, other: Float[Array, "axes n"]) -> Sample:
-        """Return the sample of some axes, with their features beside the commands."""
+        """Return the sample of some axes, with their further features."""
         value, dtype = self.value[axes], self.age.dtype
         width = jnp.full((), self.width, dtype)
         usable = self.usable & jnp.all(jnp.isfinite(value))
@@ -67,7 +67,7 @@ class PathState(eqx.Module):
     x: State
     """Last measured state."""
     t: Float[Array, ""]
-    """Its time [s]; minus infinity before the first."""
+    """Time of the last measurement [s]; minus infinity before the first."""
     elapsed: Float[Array, ""]
     """Time since the start [s]."""
     consistency: Consistency
@@ -82,13 +82,13 @@ class PathEstimator(eqx.Module):
     yaw: Prior
     thrust: Prior
     memory: Float[Array, ""]
-    """A measurement counts for 1/e of the newest after this long [s]."""
+    """Time after which the weight of a measurement is 1/e of that of the newest [s]."""
     dt: float = eqx.field(static=True)
     """Control tick [s]."""
 
     @classmethod
     def of(cls, dt: float, *, memory: float = 6.0) -> "PathEstimator":
-        """Return the estimator with priors that fit vehicles from 30 g to 3 kg.
+        """Return the estimator with priors for vehicles from 30 g to 3 kg.
 
         Args:
             dt: Control tick [s].
@@ -104,7 +104,7 @@ class PathEstimator(eqx.Module):
         one, no = jnp.ones(()), jnp.zeros(0)
         rates = Prior(one, 0.15 * one, 0.05 * one, 1.0 * one, no, 0.03 * one, 0.003 * one, 0.0 * one, (9, 9, 5))
         yaw = Prior(one, 0.15 * one, 0.08 * one, 1.0 * one, no, 0.03 * one, 0.003 * one, 0.0 * one, (5, 7, 5))
-        other = jnp.array([0.5, 20.0, 20.0])  # of drag [1/s] and of what is left of earlier commands [m/s^2]
+        other = jnp.array([0.5, 20.0, 20.0])  # drag [1/s], and remaining effect of earlier commands [m/s^2]
         thrust = Prior(
             one, 0.3 * one, 0.04 * one, 0.8 * one, other, 0.2 * one, 0.02 * one, STANDARD_GRAVITY * one, (7, 9, 1)
         )
@@ -148,7 +148,7 @@ class PathEstimator(eqx.Module):
         a: Float[Array, "3"] | None = None,
         age: Float[Array, ""] | float = 0.0,
     ) -> PathState:
-        """Return the memory after a measurement, with the estimate as it was.
+        """Return the memory after a measurement, with an unchanged estimate.
 
         Args:
             s: Memory.
@@ -193,7 +193,7 @@ class PathEstimator(eqx.Module):
         )
         force = now.force
         if a is not None:
-            # An accelerometer is not late where the attitude is.
+            # The accelerometer has no latency, even if the attitude has.
             turn = so3.exp(age * turning)
             axis = 0.5 * (so3.mul(s.x.R, turn) + so3.mul(x.R, turn))[:, 2]
             lift = jnp.sum(axis * (a + up)) - STANDARD_GRAVITY
@@ -206,7 +206,7 @@ class PathEstimator(eqx.Module):
     def estimated(self, s: PathState) -> PathState:
         """Return the memory with a new estimate.
 
-        The rates say what the delay is, and accelerations are known before velocities.
+        The rates determine the delay for all channels, and the accelerations provide a prior for the velocities.
         """
         channels = s.channels
         rates = path_posterior(channels.rates, self.rates, None, self.dt)

@@ -46,7 +46,7 @@ def moments(
 
 
 def cholesky(a: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
-    """Return the lower factor of a covariance, written out: a call of LAPACK takes longer, and has no NumPy form."""
+    """Return the lower factor of a covariance. It is written out, since LAPACK takes longer and has no NumPy form."""
     zero = jnp.zeros_like(a[0, 0])
     l00 = jnp.sqrt(a[0, 0] + TINY)
     l10, l20 = a[1, 0] / l00, a[2, 0] / l00

@@ -1,7 +1,8 @@
 """Commands of the last second as features that are linear in a step response.
 
 A command that is held over each tick is a sum of steps. Its response is therefore the sum of the steps times the step
-response at their ages. Ages of more than half a second are joined by linear interpolation: the response is smooth.
+response at their ages. Ages of more than half a second are joined by linear interpolation, since the response is
+smooth.
 """
 
 import equinox as eqx
@@ -9,15 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-SPAN = 1.2  # [s] of commands that are remembered; the response to older ones is complete
-SINGLE = 12  # ages are apart by this share of themselves, but at least by one tick
+SPAN = 1.2  # [s], time span of the stored commands; the response to older ones is complete
+SINGLE = 12  # the distance of ages is 1/SINGLE of the age, and at least one tick
 
 
 class CommandHistory(eqx.Module):
     """Commands of the last ticks, oldest first."""
 
     commands: Float[Array, "k 4"]
-    """[c, omega] as differences from hover [m/s^2, rad/s]."""
+    """Commands [c, omega] as differences from hover [m/s^2, rad/s]."""
 
     @classmethod
     def at_hover(cls, dt: float) -> "CommandHistory":
@@ -39,7 +40,7 @@ class CommandHistory(eqx.Module):
         return CommandHistory(self.commands[source])
 
     def features(self, dt: float) -> Float[Array, "4 m"]:
-        """Return the steps at each of the :func:`ages`, and the command before them, of each of the four commands."""
+        """Return, for each of the four commands, the steps at each of the :func:`ages` and the command before them."""
         newest_first = self.commands[::-1]
         steps = newest_first[:-1] - newest_first[1:]
         joined = jnp.asarray(_joining(dt), dtype=steps.dtype) @ steps

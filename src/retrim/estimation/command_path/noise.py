@@ -1,8 +1,8 @@
-"""Noise of a measured rate or thrust: a disturbance that wanders, and white noise or the difference of white noise.
+"""Noise of a measured rate or thrust: a wandering disturbance, and white noise or the difference of white noise.
 
 The residual of a channel is r_k = b_k + e_k - mu e_(k-1), where the disturbance b is a random walk. A gyroscope has
 mu = 0; the difference of two noisy attitudes has mu = 1. The Kalman filter of (b, e) turns residuals into innovations,
-which are independent. It is linear, so that it is applied to commands and measurements alike before they are compared.
+which are independent. It is linear, so that it is applied to both commands and measurements before they are compared.
 Harvey, Forecasting, Structural Time Series Models and the Kalman Filter (1989), sections 3.2 and 4.2.
 """
 
@@ -10,9 +10,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-DIFFUSE = 1e4  # variance of the first disturbance, in units of the white noise: nothing is known of it
+DIFFUSE = 1e4  # variance of the first disturbance, in units of the white noise: a diffuse prior
 DIRECT = ((0.0, 0.0), (0.0, 1e-3), (0.0, 3e-2), (0.0, 0.5))
-"""Kinds of noise of a measured value: mu, and the variance that the disturbance gains in a tick in units of e."""
+"""Kinds of noise of a measured value: mu, and the increase of the disturbance's variance per tick, in units of e."""
 DIFFERENCE = ((1.0, 0.0), (1.0, 1e-3), (0.8, 0.0), (0.8, 3e-2))
 """Kinds of noise of a difference of measured values; white process noise makes mu smaller than 1."""
 KINDS = len(DIRECT)
@@ -53,13 +53,14 @@ class Whitening(eqx.Module):
         kinds: Float[Array, "kinds 2"],
         counts: Bool[Array, ""],
     ) -> "Whitening":
-        """Return the memory after a row with this innovation; if it does not count, only time passes."""
+        """Return the memory after a row with this innovation; if it does not count, only the time advances."""
         mu, wander = kinds.T
         b, cross, error = self.spread.T
         cross, error = mu * cross, mu**2 * error
         total = b + 2.0 * cross + error + 1.0
         gain = (b + cross) / total
-        # Variance of b times that of the rest, less the squared covariance: no difference of large numbers.
+        # Variance of b times that of the other terms, less the squared covariance, to avoid a difference of large
+        # numbers.
         left = (b * (error + 1.0) - cross**2) / total
         seen = jnp.stack([left + wander, gain, 1.0 - 1.0 / total], axis=1)
         passed = jnp.stack([b + wander, jnp.zeros_like(b), jnp.ones_like(b)], axis=1)

@@ -1,9 +1,9 @@
-"""Posterior of one channel over delay, lag and damping, on grids that close in on where it lies.
+"""Posterior of one channel over delay, lag and damping, on grids that adapt to its region.
 
 Given these three, gain and noise have a conjugate posterior (normal, inverse gamma), so that they are integrated in
-closed form. The grid covers the ellipsoid in which the posterior of the last tick lies. It moves and shrinks with it. A
-coarse grid over the prior finds where else the posterior may be, for example after a change of the vehicle; it tempers
-the likelihood, since its cells are wider than the ridge. All shapes are fixed and nothing is compiled anew.
+closed form. The grid covers the ellipsoid of the posterior of the last tick, and moves and shrinks with it. A coarse
+grid over the prior finds other regions of the posterior, for example after a change of the vehicle; it tempers the
+likelihood, since its cells are wider than the ridge. All shapes are fixed, so that programs are not compiled again.
 """
 
 from typing import NamedTuple
@@ -19,10 +19,10 @@ from .prior import MOST_RINGING, Belief, GainPrior, Prior, gain_prior, log_prior
 from .response import mean_step_response
 
 TEMPER = 0.03  # share of the information that a coarse grid uses
-ELSEWHERE = 2.0  # by so much must the log posterior be larger outside of the grid to leave it
-WIDER = 1.2  # the next grid covers this times the covariance, since a posterior may also widen
-COARSE = 0.35  # share of the spacing of a grid that is the least deviation of the next one
-GAINS = (0.2, 5.0)  # within which a gain is linearised
+ELSEWHERE = 2.0  # excess of the log posterior outside of the grid at which the grid moves there
+WIDER = 1.2  # factor of the covariance for the next grid, since a posterior may also widen
+COARSE = 0.35  # smallest deviation of the next grid, as a share of the spacing of this one
+GAINS = (0.2, 5.0)  # range in which a gain is linearised
 FREEDOM = 2.0  # twice the shape of the inverse gamma prior of the variance of the noise
 
 
@@ -38,7 +38,7 @@ class _Sums(NamedTuple):
 
 
 class _Fit(NamedTuple):
-    """What the sums say of each cell."""
+    """Fit of each cell to the sums."""
 
     log_likelihood: Float[Array, " cells"]
     gain: Float[Array, " cells"]
@@ -50,9 +50,9 @@ def path_posterior(channel: Channel, prior: Prior, belief: Belief | None, dt: fl
     """Return the posterior of a channel.
 
     Args:
-        channel: Its sums.
-        prior: What is known before any flight.
-        belief: What other channels say; None if this one is the first.
+        channel: Sums of the channel.
+        prior: Prior before any flight.
+        belief: Information from other channels; None if this channel is the first.
         dt: Control tick [s].
     """
     sums = _without_others(channel, prior)
@@ -101,13 +101,13 @@ def path_posterior(channel: Channel, prior: Prior, belief: Belief | None, dt: fl
 def log_likelihood(
     channel: Channel, prior: Prior, cells: Float[Array, "cells 3"], dt: float
 ) -> Float[Array, "kinds cells"]:
-    """Return the log likelihood of some cells for each kind of noise, up to a constant; for the arguments see above."""
+    """Return the log likelihood of cells for each kind of noise, up to a constant; see :func:`path_posterior`."""
     sums, h = _without_others(channel, prior), responses(cells, channel.age, channel.width, prior.hover, dt)
     return _fits(sums, h, channel, prior, gain_prior(cells, prior, None)).log_likelihood
 
 
 def channel_before(axes: int, prior: Prior, dt: float) -> Channel:
-    """Return a channel before the first measurement; its ``axes`` share all parameters but their disturbances."""
+    """Return a channel before the first measurement; its ``axes`` share all parameters except for disturbances."""
     cells, within = coarse_grid(prior, None)
     zero = jnp.zeros(())
     h, weight = responses(cells, zero, zero, prior.hover, dt), jax.nn.softmax(log_prior(cells, prior, None))
@@ -125,7 +125,7 @@ def responses(
     hover: Float[Array, ""],
     dt: float,
 ) -> Float[Array, "cells m"]:
-    """Return what each cell makes of the features of the commands.
+    """Return the response of each cell to the features of the commands.
 
     Args:
         cells: Delay [s], logarithm of the lag [s], ringing.
@@ -143,7 +143,7 @@ def responses(
 def _without_others(channel: Channel, prior: Prior) -> _Sums:
     """Integrate over the coefficients of the other features, one after another, and add the axes."""
     m = channel.response.shape[0]
-    # The sum of squared weights corrects the information for forgetting: old measurements are known in part.
+    # The sum of squared weights corrects the information for forgetting, since old measurements count only in part.
     temper = channel.count / jnp.maximum(channel.squares, 1.0)
     products = temper * channel.products
     for i in range(prior.other.shape[0]):
@@ -167,7 +167,7 @@ def _fits(sums: _Sums, h: Float[Array, "cells m"], channel: Channel, prior: Prio
 
 
 def _fit(sums: _Sums, h: Float[Array, "cells m"], channel: Channel, prior: Prior, gain: GainPrior) -> _Fit:
-    """Integrate over gain and noise; everything is a difference from the present prediction of the channel."""
+    """Integrate over gain and noise; all quantities are differences from the present prediction of the channel."""
     g = jnp.clip(channel.response[-2], *GAINS)
     away = g * h - channel.response[None]
     across = away @ sums.uu

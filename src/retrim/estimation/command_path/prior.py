@@ -1,4 +1,4 @@
-"""What is known of a channel before a flight, and what one channel tells another."""
+"""Prior of a channel before a flight, and information from one channel for another."""
 
 from typing import NamedTuple
 
@@ -15,7 +15,7 @@ TINY = 1e-14
 
 
 class Prior(eqx.Module):
-    """What is known of a channel before any flight."""
+    """Prior of a channel before any flight."""
 
     gain: Float[Array, ""]
     """Mean of the gain [-]."""
@@ -28,17 +28,17 @@ class Prior(eqx.Module):
     other: Float[Array, " n"]
     """Standard deviations of the coefficients of other features."""
     noise: Float[Array, ""]
-    """Standard deviation of the noise that is typical."""
+    """Typical standard deviation of the noise."""
     floor: Float[Array, ""]
-    """Least standard deviation of what no model explains."""
+    """Smallest standard deviation of unmodelled effects."""
     hover: Float[Array, ""]
-    """Command that hovers, from which commands and measurements are differences."""
+    """Hover command, from which commands and measurements are differences."""
     cells: tuple[int, int, int] = eqx.field(static=True)
-    """Cells of each grid along delay, lag and damping; one along damping means that the channel is of first order."""
+    """Cells of each grid along delay, lag and damping; one cell along damping means a channel of first order."""
 
 
 class Belief(NamedTuple):
-    """Normal distribution of delay, logarithm of the lag, and gain, which another channel has found."""
+    """Normal distribution of delay, logarithm of the lag, and gain, from another channel."""
 
     mean: Float[Array, "2"]
     """Delay [s], logarithm of the lag [s]."""
@@ -48,7 +48,7 @@ class Belief(NamedTuple):
     slope: Float[Array, "2"]
     """Change of the mean of the gain with delay and logarithm of the lag."""
     gain_spread: Float[Array, ""]
-    """Standard deviation of the gain where the other two are known."""
+    """Standard deviation of the gain, given the other two."""
 
 
 class GainPrior(NamedTuple):
@@ -59,7 +59,7 @@ class GainPrior(NamedTuple):
 
 
 def delay_belief(posterior: PathPosterior, prior: Prior) -> Belief:
-    """Return what a channel of another quantity says: the delay, which all channels share."""
+    """Return the belief from a channel of another quantity: the delay, which all channels share."""
     delay = posterior.cells[:, 0]
     mean = posterior.weight @ delay
     variance = posterior.weight @ (delay - mean) ** 2
@@ -69,7 +69,7 @@ def delay_belief(posterior: PathPosterior, prior: Prior) -> Belief:
 
 
 def full_belief(posterior: PathPosterior) -> Belief:
-    """Return what another sensor of the same quantity says, with the correlation of delay, lag and gain."""
+    """Return the belief from another sensor of the same quantity, with the correlation of delay, lag and gain."""
     cells, weight = posterior.cells[:, :2], posterior.weight
     mean, gain = weight @ cells, weight @ posterior.gain
     away, off = cells - mean[None], posterior.gain - gain
@@ -100,7 +100,7 @@ def log_prior(cells: Float[Array, "cells 3"], prior: Prior, belief: Belief | Non
 
 
 def _inverse(a: Float[Array, "2 2"]) -> Float[Array, "2 2"]:
-    """Return the inverse of a covariance, with a correlation of 0.9999 at most."""
+    """Return the inverse of a covariance, with a correlation of at most 0.9999."""
     a = a + jnp.diag(1e-4 * jnp.diag(a) + TINY)
     turned = jnp.stack([jnp.stack([a[1, 1], -a[0, 1]]), jnp.stack([-a[1, 0], a[0, 0]])])
     return turned / (a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0])

@@ -9,8 +9,8 @@ def describe_path(estimate: PathEstimate, declared: tuple[float, float] | None =
     """Return the command path in one line, for the terminal, the log and the page.
 
     Args:
-        estimate: What was identified.
-        declared: Command delay and rate lag of the vehicle file [s]; None if it has none.
+        estimate: Identified command path.
+        declared: Command delay and rate lag of the vehicle file [s]; None if the file does not state them.
     """
     thrust = "thrust gain " + _text(estimate.thrust_gain)
     if not (bool(estimate.delay.excited) and bool(estimate.rate_lag.excited)):

@@ -12,11 +12,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 SMALLEST_KAPPA = 1e-3  # below it the second pole is a thousand times faster than the first
-SMALLEST_ROOT = 1e-2  # of |1 - 4 kappa|: nearer to critical damping, the two poles cancel in single precision
-NARROW = 1e-4  # [s]: a mean over less is a value
-LONGEST = 60.0  # exponents above it are zero to rounding
+SMALLEST_ROOT = 1e-2  # root of |1 - 4 kappa|; nearer to critical damping, the two poles cancel in single precision
+NARROW = 1e-4  # [s], width below which a mean is computed as a value
+LONGEST = 60.0  # exponents beyond which the exponential is zero to rounding
 SHARE_AT = np.linspace(0.0, 0.6, 7)
-SHARE = np.array([1.0, 0.94, 0.88, 0.79, 0.70, 0.61, 0.56])  # of the lag in its sum with the delay, first-order path
+SHARE = np.array([1.0, 0.94, 0.88, 0.79, 0.70, 0.61, 0.56])  # of the lag in lag + delay of the first-order path
 
 
 def ringing_of(damping: Any) -> Any:
@@ -38,7 +38,7 @@ def mean_step_response(
         t: Time since the step [s]; the response before it is zero.
         width: Length of the mean [s]; zero for the value at ``t``.
         lag: Time constant tau [s].
-        ringing: Shape of the response; see the module.
+        ringing: Shape of the response; see the docstring of the module.
     """
     value, integral = _step_and_ramp(t, lag, ringing)
     _, before = _step_and_ramp(t - width, lag, ringing)

@@ -68,7 +68,7 @@ class EnsembleResidual(eqx.Module):
         return jnp.mean(self.members(x, u), axis=0)
 
     def members(self, x: State, u: Command) -> Float[Array, "members 3"]:
-        """Return each member's prediction [m/s^2]; their spread shows where there were no data."""
+        """Return each member's prediction [m/s^2]; the members disagree in regions without data."""
         features = (jnp.concatenate([x.vector(), u.vector()]) - self.offset) / self.scale
         return jnp.stack([_forward(layers, features) for layers in self.layers])
 
@@ -97,7 +97,7 @@ class EnsembleModel(eqx.Module):
     origin: Float[Array, "3"]
     """Origin of the task, world [m]; positions enter relative to it."""
     omega_max: Float[Array, "3"]
-    """Largest body rates [rad/s]; rates enter as a share of them."""
+    """Largest body rates [rad/s]; rates are divided by them."""
     learning_rate: Float[Array, ""]
     spectral_weight: Float[Array, ""]
     """Weight of the spectral penalty."""
@@ -107,7 +107,7 @@ class EnsembleModel(eqx.Module):
     """Hidden layers of each member."""
 
     def __check_init__(self) -> None:
-        """Raise ``ValueError`` if a fit would have no step."""
+        """Raise ``ValueError`` if the number of steps is smaller than one."""
         if self.steps < 1:
             raise ValueError(f"EnsembleModel.steps = {self.steps} must be at least 1")
 
@@ -117,7 +117,7 @@ class EnsembleModel(eqx.Module):
         return EnsembleState.of(fresh, self._optimiser())
 
     def fit(self, state: EnsembleState, rows: Targets) -> tuple[EnsembleState, Float[Array, ""]]:
-        """Fit from where the last fit ended; also return the error before the last step [m/s^2]."""
+        """Fit, starting from the last fit; also return the error before the last step [m/s^2]."""
         fitted, errors = fit_ensemble(
             state, rows, optimiser=self._optimiser(), steps=self.steps, spectral_weight=self.spectral_weight
         )
@@ -150,10 +150,10 @@ def fit_ensemble(
 
     Args:
         state: Networks, optimiser state and power-iteration vectors to start from.
-        rows: What to fit.
+        rows: Data of the fit.
         optimiser: The optimiser that made ``state.optimiser``.
         steps: Number of optimiser steps.
-        spectral_weight: w.
+        spectral_weight: Weight w of the spectral penalty.
 
     Returns:
         The new state, and the squared data error (mean over members) before each step [m^2/s^4].
@@ -192,7 +192,7 @@ def _forward(layers: tuple[eqx.nn.Linear, ...], h: Float[Array, " n"]) -> Float[
 
 
 def _spectral(W: Float[Array, "m n"], v: Float[Array, " n"]) -> tuple[Float[Array, ""], Float[Array, " n"]]:
-    """sigma_max(W)^2, estimated by one power step from ``v``, and the next ``v``. A zero matrix has norm zero."""
+    """Return sigma_max(W)^2, estimated by one power step from ``v``, and the next ``v``; zero for a zero matrix."""
     tiny = jnp.asarray(1e-20, dtype=W.dtype)
     u = lax.stop_gradient(W @ v)
     u = u / jnp.sqrt(jnp.sum(u * u) + tiny)

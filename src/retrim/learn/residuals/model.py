@@ -1,4 +1,4 @@
-"""What the online learner needs from a model of the residual acceleration."""
+"""Interface between the online learner and a model of the residual acceleration."""
 
 from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
@@ -13,10 +13,11 @@ from .targets import Targets
 
 @runtime_checkable
 class ResidualModel(Protocol):
-    """A way to learn the residual. It is an ``eqx.Module`` that holds settings; what is learnt is its *state*.
+    """A model of the residual. It is an ``eqx.Module`` that holds settings; the learned parameters are its *state*.
 
-    Every method is pure and traceable. The state is a pytree of arrays with fixed shapes. A model that also learns how
-    the vehicle turns has a method ``turning``, from its state to a :class:`~retrim.learn.residuals.rates.RateFit`.
+    Every method is pure and traceable. The state is a pytree of arrays with fixed shapes. A model that also identifies
+    bias and lag of the body rates has a method ``turning``, from its state to a
+    :class:`~retrim.learn.residuals.rates.RateFit`.
     """
 
     def init(self, key: Key[Array, ""]) -> Any:
@@ -41,14 +42,14 @@ class ResidualModel(Protocol):
 
 
 class FittedResidual(eqx.Module):
-    """A residual model with its state: a function of (x, u), as :class:`retrim.physics.Hybrid` takes it."""
+    """A residual model with its state: a function of (x, u), as required by :class:`retrim.physics.Hybrid`."""
 
     model: ResidualModel
     state: Any
 
     @property
     def turning(self) -> RateFit | None:
-        """What is known of how the vehicle turns; None from a model of the acceleration alone."""
+        """Identified bias and lag of the body rates; None from a model of the acceleration alone."""
         turning: Callable[[Any], RateFit] | None = getattr(self.model, "turning", None)
         return None if turning is None else turning(self.state)
 

@@ -1,9 +1,9 @@
-"""How a vehicle turns: the bias of its body rates and the lag of their loop, identified from a window of flight.
+"""The bias of the body rates and the lag of their loop, identified from a window of flight.
 
-What is wrong with the rates is no acceleration, and no model of the acceleration can express it. The mean rates of each
-tick are compared with the commands behind a first-order lag, for a grid of time constants; given one of them the bias
-has a normal posterior, and how well it explains the flight is the weight of the time constant. The commands have no
-noise, so noisy attitudes do not make the lag look shorter, as they do in a regression on measured rates.
+An error of the body rates is not an acceleration, so a model of the acceleration cannot express it. The mean rates of
+each tick are compared with the commands after a first-order lag, for a grid of time constants. For each time constant
+the bias has a normal posterior, and the time constant is weighted by how well they explain the flight. The commands do
+not have noise, so noisy attitudes do not make the lag look shorter, as they do in a regression on measured rates.
 """
 
 import equinox as eqx
@@ -16,48 +16,48 @@ from ...physics.actuators import lagged
 from ...physics.state import Command, where
 from .targets import Targets
 
-GRID, SHORTEST, LONGEST = 32, 0.002, 1.0  # time constants that are compared: how many, and from where to where [s]
-UNSETTLED = 0.16  # [s] at the beginning of a window that only let the lag settle
+GRID, SHORTEST, LONGEST = 32, 0.002, 1.0  # grid of time constants: number, smallest and largest [s]
+UNSETTLED = 0.16  # [s], beginning of a window, during which the lag settles; these rows do not count
 
 
 class RateFit(eqx.Module):
-    """What is known of how the vehicle turns."""
+    """Identified bias and lag of the body rates."""
 
     bias: Float[Array, "3"]
-    """The vehicle turns so much faster than it is told, body frame [rad/s]."""
+    """Actual minus commanded body rates, body frame [rad/s]."""
     deviation: Float[Array, "3"]
     """Standard deviation of the bias [rad/s]."""
     tau: Float[Array, "3"]
-    """Time constants of the lag between commanded and flown rates [s]. Roll and pitch, which the same differences of
-    thrust turn, have one; yaw, which the rotors' drag turns, may be far slower."""
+    """Time constants of the lag between commanded and actual rates [s]. Roll and pitch, which thrust differences drive,
+    have the same one; yaw, which the drag of the rotors drives, may be far slower."""
 
 
 class RateModel(eqx.Module):
-    """How to identify it; a fit takes less than a millisecond and depends on the window alone."""
+    """Settings of the identification; a fit takes less than a millisecond and depends on the window alone."""
 
     bias_prior: Float[Array, ""]
     """Standard deviation of a bias before any flight [rad/s]."""
     tau_prior: Float[Array, "3"]
     """Medians of the time constants before any flight [s]."""
     tau_spread: Float[Array, ""]
-    """Standard deviation of their logarithms."""
+    """Standard deviation of the logarithms of the time constants."""
     noise: Float[Array, ""]
-    """Smallest standard deviation of the mean rate of a tick [rad/s]; a noisier flight shows its own."""
+    """Smallest standard deviation of the mean rate of a tick [rad/s]; that of a noisier flight is estimated."""
     memory: Float[Array, ""]
-    """A row counts for 1/e of the newest after this long [s]."""
+    """Time after which the weight of a row is 1/e of that of the newest [s]."""
     dt: float = eqx.field(static=True)
     """Control tick [s]."""
 
     @classmethod
     def of(cls, dt: float, *, memory: float, tau: tuple[float, float, float] = (0.03,) * 3) -> "RateModel":
-        """Return the model with priors that fit the rate loops of small quadrotors.
+        """Return the model with priors for the rate loops of small quadrotors.
 
         Args:
             dt: Control tick [s].
             memory: Time constant of forgetting [s].
-            tau: Time constants of the lag that are most likely, of roll, pitch and yaw [s].
+            tau: Most likely time constants of the lag of roll, pitch and yaw [s].
         """
-        one = jnp.ones(())  # a fit has its type, so that nothing is compiled again after the first
+        one = jnp.ones(())  # a fit has the same type, which avoids another compilation after the first fit
         return cls(0.3 * one, jnp.array(tau), 0.7 * one, 0.05 * one, memory * one, dt)
 
     def init(self) -> RateFit:
@@ -65,7 +65,7 @@ class RateModel(eqx.Module):
         return RateFit(jnp.zeros(3), jnp.broadcast_to(self.bias_prior, (3,)), self.tau_prior)
 
     def fit(self, rows: Targets) -> RateFit:
-        """Return the posterior given ``rows``, the newest last; without a valid row it is the prior."""
+        """Return the posterior given ``rows``, the newest last; return the prior if no row is valid."""
         n = rows.valid.shape[0]
         age = jnp.arange(n - 1, -1, -1, dtype=rows.omega.dtype)
         counts = rows.valid & (jnp.cumsum(rows.valid) > round(UNSETTLED / self.dt))
@@ -86,7 +86,7 @@ class RateModel(eqx.Module):
         return where(total > 0.0, fitted, self.init())
 
     def _followed(self, rows: Targets, tau: Float[Array, ""]) -> Float[Array, "n 3"]:
-        """The mean rates of each tick if the commands were followed with a lag and without a bias."""
+        """Return the mean rates of each tick if the vehicle followed the commands with a lag and without a bias."""
 
         def tick(acting: Command, u: Command) -> tuple[Command, Float[Array, "3"]]:
             mean, end = lagged(acting, u, self.dt, tau)
@@ -97,6 +97,6 @@ class RateModel(eqx.Module):
 
 
 def _shared(each: Float[Array, "g 3"], times: float = 1.0) -> Float[Array, "g 3"]:
-    """Return ``times`` their mean for roll and pitch, which have one lag, and what it is for yaw."""
+    """Return ``times`` the mean of roll and pitch for both, since they share one lag, and yaw unchanged."""
     both = 0.5 * times * (each[:, 0] + each[:, 1])
     return jnp.stack([both, both, each[:, 2]], axis=1)

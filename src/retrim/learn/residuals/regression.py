@@ -18,13 +18,13 @@ from .targets import Targets
 SIZE = 10
 """Parameters: constant push (3), thrust gain (1), linear drag (3), quadratic drag (3)."""
 BLOCK = 8
-"""Rows that are compared at once in the search for a change."""
+"""Number of rows that are compared at once in the search for a change."""
 TAIL = 4.0
-"""Rows that miss the fit by more than so many standard deviations lose weight (Huber's likelihood)."""
+"""Error in standard deviations beyond which a row loses weight (Huber's likelihood)."""
 PASSES = 2
-"""Passes of iteratively reweighted least squares. Gross errors are excluded before, so that few are enough."""
+"""Passes of iteratively reweighted least squares. Gross errors are excluded before, so that few passes are enough."""
 SURPRISE = 21.1
-"""Of a chi-squared variable of three degrees of freedom, passed once in 10,000."""
+"""Threshold of a chi-squared variable with three degrees of freedom, exceeded once in 10,000."""
 
 
 class Normal(NamedTuple):
@@ -40,19 +40,20 @@ class RegressionState(eqx.Module):
     mean: Float[Array, "10"]
     covariance: Float[Array, "10 10"]
     rates: RateFit
-    """How the vehicle turns."""
+    """Bias and lag of the body rates."""
 
 
 class RegressionModel(eqx.Module):
-    """The residual as ten physical numbers, as a :class:`retrim.learn.ResidualModel`.
+    """The residual with ten physical parameters, as a :class:`retrim.learn.ResidualModel`.
 
     a_res = d + R (k_c (c - g) e3 - k_1 v_b - k_2 |v_b| v_b), with v_b the velocity in the body frame and the products
-    per axis. The thrust gain k_c acts on what exceeds hover thrust: at hover it cannot be told from a push along z,
-    which d is. A fit is exact, takes less than a millisecond, and depends on the window alone, not on earlier fits.
+    per axis. The thrust gain k_c acts on the thrust beyond hover, since at hover it cannot be distinguished from a push
+    along z, which is part of d. A fit is exact, takes less than a millisecond, and depends on the window alone, not on
+    earlier fits.
 
-    Rows whose command is at a limit do not count: a gain that explains what a mixer does there reverses what thrust
-    does. The likelihood has heavy tails: a row that the fit misses by more than four standard deviations counts less,
-    and a window without such rows has the fit of a normal likelihood.
+    Rows whose command is at a limit do not count: a gain that explains the output of a mixer there would reverse the
+    effect of thrust. The likelihood has heavy tails: a row with an error of more than four standard deviations counts
+    less, and a window without such rows has the fit of a normal likelihood.
     """
 
     prior: Float[Array, "10"]
@@ -60,13 +61,13 @@ class RegressionModel(eqx.Module):
     noise: Float[Array, ""]
     """Standard deviation of one row of targets [m/s^2]."""
     memory: Float[Array, ""]
-    """A row counts for 1/e of the newest after this long [s]."""
+    """Time after which the weight of a row is 1/e of that of the newest [s]."""
     rates: RateModel
-    """What is wrong with body rates is no acceleration; it is identified beside."""
+    """Model of the errors of the body rates, which are not accelerations and are identified separately."""
     dt: float = eqx.field(static=True)
     """Control tick [s]."""
     limits: tuple[Command, Command] | None = None
-    """Smallest and largest command; None: commands have no limit."""
+    """Smallest and largest command; None if commands are not limited."""
 
     @classmethod
     def of(
@@ -79,21 +80,21 @@ class RegressionModel(eqx.Module):
         tau: tuple[float, float, float] = (0.03,) * 3,
         limits: tuple[Command, Command] | None = None,
     ) -> "RegressionModel":
-        """Return the model with priors that fit small and medium quadrotors.
+        """Return the model with priors for small and medium quadrotors.
 
         Args:
             dt: Control tick [s].
             memory: Time constant of forgetting [s].
-            noise: Standard deviation of one row of targets [m/s^2]: of the sensors, and of what no feature explains.
+            noise: Standard deviation of one row of targets [m/s^2]: noise of the sensors, and unmodelled effects.
             thrust_prior: Standard deviation of the thrust gain [-].
             tau: Most likely time constants of the body rates [s].
-            limits: Smallest and largest command; None: commands have no limit.
+            limits: Smallest and largest command; None if commands are not limited.
         """
         prior = jnp.array([5.0, 5.0, 5.0, thrust_prior, 0.3, 0.3, 0.3, 0.03, 0.03, 0.03])
         return cls(prior, jnp.array(noise), jnp.array(memory), RateModel.of(dt, memory=memory, tau=tau), dt, limits)
 
     def init(self, key: Key[Array, ""]) -> RegressionState:
-        """Return the prior, which predicts zero; the key is not needed."""
+        """Return the prior, which predicts zero; the key is not used."""
         del key
         return RegressionState(jnp.zeros_like(self.prior), jnp.diag(self.prior**2), self.rates.init())
 
@@ -101,8 +102,8 @@ class RegressionModel(eqx.Module):
         """Return the posterior given ``rows``, the newest last; also the weighted error [m/s^2].
 
         The precision is diag(1 / prior^2) + sum_i w_i Phi_i^T Phi_i / noise^2. w_i falls exponentially with age, and is
-        zero for what lies before a change: blocks of rows are compared with what the newest one predicts for them, and
-        from the first that it does not explain (99.99 %) nothing older counts.
+        zero for rows before a change. To find a change, the newest block of rows predicts each older block; the first
+        block that it does not explain (99.99 %) and all older ones do not count.
         """
         fitted, rms, _ = self.fit_weighted(state, rows)
         return fitted, rms
@@ -110,7 +111,7 @@ class RegressionModel(eqx.Module):
     def fit_weighted(
         self, state: RegressionState, rows: Targets
     ) -> tuple[RegressionState, Float[Array, ""], Float[Array, " n"]]:
-        """Fit as :meth:`fit`; also return how much each row counts: nothing, if invalid or from before a change."""
+        """Fit as :meth:`fit`; also return the weight of each row: zero if it is invalid or before a change."""
         if self.limits is not None:
             followed = jax.vmap(partial(is_followed, limits=self.limits))(rows.u)
             rows = dataclasses.replace(rows, valid=rows.valid & followed)
@@ -134,7 +135,7 @@ class RegressionModel(eqx.Module):
     def _tail(
         self, features: Float[Array, "n 3 10"], rows: Targets, weight: Float[Array, " n"], fitted: Normal
     ) -> Float[Array, " n"]:
-        """Return by which factor each row counts: one within the tail, falling with the square of the error beyond."""
+        """Return the factor of each row's weight: one within the limit, falling with the square of the error beyond."""
         missed = jnp.sqrt(jnp.sum((rows.a_res - features @ fitted.mean) ** 2, axis=1))
         count = jnp.sum(weight > 0.0)
         ordered = jnp.sort(jnp.where(weight > 0.0, missed, jnp.inf))
@@ -161,7 +162,7 @@ class RegressionModel(eqx.Module):
         valid: Float[Array, " n"],
         block: Int[Array, " n"],
     ) -> Float[Array, " n"]:
-        """One for rows since the last change, zero before; ``block`` counts blocks of rows from the newest."""
+        """Return one for rows since the last change, zero before; ``block`` counts blocks of rows from the newest."""
         blocks = -(-target.shape[0] // BLOCK)
         count = jax.ops.segment_sum(valid, block, blocks)
         per = jnp.maximum(count, 1.0)
@@ -179,11 +180,11 @@ class RegressionModel(eqx.Module):
         return features_of(x, u) @ state.mean
 
     def turning(self, state: RegressionState) -> RateFit:
-        """Return what is known of how the vehicle turns."""
+        """Return the identified bias and lag of the body rates."""
         return state.rates
 
     def spread(self, state: RegressionState, x: State, u: Command) -> Float[Array, "3"]:
-        """Return the standard deviation of the prediction, without that of a single row [m/s^2]."""
+        """Return the standard deviation of the prediction, without the noise of a row [m/s^2]."""
         features = features_of(x, u)
         return jnp.sqrt(jnp.sum((features @ state.covariance) * features, axis=1))
 

@@ -1,4 +1,4 @@
-"""What the nominal model missed in a window of flight (paper, Sec. III-D)."""
+"""The acceleration that the nominal model misses in a window of flight (paper, Sec. III-D)."""
 
 from typing import Any
 
@@ -13,11 +13,11 @@ from ...physics.dynamics import AbstractDynamics
 from ...physics.state import Command, State
 from ..window import Window
 
-ROUNDING = 0.01  # ticks: an age that is a whole number of ticks counts as one
+ROUNDING = 0.01  # ticks, rounding error of an age that is a whole number of ticks
 
 
 class Targets(eqx.Module):
-    """Rows of a residual fit: inputs, the acceleration that the model missed, and which rows count."""
+    """Rows of a residual fit: inputs, the acceleration that the model misses, and which rows count."""
 
     x: State
     """State at the start of each tick (leading axis n)."""
@@ -26,7 +26,7 @@ class Targets(eqx.Module):
     a_res: Float[Array, "n 3"]
     """Missed acceleration, world frame [m/s^2]."""
     omega: Float[Array, "n 3"]
-    """Body rates at which the vehicle turned, mean over the tick [rad/s]."""
+    """Body rates of the vehicle, mean over the tick [rad/s]."""
     valid: Bool[Array, " n"]
 
 
@@ -40,11 +40,13 @@ def residual_targets(
 ) -> Targets:
     """Compute a_res = a_gt - a_hat of each tick.
 
-    a_gt is the forward difference of velocity over the tick, a_hat that of the nominal model from the same state, both
-    under the command that was acting: the one accepted ``delay_ticks`` before, and earlier by the measurement's age.
+    a_gt is the forward difference of velocity over the tick, a_hat that of the nominal model from the same state. Both
+    are under the command that was acting: the one accepted ``delay_ticks`` before, and earlier by the measurement's
+    age.
 
     A row does not count if its time step, or a step between its command and it, is not one tick (a gap in the
-    measurements), nor while the hidden state of the model (an actuator lag) still remembers the assumed hover start.
+    measurements). It does not count either while the hidden state of the model (an actuator lag) still depends on the
+    assumed hover start.
 
     Args:
         window: n ticks of flight.
@@ -52,8 +54,8 @@ def residual_targets(
         delay_ticks: Declared command delay of the plant [ticks].
         a_gt: Measured accelerations, the mean over the tick that begins in each row, world [m/s^2]; by default the
             differences of velocity.
-        consistent: Whether each of the n - 1 steps from one measurement to the next can be learned from; None: all of
-            them can.
+        consistent: Whether each of the n - 1 steps from one measurement to the next is usable for learning; None if all
+            of them are.
 
     Returns:
         n - 1 - ``delay_ticks`` rows.
@@ -71,7 +73,7 @@ def residual_targets(
 
     def tick(s: Any, row: tuple[State, Command, Float[Array, "3"]]) -> tuple[Any, Float[Array, "3"]]:
         x, u, v_next = row
-        after = nominal.step(nominal.with_state(s, x), u, jnp.zeros_like(x.p))  # hidden state, as a lag, goes on
+        after = nominal.step(nominal.with_state(s, x), u, jnp.zeros_like(x.p))  # keeps hidden state, such as a lag
         return after, (v_next - nominal.state(after).v) / nominal.dt
 
     first = nominal.init(jax.tree.map(lambda leaf: leaf[0], x))
@@ -92,9 +94,9 @@ def residual_targets(
 def _acting(
     window: Window, rows: int, delay_ticks: int, dt: float
 ) -> tuple[Command, Int[Array, " rows"], Bool[Array, " rows"]]:
-    """The mean command over the tick that each measurement describes, its first row, and whether the window has it.
+    """Return the mean command over the tick of each measurement, its first row, and whether the window contains it.
 
-    Two commands share a tick of measurements whose age is no whole number of ticks.
+    If the age of the measurements is not a whole number of ticks, two commands share a tick.
     """
     if window.age is None:
         first: Command = jax.tree.map(lambda leaf: leaf[:rows], window.u)
@@ -114,15 +116,15 @@ def _acting(
 
 
 def _turned(before: Float[Array, "3 3"], after: Float[Array, "3 3"]) -> Float[Array, "3"]:
-    """Return the rotation vector from one attitude to the other, body frame [rad]."""
+    """Return the rotation vector from one attitude to another, body frame [rad]."""
     return so3.log(so3.mul(before.T, after))
 
 
 def _regular(window: Window, dt: float, delay_ticks: int, before: Int[Array, " rows"]) -> Bool[Array, " rows"]:
-    """Whether all steps from the row's command to its next velocity are one tick long, to a quarter of it.
+    """Return whether all steps from the row's command to its next velocity are one tick long, to a quarter of a tick.
 
-    By the clock of commands, and by the times at which the states were true. The command of an old measurement is
-    looked for ``before``, by rows, so that no step from there on may be another.
+    Steps are checked on the clock of commands and at the times at which the states were true. The command of an old
+    measurement is found at row ``before`` by counting rows, so every step from that row on must be regular.
     """
     one_tick = jnp.abs(jnp.diff(window.t) - dt) < 0.25 * dt
     if window.age is not None:
@@ -132,5 +134,5 @@ def _regular(window: Window, dt: float, delay_ticks: int, before: Int[Array, " r
 
 
 def _settled(window: Window, ticks: int | Float[Array, ""]) -> Bool[Array, " n"]:
-    """Whether at least ``ticks`` valid ticks lie before this one in the window."""
+    """Return whether at least ``ticks`` valid ticks precede this one in the window."""
     return jnp.cumsum(window.valid.astype(window.t.dtype)) > ticks
