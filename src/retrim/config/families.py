@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 from ..control.actuator_tracking import ActuatorTracking
 from ..control.controller import AbstractController, PolicyController
 from ..control.identified import IdentifiedFlight
+from ..control.near_target import NearTarget
 from ..control.policy import Policy
 from ..control.resting import RestingController
 from ..errors import ConfigError
@@ -19,6 +20,8 @@ from .tasks import find_task
 from .vehicle_file import VehicleSpec
 
 TRUST = 2.0  # assumed error factor of a delay or lag in a vehicle file
+# [m], largest distance in the input: from farther away, the policy tilts more than a weak vehicle can lift.
+REACH = 0.5
 LEAST = 0.01  # [s]: assumed error of a short delay or lag
 
 
@@ -67,19 +70,19 @@ def prior_belief(preset: Preset, family: PathFamily) -> PathBelief:
     return PathBelief.between(*ends)
 
 
-def policy_controller(preset: Preset, task: AbstractTask, policy: Policy) -> PolicyController:
+def policy_controller(preset: Preset, task: AbstractTask, policy: Policy) -> AbstractController[Any]:
     """Return a policy with the observation used in flight.
 
     Args:
         preset: Preset of the policy. In a task without reference, a policy for a family is shifted so that it commands
-            hover at home.
+            hover at home, and the distance from home in its input is limited.
         task: Task of the flight.
         policy: Policy of the flight.
     """
     observation = task.observation_in_flight
     if preset.family is None or find_task(preset.task).has_reference:
         return PolicyController(observation, policy)
-    return RestingController(observation, policy, task.home())
+    return NearTarget(RestingController(observation, policy, task.home()), task, jnp.array(REACH))
 
 
 def track_actuators(controller: AbstractController[Any], preset: Preset) -> AbstractController[Any]:

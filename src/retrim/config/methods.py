@@ -10,7 +10,7 @@ from jax import random
 from jaxtyping import Array, Key
 
 from ..adapt.learner import LearnerState
-from ..control.controller import AbstractController, PolicyController
+from ..control.controller import AbstractController
 from ..control.datt import DattNet
 from ..control.integral import IntegralAction
 from ..control.passive import Passive
@@ -43,7 +43,7 @@ class MethodRequest:
     state: LearnerState | None = None
     """Learner state of an earlier flight, from which to continue; None for a new one."""
 
-    def controller(self) -> PolicyController:
+    def controller(self) -> AbstractController[Any]:
         """Return the policy with the observation used in flight."""
         return policy_controller(self.setup.preset, self.setup.flown, self.policy.merged())
 
