@@ -25,6 +25,7 @@ from retrim.control.controller import PolicyController
 from retrim.control.gravity_frame import GravityFrame, SeenFrame
 from retrim.control.identified import IdentifiedFlight
 from retrim.control.monitor import Monitor
+from retrim.control.near_target import NearTarget
 from retrim.learn import policy_loss
 from retrim.physics.actuators import Lagged
 from retrim.physics.dynamics import PointMass
@@ -243,6 +244,10 @@ def test_the_pilot_has_the_presets_schedule(built, latency, monkeypatch):
         declared = preset.plant_delay_ticks * preset.dt
         assert float(flown.observer.path.delay) == pytest.approx(declared if preset.family is None else unknown)
         assert flown.known.model is made.learner.residual_model
+        flown = flown.inner
+    if preset.family is not None and preset.task == "hover":
+        assert isinstance(flown, NearTarget)
+        assert float(flown.reach) == pytest.approx(0.5)
         flown = flown.inner
     assert isinstance(flown, PolicyController)
     if preset.family is None:
