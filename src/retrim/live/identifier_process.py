@@ -5,7 +5,6 @@ import time
 from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -162,7 +161,7 @@ def identify(plan: IdentifierPlan) -> None:
     """Run the main function of the process: identify until the flight is over."""
     enable_compile_cache()
     bus, parent = SharedMemoryBus(plan.folder), Lifeline(plan.parent)
-    preset: Any = load_learnt(plan.start, trust=plan.trust)[1]
+    _, preset = load_learnt(plan.start, trust=plan.trust)
     loop = IdentifierLoop(preset, plan.base, bus)
     loop.warm_up()
     bus.publish("ready.identifier", pack_note("ready", base=plan.base))

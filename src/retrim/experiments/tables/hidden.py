@@ -1,4 +1,4 @@
-"""The gauntlet of hidden vehicles: one policy, and many vehicles that it is told nothing of."""
+"""The gauntlet of hidden vehicles: one policy for many vehicles that it does not know."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -135,7 +135,7 @@ def entrants_of(task: str, preset: str, methods: Sequence[str]) -> tuple[Entrant
     Args:
         task: Task of the preset.
         preset: Name of a preset, or a file.
-        methods: Methods to fly; none for the published ones.
+        methods: Methods to fly; empty for the published ones.
 
     Raises:
         ConfigError: There is no such benchmark for the task.
@@ -171,7 +171,7 @@ def fly_hidden(
         sensors: Name of a sensor model.
 
     Raises:
-        ConfigError: Something does not exist, or does not fit together; nothing has been trained.
+        ConfigError: A name does not exist, or the parts do not fit together. Raised before training.
     """
     if not 1 <= count <= MOST_VEHICLES:
         raise ConfigError(f"count must be 1 to {MOST_VEHICLES} vehicles, got {count}")
@@ -233,7 +233,7 @@ def _fly(
 def _row(
     entrant: Entrant, course: Course, vehicles: Sequence[HiddenVehicle], flight: Flight, scoring: Scoring
 ) -> dict[str, Any]:
-    """Return the figures of one flight beside those of its vehicle; None stands for infinity."""
+    """Return the figures of one flight and the numbers of its vehicle; None stands for infinity."""
     number = next(n for n, each in enumerate(vehicles) if each.spec == flight.spec.scenario.vehicle)
     vehicle = vehicles[number]
     return {
