@@ -34,6 +34,8 @@ from .tasks import find_task
 
 OBSERVER_TAU = 0.05  # [s]: half of this is unstable if the delay of the plant is 40 ms longer than declared
 WANDER = 4.0  # [m/s^2] in one second: random walk of the disturbance
+# The same for a family: its stiffer policy turns noise of the estimate into motion. Without noise both are equal.
+FAMILY_WANDER = 1.0
 TILT_LIMIT = 6.0  # [m/s^2]: largest disturbance that rotates a frame, so that gravity keeps a downward component
 
 
@@ -132,7 +134,7 @@ def felt_frame(
         PointMass(preset.dt),
         jnp.array(OBSERVER_TAU),
         limit,
-        jnp.array(WANDER),
+        jnp.array(WANDER if preset.family is None else FAMILY_WANDER),
         declared_path(preset, vehicle),
         (vehicle.command_min, vehicle.command_max),
         longest_delay=longest_delay(preset),
