@@ -117,7 +117,14 @@ def identify_vehicle(controller: AbstractController[Any], preset: Preset) -> Ide
             "with a table [family], such as hover/any"
         )
     prior = prior_belief(preset, family)
-    return IdentifiedFlight(controller, PathEstimator.of(preset.dt), family, prior, declared_vehicle(preset))
+    return IdentifiedFlight(
+        controller,
+        PathEstimator.of(preset.dt),
+        family,
+        prior,
+        declared_vehicle(preset),
+        watches=not find_task(preset.task).has_reference,
+    )
 
 
 def declared_vehicle(preset: Preset) -> Float[Array, "2"] | None:

@@ -13,6 +13,7 @@ class Stage(IntEnum):
     OBSERVED = 1
     SLOW = 2
     BASE = 3
+    CAUTIOUS = 4
 
 
 class Cause(IntEnum):
@@ -22,6 +23,8 @@ class Cause(IntEnum):
     ERROR = 1
     OSCILLATION = 2
     RECOVERY = 3
+    SWINGS = 4
+    CALM = 5
 
 
 PARTS = {
@@ -29,12 +32,15 @@ PARTS = {
     Stage.OBSERVED: "the base policy flies with the disturbance observer",
     Stage.SLOW: "the base policy flies with a slow mean of the estimated disturbance",
     Stage.BASE: "the base policy flies alone",
+    Stage.CAUTIOUS: "the policy assumes a slower vehicle",
 }
 GROUNDS = {
     Cause.NONE: "start of the flight",
     Cause.ERROR: "the error exceeds that predicted for the base policy",
     Cause.OSCILLATION: "the estimated disturbance oscillates by itself, as with late or wrongly scaled measurements",
     Cause.RECOVERY: "the error has been as small as predicted for the base policy",
+    Cause.SWINGS: "the vehicle swings back and forth by itself, as with a wrong estimate of its delay or lag",
+    Cause.CALM: "the vehicle has not swung by itself for a while",
 }
 
 

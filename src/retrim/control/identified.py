@@ -17,7 +17,8 @@ from ..estimation.command_path import PathEstimate, PathEstimator, ringing_of
 from ..estimation.command_path import PathState as EstimatorState
 from ..physics.path_family import Member, PathBelief, PathFamily
 from ..physics.state import Command, State
-from .condition import Condition
+from .caution import REPORTED, Caution
+from .condition import Cause, Condition, Stage
 from .controller import AbstractController
 from .vehicle_report import VehicleEstimate, VehicleReport
 
@@ -34,6 +35,7 @@ class BeliefState(eqx.Module):
     gain: Float[Array, ""]
     """Gain of the thrust that is used for the last command."""
     inner: Any
+    caution: Caution
 
 
 class BeliefFlight(AbstractController[BeliefState]):
@@ -47,6 +49,9 @@ class BeliefFlight(AbstractController[BeliefState]):
     """Vehicle that the belief follows."""
     dt: float = eqx.field(static=True)
     """Control tick [s]."""
+    watches: bool = eqx.field(static=True, default=True)
+    """Whether a self-induced oscillation makes it assume a slower vehicle. The tilt of a task with a reference swings
+    without such an oscillation."""
 
     def with_age(self, age: float | Float[Array, ""]) -> "BeliefFlight":
         """Return the same for measurements that are ``age`` old [s]."""
@@ -57,12 +62,18 @@ class BeliefFlight(AbstractController[BeliefState]):
         return dataclasses.replace(self, inner=self.inner.with_inertial(omega, a))
 
     def condition(self, memory: BeliefState) -> Condition | None:
-        """Return the condition of the controller inside."""
-        return self.inner.condition(memory.inner)
+        """Return the condition of the controller inside; if it has none, that of the caution."""
+        inside = self.inner.condition(memory.inner)
+        if inside is not None or not self.watches:
+            return inside
+        cautious = memory.caution.level > REPORTED
+        return Condition(
+            jnp.where(cautious, Stage.CAUTIOUS, Stage.ADAPTED), jnp.where(cautious, Cause.SWINGS, Cause.CALM)
+        )
 
     def init(self, x: State) -> BeliefState:
         """Return the memory at the start of a flight."""
-        return BeliefState(self.prior, jnp.ones_like(x.p[0]), self._flying(self.prior).init(x))
+        return BeliefState(self.prior, jnp.ones_like(x.p[0]), self._flying(self.prior).init(x), Caution.none(x))
 
     def __call__(self, memory: BeliefState, t: Float[Array, ""], x: State) -> tuple[Command, BeliefState]:
         """Return the command of the controller inside for the present belief about the vehicle."""
@@ -70,12 +81,13 @@ class BeliefFlight(AbstractController[BeliefState]):
         belief = memory.belief.towards(self.estimate.belief, PACE * dt)
         change = jnp.clip(self.estimate.gain.astype(x.p.dtype) - memory.gain, -GAIN_PACE * dt, GAIN_PACE * dt)
         gain = memory.gain + change
-        u, inner = self._flying(belief)(memory.inner, t, x)
-        return Command(u.c / gain, u.omega), BeliefState(belief, gain, inner)
+        caution = memory.caution.after(x, dt) if self.watches else memory.caution
+        u, inner = self._flying(caution.applied(belief))(memory.inner, t, x)
+        return Command(u.c / gain, u.omega), BeliefState(belief, gain, inner, caution)
 
     def accepted(self, memory: BeliefState, u: Command) -> BeliefState:
         """Remember the accepted command."""
-        inner = self._flying(memory.belief).accepted(memory.inner, Command(u.c * memory.gain, u.omega))
+        inner = self._flying(memory.caution.applied(memory.belief)).accepted(memory.inner, Command(u.c * memory.gain, u.omega))
         return dataclasses.replace(memory, inner=inner)
 
     def _flying(self, belief: PathBelief) -> AbstractController[Any]:
@@ -107,6 +119,8 @@ class IdentifiedFlight(AbstractController[IdentifiedState]):
     """Measured acceleration, world [m/s^2]; None if it is not measured."""
     age: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(0.0))
     """Age of measurements [s]."""
+    watches: bool = eqx.field(static=True, default=True)
+    """Whether a self-induced oscillation makes it assume a slower vehicle; see :class:`BeliefFlight`."""
 
     def with_age(self, age: float | Float[Array, ""]) -> "IdentifiedFlight":
         """Return the same for measurements that are ``age`` old [s]."""
@@ -117,8 +131,8 @@ class IdentifiedFlight(AbstractController[IdentifiedState]):
         return dataclasses.replace(self, inner=self.inner.with_inertial(omega, a), omega=omega, a=a)
 
     def condition(self, memory: IdentifiedState) -> Condition | None:
-        """Return the condition of the controller inside."""
-        return self.inner.condition(memory.flight.inner)
+        """Return the condition of the flight."""
+        return self.follow(vehicle_estimate(self.family, memory.path.estimate)).condition(memory.flight)
 
     def vehicle(self, memory: IdentifiedState) -> VehicleReport:
         """Return the present estimate of the vehicle."""
@@ -153,7 +167,7 @@ class IdentifiedFlight(AbstractController[IdentifiedState]):
         Args:
             estimate: Present estimate of the vehicle.
         """
-        return BeliefFlight(self.inner, self.family, self.prior, estimate, self.estimator.dt)
+        return BeliefFlight(self.inner, self.family, self.prior, estimate, self.estimator.dt, self.watches)
 
 
 def vehicle_estimate(family: PathFamily, estimate: PathEstimate) -> VehicleEstimate:

@@ -1,0 +1,58 @@
+"""Detect a vehicle that oscillates by itself, and assume that it is slower until it is calm.
+
+A policy that assumes a faster vehicle than it flies turns back too late and drives the vehicle back and forth. The
+estimate of the vehicle cannot show this, since it may be the cause. The attitude shows it: the tilt swings by many
+times the amount that a push, a gust or a kick causes, and does not stop.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..physics.path_family import PathBelief
+from ..physics.state import STANDARD_GRAVITY, State
+from .swings import Swings
+
+# Size of the swings of the thrust axis, times gravity: the largest kick of the gauntlet reaches 36 for a second, and
+# flights on 60 vehicles with a true belief 15 otherwise; self-induced oscillations stay between 45 and 145.
+LARGE, FULL = 30.0, 60.0
+RISE = 3.0  # [1/s], largest rate of the level
+MEMORY = 6.0  # [s], time constant of its decay; a caution that stays makes the flight inaccurate
+REPORTED = 0.1  # level from which the log reports the oscillation
+SLOWER = (1.0, 1.0, 0.0, 0.0)  # coordinates that the level changes: delay and rate lag
+
+
+class Caution(eqx.Module):
+    """Recent swings of the tilt, and the level of caution that follows from them."""
+
+    swings: Swings
+    level: Float[Array, ""]
+    """0 for the identified vehicle, 1 for the slowest vehicle of the family."""
+
+    @classmethod
+    def none(cls, x: State) -> "Caution":
+        """Return the memory at the start of a flight in the state ``x``."""
+        return cls(Swings.none(_tilt(x)), jnp.zeros_like(x.p[0]))
+
+    def after(self, x: State, dt: float) -> "Caution":
+        """Return the memory after a measurement.
+
+        Args:
+            x: Measured state.
+            dt: Control tick [s].
+        """
+        swings = self.swings.after(_tilt(x), dt)
+        rise = RISE * dt * jnp.clip((swings.size - LARGE) / (FULL - LARGE), 0.0, 1.0)
+        level = jnp.exp(-dt / MEMORY) * self.level + rise
+        return Caution(swings, jnp.minimum(level, 1.0).astype(self.level.dtype))
+
+    def applied(self, belief: PathBelief) -> PathBelief:
+        """Return a belief about a vehicle that is slower by the level of caution."""
+        share = self.level * jnp.array(SLOWER)
+        low, high = (end + share * (1.0 - end) for end in belief.ends)
+        return PathBelief.between(low, high)
+
+
+def _tilt(x: State) -> Float[Array, "3"]:
+    """Return the acceleration by the thrust of a hover at this attitude, world [m/s^2]."""
+    return STANDARD_GRAVITY * x.R[:, 2]

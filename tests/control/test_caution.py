@@ -1,0 +1,106 @@
+"""Caution after a self-induced oscillation: which motions raise it, and what it changes."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax, random
+
+from retrim.control.caution import Caution
+from retrim.control.condition import Cause, Stage
+from retrim.control.controller import AbstractController
+from retrim.control.identified import BeliefFlight
+from retrim.control.vehicle_report import VehicleEstimate
+from retrim.physics import ActuatorResponse, Command, State, small, so3
+from retrim.physics.effects import ExternalEffects
+from retrim.physics.path_family import PathBelief, PathFamily
+from retrim.physics.second_order import SecondOrderQuadrotor
+from retrim.plants.sim import Simulation
+from retrim.runtime.batch import batch_flight
+
+pytestmark = pytest.mark.usefixtures("as_a_user")
+
+DT = 0.02
+
+
+def levels(angles):
+    """Return the level of caution while the vehicle rolls through the angles [rad]."""
+    level = State.at(jnp.zeros(3))
+
+    def step(caution, angle):
+        x = dataclasses.replace(level, R=so3.exp(jnp.array([1.0, 0.0, 0.0]) * angle))
+        caution = caution.after(x, DT)
+        return caution, caution.level
+
+    return np.asarray(lax.scan(step, Caution.none(level), jnp.asarray(angles, dtype=jnp.float32))[1])
+
+
+def test_one_recovery_does_not_raise_it():
+    t = np.arange(0.0, 4.0, DT)
+    assert levels(0.8 * np.sin(7.0 * t) * np.exp(-2.0 * t)).max() == 0.0
+
+
+def test_a_lasting_oscillation_raises_it_and_calm_flight_lowers_it():
+    t = np.arange(0.0, 4.0, DT)
+    level = levels(np.concatenate([0.9 * np.sin(7.0 * t), np.zeros(1500)]))
+    assert level[len(t) - 1] > 0.5
+    assert level[-1] < 0.05
+    assert level.max() <= 1.0
+
+
+def test_it_makes_the_assumed_vehicle_slower_and_changes_nothing_else():
+    belief = PathBelief.between(jnp.array([-0.8, -0.6, -0.3, 0.1]), jnp.array([-0.7, -0.2, 0.5, 0.4]))
+    none = Caution.none(State.at(jnp.zeros(3)))
+    for level in (0.0, 0.4, 1.0):
+        low, high = dataclasses.replace(none, level=jnp.array(level)).applied(belief).ends
+        for found, before in zip((low, high), belief.ends, strict=True):
+            expected = np.array(before) + level * np.array([1.0, 1.0, 0.0, 0.0]) * (1.0 - np.array(before))
+            np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+class Textbook(AbstractController[None]):
+    """A hover with a stiffness that suits the assumed vehicle: it is unstable on one that is much slower."""
+
+    lateness: jnp.ndarray = dataclasses.field(default_factory=lambda: jnp.array(0.1))
+
+    def init(self, x):
+        del x
+
+    def __call__(self, memory, t, x):
+        bandwidth = 0.35 / self.lateness  # [rad/s] of the attitude
+        wish = -((0.3 * bandwidth) ** 2) * x.p - 0.6 * bandwidth * x.v
+        wish = wish * jnp.minimum(1.0, 8.0 / jnp.linalg.norm(wish + 1e-9))
+        axis = jnp.array([0.0, 0.0, 1.0]) + wish * jnp.array([1.0, 1.0, 0.0]) / 9.81
+        error = jnp.cross(x.R[:, 2], axis / jnp.linalg.norm(axis))
+        return Command(9.81 + wish[2], bandwidth * (x.R.T @ error)), None
+
+    def with_vehicle(self, member):
+        return dataclasses.replace(self, lateness=member.lateness)
+
+
+@pytest.mark.parametrize("watches", [False, True])
+def test_an_oscillation_by_a_wrong_estimate_ends(watches):
+    """The estimate states a quarter of delay and lag; without caution the vehicle oscillates by metres to the end."""
+    family = PathFamily.of()
+    response = ActuatorResponse.of(0.03, 0.15, inverse_damping=1.0)
+    limits = (small().command_min, small().command_max)
+    model = SecondOrderQuadrotor(response, jnp.array(1.0), jnp.array(0.3), limits, DT)
+    plant = Simulation(
+        model, lambda t, x: ExternalEffects.calm(x.p.dtype), None, random.key(0), jnp.array(0.05)
+    )
+    wrong = family.coordinates(jnp.array(0.0125), jnp.array(0.0375), jnp.array(0.3), jnp.array(0.03))
+    belief = PathBelief.between(wrong, wrong)
+    flight = BeliefFlight(Textbook(), family, belief, VehicleEstimate(belief, jnp.array(1.0)), DT, watches)
+    start = dataclasses.replace(State.at(jnp.array([0.5, -0.3, 0.0])), R=so3.exp(jnp.array([0.1, 0.0, 0.0])))
+    ticks = batch_flight(plant, flight, start, ticks=600)
+    error = np.linalg.norm(np.asarray(ticks.true.p), axis=-1)
+    if not watches:
+        assert error[-50:].mean() > 1.0
+        assert ticks.condition is None
+        return
+    assert error.max() < 3.0
+    assert error[-50:].mean() < 0.2
+    stages, causes = np.asarray(ticks.condition.stage), np.asarray(ticks.condition.cause)
+    assert stages[0] == Stage.ADAPTED
+    assert causes[stages == Stage.CAUTIOUS][0] == Cause.SWINGS
