@@ -202,7 +202,7 @@ OURS["hover/any"] = OURS["hover/retrim"] | {
     "jump_cost": 0.05,
     "family": {
         "delay": (0.0, 0.1), "rate_lag": (0.01, 0.25), "least_damping": 0.4, "thrust_lag": (0.01, 0.15),
-        "least_frequency": 4.0,
+        "least_frequency": 4.0, "excitation": False,
     },
     "pretrain": OURS["hover/retrim"]["pretrain"]
     | {"num_updates": 1000, "num_envs": 64, "learning_rate": 5e-3, "hidden_sizes": (256, 256)},

@@ -13,6 +13,7 @@ from retrim.config import Setup, changed, load
 from retrim.config.families import prior_belief
 from retrim.control.actuator_tracking import ActuatorTracking
 from retrim.control.controller import AbstractController
+from retrim.control.excitation import Excitation
 from retrim.control.finite_controller import FiniteController
 from retrim.control.identified import IdentifiedFlight
 from retrim.control.integral import IntegralAction
@@ -20,7 +21,7 @@ from retrim.control.near_target import NearTarget
 from retrim.control.vehicle_report import VehicleEstimate
 from retrim.errors import ConfigError
 from retrim.estimation.command_path import PathEstimator, ringing_of
-from retrim.physics import ActuatorResponse, Command, CommandPath, small
+from retrim.physics import ActuatorResponse, Command, CommandPath, State, small
 from retrim.physics.actuator_response import ActuatorState
 from retrim.physics.effects import ExternalEffects
 from retrim.physics.path_family import Member, PathBelief, PathFamily
@@ -56,6 +57,16 @@ class Weak(AbstractController[Command]):
 
     def with_vehicle(self, member):
         return dataclasses.replace(self, member=member)
+
+
+class Still(AbstractController[None]):
+    """Commands the hover thrust of its vehicle, and no rates."""
+
+    def init(self, x):
+        del x
+
+    def __call__(self, memory, t, x):
+        return Command(jnp.asarray(9.81, t.dtype), jnp.zeros(3, t.dtype)), None
 
 
 def simulation(delay, lag, *, damping=1.0, gain=1.0):
@@ -96,6 +107,23 @@ def test_the_vehicle_is_identified_in_flight(x0, delay, lag, gain):
     assert last.belief.half_width[0] < 0.5
     assert abs(float(last.gain) - gain) < 0.1 * gain
     assert np.all(np.asarray(memory.belief.half_width[0]) > 0.9)  # unknown at take-off
+
+
+def test_excitation_identifies_a_vehicle_that_stands_still():
+    """Without the doublets nothing is identified."""
+    flights = {}
+    for name, excitation in {"still": None, "excited": Excitation.of()}.items():
+        controller = IdentifiedFlight(
+            Still(), PathEstimator.of(DT), family(), PathBelief.unknown(), excitation=excitation
+        )
+        start = State.at(jnp.array([0.0, 0.0, 1.0]))
+        flights[name] = fly(simulation(0.04, 0.1, gain=1.2), controller, start)[1].path.estimate
+    estimate = flights["excited"]
+    at = 50  # 1 s
+    assert abs(float(estimate.delay.mean[at]) - 0.04) < 0.008
+    assert abs(float(estimate.rate_lag.mean[at]) - 0.1) < 0.02
+    assert abs(float(estimate.thrust_gain.mean[at]) - 1.2) < 0.024
+    assert not bool(flights["still"].delay.excited[at])
 
 
 def test_belief_and_gain_never_jump(x0):

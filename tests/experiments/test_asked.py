@@ -62,6 +62,18 @@ def test_a_flight_changes_nothing_that_the_weights_were_trained_for():
             same_policy(trained, dataclasses.replace(trained, **_whole(trained, changes)), Path("a.toml"))
 
 
+def test_a_flight_may_excite_a_vehicle_but_not_change_its_family():
+    trained = load("hover/any")
+    excited = changed(trained, family={"excitation": True})
+    assert same_policy(trained, excited, Path("a.toml")) is excited
+    for other, said in (
+        (changed(trained, family={"delay": (0.0, 0.05)}), "family = "),
+        (dataclasses.replace(trained, axes="world"), "axes = 'world', but the policy was trained with 'heading'"),
+    ):
+        with pytest.raises(ConfigError, match=rf"a\.toml: {said}"):
+            same_policy(trained, other, Path("a.toml"))
+
+
 def _whole(preset, changes):
     return {
         name: dataclasses.replace(getattr(preset, name), **value) if isinstance(value, dict) else value

@@ -142,6 +142,13 @@ def test_a_preset_for_one_vehicle_is_refused():
         IdentifierLoop(load("hover/retrim"), BASE, bus())
 
 
+def test_a_live_flight_does_not_excite_its_vehicle(setup):
+    excited = Setup.of(changed(setup.preset, family={"excitation": True}))
+    controller = excited.pilot(excited.new_policy(jax.random.key(0)), "base-id").controller
+    with pytest.raises(ConfigError, match=r"family\.excitation: a live flight does not excite its vehicle"):
+        plain_source(excited, controller)
+
+
 def test_only_a_controller_that_identifies_has_the_half(setup):
     policy = setup.new_policy(jax.random.key(0))
     assert vehicle_half(setup, setup.pilot(policy, "base-id").controller).keys() == {VEHICLE}

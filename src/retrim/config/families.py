@@ -7,6 +7,7 @@ from jaxtyping import Array, Float
 
 from ..control.actuator_tracking import ActuatorTracking
 from ..control.controller import AbstractController, PolicyController
+from ..control.excitation import Excitation
 from ..control.identified import IdentifiedFlight
 from ..control.near_target import NearTarget
 from ..control.policy import Policy
@@ -124,6 +125,7 @@ def identify_vehicle(controller: AbstractController[Any], preset: Preset) -> Ide
         prior,
         declared_vehicle(preset),
         watches=not find_task(preset.task).has_reference,
+        excitation=Excitation.of() if preset.family is not None and preset.family.excitation else None,
     )
 
 

@@ -155,6 +155,9 @@ class Family:
     """Smallest and largest time constant of the thrust [s]."""
     least_frequency: Positive = 4.0
     """Smallest natural frequency omega_n of a rate loop [rad/s]; slower rate loops have more damping."""
+    excitation: bool = False
+    """Whether a flight begins with small doublets of thrust and body rates, until the vehicle is identified. The
+    vehicle moves by a few centimetres. Not in live flights."""
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -20,6 +20,7 @@ from ..physics.state import Command, State
 from .caution import REPORTED, Caution
 from .condition import Cause, Condition, Stage
 from .controller import AbstractController
+from .excitation import Excitation
 from .vehicle_report import VehicleEstimate, VehicleReport
 
 PACE = 2.0  # [1/s]: an unknown coordinate is known after half a second at the earliest
@@ -121,6 +122,8 @@ class IdentifiedFlight(AbstractController[IdentifiedState]):
     """Age of measurements [s]."""
     watches: bool = eqx.field(static=True, default=True)
     """Whether a self-induced oscillation makes it assume a slower vehicle; see :class:`BeliefFlight`."""
+    excitation: Excitation | None = None
+    """Small doublets of the commands until the estimate is narrow; None does not excite the vehicle."""
 
     def with_age(self, age: float | Float[Array, ""]) -> "IdentifiedFlight":
         """Return the same for measurements that are ``age`` old [s]."""
@@ -146,7 +149,12 @@ class IdentifiedFlight(AbstractController[IdentifiedState]):
     def __call__(self, memory: IdentifiedState, t: Float[Array, ""], x: State) -> tuple[Command, IdentifiedState]:
         """Update the identification, and return the command of the controller inside for the present estimate."""
         path = self.estimator.update(memory.path, t, x, self.omega, self.a, self.age)
-        u, flight = self.follow(vehicle_estimate(self.family, path.estimate))(memory.flight, t, x)
+        follower = self.follow(vehicle_estimate(self.family, path.estimate))
+        u, flight = follower(memory.flight, t, x)
+        if self.excitation is not None:
+            doublet = self.excitation(t, path.estimate)
+            u = Command(u.c + doublet.c.astype(u.c.dtype), u.omega + doublet.omega.astype(u.omega.dtype))
+            flight = follower.accepted(flight, u)
         return u, IdentifiedState(self.estimator.issued(path, u), flight)
 
     def accepted(self, memory: IdentifiedState, u: Command) -> IdentifiedState:

@@ -9,7 +9,7 @@ from ..adapt.learner import LearnerState
 from ..config.faults import NO_FAULT
 from ..config.loading import changed, load_for, overlaid, with_vehicle
 from ..config.plants import DELAY, is_vehicle
-from ..config.presets import Preset
+from ..config.presets import Family, Preset
 from ..config.scenario import THRUST_ERROR, Scenario
 from ..config.tasks import find_task
 from ..control.policy import Policy
@@ -142,8 +142,8 @@ def same_policy(trained: Preset, changed_one: Preset, config: Path) -> Preset:
     Raises:
         ConfigError: It changes such a value.
     """
-    for name in ("task", "vehicle", "dt", "command_history", "pretrain"):
-        before, after = getattr(trained, name), getattr(changed_one, name)
+    for name in ("task", "vehicle", "dt", "axes", "command_history", "family", "pretrain"):
+        before, after = (_without_excitation(getattr(each, name)) for each in (trained, changed_one))
         if before != after:
             shown = (f"{name} = {after!r}, but the policy was trained with {before!r}"
                      if name != "pretrain" else "[pretrain] cannot change for a policy that is trained")  # fmt: skip
@@ -154,6 +154,11 @@ def same_policy(trained: Preset, changed_one: Preset, config: Path) -> Preset:
             f"{config}: track.observation = {after_sees!r}, but the policy was trained with {before_sees!r}"
         )
     return changed_one
+
+
+def _without_excitation(value: Any) -> Any:
+    """Return a value of a preset; for a family without the excitation, which the weights do not depend on."""
+    return dataclasses.replace(value, excitation=False) if isinstance(value, Family) else value
 
 
 def asked_preset(

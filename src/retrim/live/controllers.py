@@ -15,6 +15,7 @@ from ..control.condition import Condition
 from ..control.controller import AbstractController
 from ..control.identified import vehicle_estimate
 from ..control.policy import Policy
+from ..errors import ConfigError
 from ..estimation.command_path import PathEstimator
 from ..learn.bptt import PolicyState
 from ..learn.residuals.model import FittedResidual
@@ -89,10 +90,15 @@ def vehicle_half(setup: Setup, controller: AbstractController[Any]) -> dict[str,
     Args:
         setup: Set-up of the flight.
         controller: Controller of the flight.
+
+    Raises:
+        ConfigError: The preset excites the vehicle.
     """
     family = make_family(setup.preset)
     if not controller.identifies or family is None:
         return {}
+    if setup.preset.family is not None and setup.preset.family.excitation:
+        raise ConfigError("family.excitation: a live flight does not excite its vehicle; remove the key or set it to false")
     first = PathEstimator.of(setup.preset.dt).init(State.at(setup.flown.home()))
     return {VEHICLE: vehicle_estimate(family, first.estimate)}
 
