@@ -86,9 +86,7 @@ def test_an_oscillation_by_a_wrong_estimate_ends(watches):
     response = ActuatorResponse.of(0.03, 0.15, inverse_damping=1.0)
     limits = (small().command_min, small().command_max)
     model = SecondOrderQuadrotor(response, jnp.array(1.0), jnp.array(0.3), limits, DT)
-    plant = Simulation(
-        model, lambda t, x: ExternalEffects.calm(x.p.dtype), None, random.key(0), jnp.array(0.05)
-    )
+    plant = Simulation(model, lambda t, x: ExternalEffects.calm(x.p.dtype), None, random.key(0), jnp.array(0.05))
     wrong = family.coordinates(jnp.array(0.0125), jnp.array(0.0375), jnp.array(0.3), jnp.array(0.03))
     belief = PathBelief.between(wrong, wrong)
     flight = BeliefFlight(Textbook(), family, belief, VehicleEstimate(belief, jnp.array(1.0)), DT, watches)

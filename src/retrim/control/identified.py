@@ -88,7 +88,9 @@ class BeliefFlight(AbstractController[BeliefState]):
 
     def accepted(self, memory: BeliefState, u: Command) -> BeliefState:
         """Remember the accepted command."""
-        inner = self._flying(memory.caution.applied(memory.belief)).accepted(memory.inner, Command(u.c * memory.gain, u.omega))
+        inner = self._flying(memory.caution.applied(memory.belief)).accepted(
+            memory.inner, Command(u.c * memory.gain, u.omega)
+        )
         return dataclasses.replace(memory, inner=inner)
 
     def _flying(self, belief: PathBelief) -> AbstractController[Any]:

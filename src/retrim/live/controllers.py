@@ -98,7 +98,9 @@ def vehicle_half(setup: Setup, controller: AbstractController[Any]) -> dict[str,
     if not controller.identifies or family is None:
         return {}
     if setup.preset.family is not None and setup.preset.family.excitation:
-        raise ConfigError("family.excitation: a live flight does not excite its vehicle; remove the key or set it to false")
+        raise ConfigError(
+            "family.excitation: a live flight does not excite its vehicle; remove the key or set it to false"
+        )
     first = PathEstimator.of(setup.preset.dt).init(State.at(setup.flown.home()))
     return {VEHICLE: vehicle_estimate(family, first.estimate)}
 
