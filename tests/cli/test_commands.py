@@ -174,16 +174,22 @@ def test_what_was_adapted_flies_as_it_is_and_the_default_folder_is_a_new_one_und
 
 def test_demo_at_reduced_size(folder, monkeypatch):
     from retrim.config import named_presets as presets
-    from retrim.config.loading import overlaid
+    from retrim.config.loading import changed, overlaid
+    from retrim.experiments import demo
 
     small = overlaid(presets.PRESETS["hover/retrim"], folder / "small.toml")
     monkeypatch.setitem(presets.PRESETS, "hover/retrim", small)
+    any_small = changed(presets.PRESETS["hover/any"], pretrain={"num_envs": 2, "horizon": 20, "hidden_sizes": (8,)})
+    monkeypatch.setitem(presets.PRESETS, "hover/any", any_small)
+    monkeypatch.setattr(demo, "UPDATES", 2)
     out = retrim("demo", "--seconds", "2", "--starts", "1", "--out", "d", cwd=folder)
     assert "adapted, all weights" in out
-    assert [(r["disturbance"], r["method"]) for r in results(folder / "d")["rows"]] == [
-        (level, method) for level in ("none", "small", "large") for method in ("base", "full")
-    ]
+    assert "One quadrotor with a rate loop of 100 ms" in out
+    found = [(r["disturbance"], r["method"]) for r in results(folder / "d")["rows"]]
+    assert found[:6] == [(level, method) for level in ("none", "small", "large") for method in ("base", "full")]
+    assert found[6:] == [("early-step", method) for method in ("base", "indi", "indi", "base-id")]
     assert all((folder / "d" / f"hover_{level}.png").exists() for level in ("none", "small", "large"))
+    assert (folder / "d" / "slow_vehicle.png").exists()
     whole = results(folder / "d")
     assert (whole["preset"], whole["seeds"], len(whole["losses"])) == (small.name, [0], small.pretrain.num_updates)
     assert load_policy(folder / "d")[1] == small

@@ -78,6 +78,7 @@ def test_toml_files_of_pages_are_accepted(tmp_path):
         "my_log": read_map,
         "study": read_sweep,
         "track100": lambda path: overlaid(PRESETS["track/preview"], path),
+        "excite": lambda path: overlaid(PRESETS["hover/any"], path),
         "east": lambda path: tomllib.loads(path.read_text()),
     }
     found = {block["title"]: block["code"] for page in PAGES for block in TOML.finditer(page.read_text())}

@@ -19,6 +19,7 @@ LARGE, FULL = 30.0, 60.0
 RISE = 3.0  # [1/s], largest rate of the level
 MEMORY = 6.0  # [s], time constant of its decay; a caution that stays makes the flight inaccurate
 REPORTED = 0.1  # level from which the log reports the oscillation
+MORE = 0.5  # share by which the gain of the thrust may be larger than estimated
 SLOWER = (1.0, 1.0, 0.0, 0.0)  # coordinates that the level changes: delay and rate lag
 
 
@@ -51,6 +52,16 @@ class Caution(eqx.Module):
         share = self.level * jnp.array(SLOWER)
         low, high = (end + share * (1.0 - end) for end in belief.ends)
         return PathBelief.between(low, high)
+
+    def gain(self, gain: Float[Array, ""]) -> Float[Array, ""]:
+        """Return a gain of the thrust that is larger by the level of caution, so that the commands are smaller.
+
+        Too small a gain makes all loops stiffer; too large a gain costs some centimetres, which the observer removes.
+
+        Args:
+            gain: Estimated gain of the thrust.
+        """
+        return gain * (1.0 + MORE * self.level.astype(gain.dtype))
 
 
 def _tilt(x: State) -> Float[Array, "3"]:

@@ -80,9 +80,9 @@ class BeliefFlight(AbstractController[BeliefState]):
         """Return the command of the controller inside for the present belief about the vehicle."""
         dt = self.dt
         belief = memory.belief.towards(self.estimate.belief, PACE * dt)
-        change = jnp.clip(self.estimate.gain.astype(x.p.dtype) - memory.gain, -GAIN_PACE * dt, GAIN_PACE * dt)
-        gain = memory.gain + change
         caution = memory.caution.after(x, dt) if self.watches else memory.caution
+        wanted = caution.gain(self.estimate.gain.astype(x.p.dtype))
+        gain = memory.gain + jnp.clip(wanted - memory.gain, -GAIN_PACE * dt, GAIN_PACE * dt)
         u, inner = self._flying(caution.applied(belief))(memory.inner, t, x)
         return Command(u.c / gain, u.omega), BeliefState(belief, gain, inner, caution)
 

@@ -1,9 +1,10 @@
 """Pictures of flights."""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 
 import jax
 import numpy as np
@@ -27,7 +28,14 @@ BY_HAND = ("asked", "knobs", "reference")
 
 
 def picture(
-    flights: Sequence[Flight], setup: Setup, scenario: Scenario, folder: Path, *, stem: str | None = None
+    flights: Sequence[Flight],
+    setup: Setup,
+    scenario: Scenario,
+    folder: Path,
+    *,
+    stem: str | None = None,
+    title: str | None = None,
+    labels: Mapping[str, str] = MappingProxyType({}),
 ) -> list[Path]:
     """Draw the flights of one scenario, with all methods in one picture.
 
@@ -37,6 +45,8 @@ def picture(
         scenario: Scenario whose flights are drawn.
         folder: Output folder.
         stem: Name of the files; by default task and disturbance.
+        title: Title of the picture; by default the conditions of the flights.
+        labels: Labels of methods by name; by default those of tables.
 
     Returns:
         Paths of the PNG and the SVG; an empty list if no flight has this scenario.
@@ -46,14 +56,14 @@ def picture(
         return []
     methods = list(dict.fromkeys(f.spec.method for f in shown))
     by = {method: [f for f in shown if f.spec.method == method] for method in methods}
-    names = {method: find_method(method).label.strip("*") for method in methods}
+    names = {method: labels.get(method, find_method(method).label.strip("*")) for method in methods}
     colours = _colours(methods)
     groups = [plots.Group(names[method], [_track(f) for f in by[method]], colours[method]) for method in methods]
     seconds = max(float(track.t[-1]) for group in groups for track in group.tracks)
     task, preset = setup.flown, setup.preset
     where = f"{shown[0].vehicle} on plant {scenario.plant!r}"
     kind = preset.task if ":" in preset.task else preset.task.capitalize()
-    title = f"{kind}: {where}, disturbance {scenario.disturbance!r}, preset {preset.name!r}"
+    title = title or f"{kind}: {where}, disturbance {scenario.disturbance!r}, preset {preset.name!r}"
 
     observation = setup.env.task.observation
     if isinstance(observation, Keypoints):
