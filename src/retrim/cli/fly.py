@@ -71,17 +71,9 @@ def fly(
             from .live import live  # here: other flights do not need this module
 
             return live(
-                policy,
-                resume,
-                where=where,
-                adapt=adapt,
-                residual=residual,
-                seconds=seconds or 30.0,
-                seed=seed,
-                save_vehicle=save_vehicle,
-                trust=trust,
-                out=out,
-            )(stop)
+                policy, resume, where=where, adapt=adapt, residual=residual, seconds=seconds or 30.0, seed=seed,
+                save_vehicle=save_vehicle, trust=trust, out=out,
+            )(stop)  # fmt: skip
         weights, preset, state = loaded(policy, resume, delta, trust=trust)
         if config is not None:
             preset = same_policy(preset, overlaid(preset, config, trust=trust), config)
