@@ -9,7 +9,7 @@ import jax
 import numpy as np
 import pytest
 
-from retrim.learn.devices import shared_by, spread
+from retrim.learn.devices import LEAST_WORK, shared_by, spread, suited
 
 HERE = Path(__file__).parent
 WORK = """
@@ -118,3 +118,16 @@ def test_with_one_device_nothing_is_moved():
     tree = {"x": np.ones((4, 2)), "name": "kept"}
     assert spread(tree) is tree
     assert jax.device_count() == 1
+
+
+def test_small_trainings_stay_on_the_cpu(monkeypatch):
+    """As with one accelerator; here the CPU itself stands for it."""
+    weights = np.zeros(1000)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(jax, "device_count", lambda: 1)
+    for starts, device in ((10, jax.devices("cpu")[0]), (LEAST_WORK // 1000, None)):
+        with suited({"w": weights, "name": "a policy"}, starts):
+            assert jax.config.jax_default_device == device
+    monkeypatch.setattr(jax, "device_count", lambda: 2)
+    with suited(weights, 10):
+        assert jax.config.jax_default_device is None

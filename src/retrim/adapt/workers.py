@@ -14,6 +14,7 @@ from jaxtyping import Array, Key
 from ..control.lora import LoraPolicy
 from ..control.policy import Policy
 from ..learn.bptt import PolicyState
+from ..learn.devices import suited
 from ..learn.screening import describe_counts
 from ..learn.window import Window
 from .gate import Verdict
@@ -70,7 +71,8 @@ class ResidualWorker:
 
     def learn(self, window: Window) -> ResidualUpdate | Rejection:
         """Fit to ``window``."""
-        fitted, report = jax.block_until_ready(self.learner.fit_residual(self._residual, window))
+        with suited(self._residual, 1):
+            fitted, report = jax.block_until_ready(self.learner.fit_residual(self._residual, window))
         return residual_update(float(window.t[-1]), fitted, report)
 
     def receive(self, update: Update) -> None:
@@ -108,7 +110,9 @@ class PolicyWorker:
     def learn(self, window: Window) -> PolicyUpdate | Rejection:
         """Re-train the policy; the window provides starts for the gate."""
         key = self.next_key()
-        trained, verdict = jax.block_until_ready(self.learner.update_policy(self._policy, self._residual, window, key))
+        with suited(self._policy.policy, self.learner.num_envs):
+            updated = self.learner.update_policy(self._policy, self._residual, window, key)
+            trained, verdict = jax.block_until_ready(updated)
         return policy_update(float(window.t[-1]), trained, verdict)
 
     def receive(self, update: Update) -> None:

@@ -13,7 +13,7 @@ from ..control.policy import Policy
 from ..errors import TrainingError
 from ..tasks.task import AbstractTask, Start
 from .bptt import PolicyState, bptt
-from .devices import gathered, spread, whole
+from .devices import gathered, spread, suited, whole
 from .env import Env
 
 PATIENCE = 10  # consecutive steps without a finite loss; fewer are due to bad starts, which are left out
@@ -75,7 +75,8 @@ def pretrain(
     state = PolicyState(policy, optimiser.init(policy.params))
     steps, bad = 0, 0
     for k in random.split(key, num_updates // chunk):
-        state, losses = gathered(train_chunk(state, env, k, optimiser, chunk, num_envs))
+        with suited(policy, num_envs):
+            state, losses = gathered(train_chunk(state, env, k, optimiser, chunk, num_envs))
         for loss in losses.tolist():
             steps, bad = steps + 1, 0 if math.isfinite(loss) else bad + 1
             if bad >= PATIENCE or (bad and steps == num_updates):
