@@ -13,13 +13,13 @@ from retrim.control.attitude import LEAST_LIFT, attitude_of, command_for, flyabl
 from retrim.control.geometric import Gains, Geometric
 from retrim.control.indi import Incremental
 from retrim.estimation.prediction import Prediction
-from retrim.physics import Command, PointMass, State, small, so3
+from retrim.physics import Command, CommandPath, PointMass, State, small, so3
 from retrim.physics.actuators import Lagged
 from retrim.tasks import Preview, Track
 from retrim.tasks.shapes import figure8
 
 DT, TAU = 0.02, 0.033
-PREDICTION = Prediction(jnp.array(TAU), DT, 1)
+PREDICTION = Prediction.of(CommandPath.of(DT, first_order(TAU)), DT)
 LIMITS = small().command_min, small().command_max
 
 

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from jax import lax, random
 
-from helpers import GOAL, hover_task, random_command, random_state
+from helpers import GOAL, first_order, hover_task, random_command, random_state
 from retrim.control.datt import SIZE, Datt, DattNet, _along, datt_command, datt_observation
 from retrim.estimation.l1 import L1Estimator
 from retrim.estimation.prediction import Prediction
 from retrim.learn.datt import KNOWN, DattProblem, reference_bank, ticks_of
 from retrim.learn.ppo import PpoSettings, PpoState, ppo
-from retrim.physics import Command, State, small
+from retrim.physics import Command, CommandPath, State, small
 from retrim.testing import check_controller
 
 pytestmark = pytest.mark.usefixtures("optax_promotion")
@@ -88,7 +88,15 @@ def test_it_learns_and_is_a_controller(key):
     for before, after in zip(jax.tree.leaves(fresh), jax.tree.leaves(net), strict=True):
         assert not eqx.is_array(before) or (not np.array_equal(before, after) and np.isfinite(after).all())
     estimator = L1Estimator(jnp.array(-0.2), jnp.array(0.95), DT)
-    flown = Datt(net, hover_task(), Prediction(jnp.array(TAU), DT, 1), estimator, jnp.array(KNOWN), made.low, made.high)
+    flown = Datt(
+        net,
+        hover_task(),
+        Prediction.of(CommandPath.of(DT, first_order(TAU)), DT),
+        estimator,
+        jnp.array(KNOWN),
+        made.low,
+        made.high,
+    )
     check_controller(flown)
     memory = flown.init(State.at(jnp.array(GOAL)))
     assert not np.any(memory.estimate.d_hat)

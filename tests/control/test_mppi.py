@@ -13,18 +13,21 @@ from helpers import GOAL, first_order, hover_task, random_state
 from retrim.control.mppi import Mppi, _turned
 from retrim.estimation.l1 import L1Estimator
 from retrim.estimation.prediction import Prediction
-from retrim.physics import Command, PointMass, State, small, so3
+from retrim.physics import Command, CommandPath, PointMass, State, small, so3
 from retrim.physics.actuators import Lagged
 
 DT, TAU = 0.02, 0.033
 L1 = L1Estimator(jnp.array(-0.2), jnp.exp(jnp.array(-DT / 0.3)), DT)
 
 
+PREDICTION = Prediction.of(CommandPath.of(DT, first_order(TAU)), DT)
+
+
 def mppi(estimator=None, samples=256, seed=0):
     numbers = (jnp.array(v) for v in (0.1, 0.05, 10.0, 1.0, 1.0))
     return Mppi(
         hover_task(),
-        Prediction(jnp.array(TAU), DT, 1),
+        PREDICTION,
         small().command_min,
         small().command_max,
         random.key(seed),

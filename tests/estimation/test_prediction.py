@@ -8,10 +8,15 @@ from jax import random
 
 from helpers import first_order, random_command, random_state
 from retrim.estimation.prediction import Prediction
-from retrim.physics import Command, PointMass
+from retrim.physics import ActuatorResponse, Command, CommandPath, PointMass
+from retrim.physics.actuator_response import ActuatorState
 from retrim.physics.actuators import Lagged
 
 DT, TAU = 0.02, 0.033
+
+
+def prediction_of(lag, ticks):
+    return Prediction.of(CommandPath.of(ticks * DT, first_order(lag)), DT)
 
 
 @pytest.mark.parametrize("delay", [0, 1, 3])
@@ -20,7 +25,7 @@ def test_it_is_what_the_lagged_model_does(delay, key):
     model, d = Lagged(PointMass(DT), first_order(TAU)), jnp.array([0.5, -1.0, 0.3])
     k_x, *keys = random.split(key, 9)
     s = model.init(random_state(k_x))
-    prediction = Prediction(jnp.array(TAU), DT, delay)
+    prediction = prediction_of(TAU, delay)
     memory = prediction.init(model.state(s))
     queue = [Command.hover(s.inner.p.dtype)] * delay
     for k in keys:
@@ -38,7 +43,7 @@ def test_it_is_what_the_lagged_model_does(delay, key):
 
 def test_what_the_plant_accepted_is_what_counts(key):
     x, (k_a, k_b) = random_state(key), random.split(key)
-    prediction = Prediction(jnp.array(TAU), DT, 1)
+    prediction = prediction_of(TAU, 1)
     issued, accepted = random_command(k_a), random_command(k_b)
     told = prediction.accepted(prediction.issued(prediction.init(x), issued), accepted)
     known = prediction.issued(prediction.init(x), accepted)
@@ -49,9 +54,41 @@ def test_what_the_plant_accepted_is_what_counts(key):
 def test_an_old_measurement_is_brought_to_now(key):
     """A vehicle in a steady turn, seen 20 ms late, is where it is."""
     x, u = random_state(key), random_command(key)
-    prediction = Prediction(jnp.array(1e-6), DT, 0)
+    prediction = prediction_of(0.0, 0)
     memory = prediction.issued(prediction.init(x), u)
     now = PointMass(DT).step(x, u, jnp.zeros(3))
     late, _ = prediction.with_age(DT)(memory, x, jnp.zeros(3))
     np.testing.assert_allclose(late.R, now.R, atol=1e-9)
     np.testing.assert_allclose(late.p, now.p, atol=5e-3)  # its acceleration is taken as constant
+
+
+def test_a_delay_between_two_ticks_and_a_ringing_rate_loop(key):
+    """The model with the same path, simulated in 1 ms, is in the predicted state when the command begins to act."""
+    delay, fine = 0.033, 0.001
+    response = ActuatorResponse.of(0.05, jnp.array([0.08, 0.1, 0.2]), inverse_damping=1.6)
+    prediction, d = Prediction.of(CommandPath.of(delay, response), DT), jnp.array([0.5, -1.0, 0.3])
+    k_x, *keys = random.split(key, 7)
+    x, model = random_state(k_x), PointMass(fine)
+    memory, actuators = prediction.init(x), ActuatorState.at(Command.hover(x.p.dtype))
+    commands = [random_command(k) for k in keys]
+    arrivals = [round((n * DT + delay) / fine) for n in range(len(commands))]
+    expected = {}
+    for n, u in enumerate(commands):
+        expected[arrivals[n]] = prediction(memory, x, d) if n == len(commands) - 1 else None
+        memory = prediction.issued(memory, u)
+        for k in range(round(n * DT / fine), round((n + 1) * DT / fine)):
+            x, actuators = _fine_step(model, response, commands, arrivals, k, x, actuators, d)
+    ((at, found),) = ((at, found) for at, found in expected.items() if found is not None)
+    for k in range(len(commands) * round(DT / fine), at):
+        x, actuators = _fine_step(model, response, commands, arrivals, k, x, actuators, d)
+    np.testing.assert_allclose(found[0].p, x.p, atol=2e-4)
+    np.testing.assert_allclose(found[0].v, x.v, atol=5e-3)
+    np.testing.assert_allclose(found[1].vector(), actuators.command.vector(), atol=1e-6)
+
+
+def _fine_step(model, response, commands, arrivals, k, x, actuators, d):
+    arrived = [n for n, at in enumerate(arrivals) if at <= k]
+    u = commands[arrived[-1]] if arrived else Command.hover(x.p.dtype)
+    away, actuators = response(actuators, u, model.dt)
+    mean = jax.tree.map(lambda target, each: target + each / model.dt, response.target(u), away)
+    return model.step(x, mean, d), actuators

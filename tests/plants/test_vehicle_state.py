@@ -13,7 +13,9 @@ from made_up_vehicle import PointVehicle
 from retrim.estimation.prediction import Prediction, Underway
 from retrim.live.vehicle_process import _sample
 from retrim.onboard.guard import Limits
-from retrim.physics import Command, State
+from retrim.physics import Command, CommandPath, State
+from retrim.physics.actuator_response import ActuatorState
+from retrim.physics.command_path import CommandQueue
 from retrim.plants.bridges.vehicle_state import LONGEST_S, VehicleState
 
 ages = st.floats(0.0, LONGEST_S)
@@ -91,8 +93,9 @@ def at(t):
 def worked_with(x, age):
     """What a controller that looks ahead takes for the present state."""
     acting = Command(jnp.array(THRUST), jnp.array(SPIN))
-    prediction = Prediction(jnp.array(1e-6), 0.02).with_age(age)
-    return prediction(Underway(acting, (acting,)), x, jnp.zeros(3))[0]
+    prediction = Prediction.of(CommandPath.of(), 0.02).with_age(age)
+    queue = CommandQueue.of(acting, 0.02, longest=0.0)
+    return prediction(Underway(ActuatorState.at(acting), queue), x, jnp.zeros(3))[0]
 
 
 def agrees(found, true):

@@ -20,6 +20,8 @@ from ..control.mppi import Mppi
 from ..estimation.l1 import L1Estimator
 from ..estimation.prediction import Prediction
 from ..learn.datt import KNOWN
+from ..physics.actuator_response import ActuatorResponse
+from ..physics.command_path import CommandPath
 from ..tasks.occluded import OccludedKeypoints
 from .command_paths import ACTUATOR_LAG, declared_path, lag_of
 
@@ -64,9 +66,10 @@ class Baseline:
 
 def prediction_of(setup: "Setup") -> Prediction:
     """Return the nominal model of the vehicle of a preset."""
-    preset, lag = setup.preset, lag_of(setup.preset, setup.vehicle)
-    tau = jnp.array(ACTUATOR_LAG) if lag is None else lag.omega[0]  # roll lag for all axes: a baseline hardly yaws
-    return Prediction(tau, preset.dt, preset.plant_delay_ticks)
+    path = declared_path(setup.preset, setup.vehicle)
+    if lag_of(setup.preset, setup.vehicle) is None:
+        path = CommandPath(path.delay, ActuatorResponse.of(ACTUATOR_LAG, ACTUATOR_LAG))
+    return Prediction.of(path, setup.preset.dt)
 
 
 def slowness(setup: "Setup") -> float:

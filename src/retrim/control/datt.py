@@ -130,7 +130,7 @@ class Datt(AbstractController[DattState]):
         estimate = self.estimator(memory.estimate, t, x, thrust)
         d = jnp.clip(estimate.d_hat, -self.known, self.known)
         soon, acting = self.prediction(memory.underway, x, estimate.d_hat)
-        times = t + self.prediction.delay_ticks * self.prediction.dt + APART * jnp.arange(AHEAD, dtype=t.dtype)
+        times = t + self.prediction.path.delay.astype(t.dtype) + APART * jnp.arange(AHEAD, dtype=t.dtype)
         ahead = jax.vmap(self.task.target)(times)
         mean, _ = self.net(datt_observation(soon, acting, d, ahead))
         u = datt_command(mean, self.low, self.high)

@@ -18,6 +18,7 @@ from jaxtyping import Array, Float, Int, Key
 from ..estimation.l1 import L1Estimator, L1State
 from ..estimation.prediction import Prediction, Underway
 from ..physics import so3
+from ..physics.actuator_response import FASTEST
 from ..physics.actuators import lagged
 from ..physics.state import STANDARD_GRAVITY, Command, State
 from ..tasks.abstract_reference import Point
@@ -83,7 +84,8 @@ class Mppi(AbstractController[MppiState]):
             estimate = self.estimator(estimate, t, x, self.prediction.thrust(underway, memory.last.R, x.R))
         soon, acting = self.prediction(underway, x, estimate.d_hat)
         dt = self.prediction.dt
-        times = t + dt * (self.prediction.delay_ticks + 1 + jnp.arange(self.horizon, dtype=dtype))
+        begin = t.astype(dtype) + self.prediction.path.delay.astype(dtype)
+        times = begin + dt * (1 + jnp.arange(self.horizon, dtype=dtype))
         wanted = jax.vmap(self.task.wanted)(times)
         low, high = self.low.vector().astype(dtype), self.high.vector().astype(dtype)
         drawn = random.normal(random.fold_in(self.key, memory.tick), (self.horizon, 4, self.samples), dtype)
@@ -119,7 +121,10 @@ class Mppi(AbstractController[MppiState]):
     ) -> Float[Array, " samples"]:
         """Return the cost of each plan. Samples are along the last axis, so that every operation has long rows."""
         dt, dtype = self.prediction.dt, x.p.dtype
-        tau = self.prediction.tau.astype(dtype)
+        response = self.prediction.path.response
+        # The plans neglect the ringing of the rate loops.
+        lags = jnp.concatenate([response.thrust_lag[None], response.rate_lag]).astype(dtype)
+        tau = jnp.maximum(lags, FASTEST)[:, None]
         pull = d + jnp.array([0.0, 0.0, -STANDARD_GRAVITY], dtype=dtype)
 
         def rows(a: Array) -> Array:

@@ -1,13 +1,16 @@
 """Prediction of the state at the time when the next command begins to act."""
 
 import dataclasses
+import math
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..physics.actuators import lagged
-from ..physics.dynamics import PointMass
+from ..physics.actuator_response import FASTEST, ActuatorState
+from ..physics.command_path import ROUNDING, CommandPath, CommandQueue
+from ..physics.dynamics import runge_kutta
 from ..physics.state import Command, State
 from .latency import ahead
 
@@ -15,23 +18,32 @@ from .latency import ahead
 class Underway(eqx.Module):
     """Commands under way to a vehicle, and the state of its actuators."""
 
-    before: Command
-    """Command that acted at the beginning of the tick that has just ended, after the actuator lag."""
-    commands: tuple[Command, ...]
-    """Commands of the last ticks, oldest first; the oldest acted during the tick that has just ended."""
+    before: ActuatorState
+    """State of the actuators at the beginning of the tick that has just ended."""
+    queue: CommandQueue
+    """Commands of the last ticks; the newest was issued for the tick that has just ended."""
 
 
 class Prediction(eqx.Module):
-    """Eq. (1) of the paper with the declared actuator lag and command delay of a vehicle."""
+    """Eq. (1) of the paper behind the declared command path of a vehicle."""
 
-    tau: Float[Array, ""]
-    """Time constant of the actuators [s]."""
+    path: CommandPath
     dt: float = eqx.field(static=True)
     """Control tick [s]."""
-    delay_ticks: int = eqx.field(static=True, default=0)
-    """Declared command delay [ticks]."""
+    ticks: int = eqx.field(static=True)
+    """Delay of the path in ticks, rounded up; a static number, since most vehicles need one step of prediction."""
     age: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(0.0))
     """Age of measurements [s]."""
+
+    @classmethod
+    def of(cls, path: CommandPath, dt: float) -> "Prediction":
+        """Return the prediction for a command path.
+
+        Args:
+            path: Declared command path.
+            dt: Control tick [s].
+        """
+        return cls(path, dt, math.ceil(float(path.delay) / dt - ROUNDING))
 
     def with_age(self, age: float | Float[Array, ""]) -> "Prediction":
         """Return the same for measurements that are ``age`` old [s]."""
@@ -40,11 +52,11 @@ class Prediction(eqx.Module):
     def init(self, x: State) -> Underway:
         """Return the memory of a vehicle that has hovered until now."""
         hover = Command.hover(x.p.dtype)
-        return Underway(hover, (hover,) * (self.delay_ticks + 1))
+        return Underway(ActuatorState.at(hover), CommandQueue.of(hover, self.dt, longest=self.ticks * self.dt))
 
-    def acted(self, s: Underway) -> tuple[Command, Command]:
-        """Return the mean command that acted over the tick that has just ended, and the one that acts at its end."""
-        return lagged(s.before, s.commands[0], self.dt, self.tau.astype(s.before.c.dtype))
+    def acted(self, s: Underway) -> tuple[Command, ActuatorState]:
+        """Return mean thrust and rates over the tick that has just ended, and the state of the actuators at its end."""
+        return self.path.advance(s.queue, s.before, self.dt)
 
     def thrust(self, s: Underway, before: Float[Array, "3 3"], after: Float[Array, "3 3"]) -> Float[Array, "3"]:
         """Return the mass-normalised thrust over the tick that has just ended, world [m/s^2].
@@ -67,19 +79,24 @@ class Prediction(eqx.Module):
             d: Disturbance, world [m/s^2].
             omega: Measured body rates [rad/s]; None for those that follow from the commands.
         """
-        _, acting = self.acted(s)
+        _, actuators = self.acted(s)
         if omega is not None:
-            acting = Command(acting.c, omega)
-        x = ahead(x, acting, d, self.age.astype(x.p.dtype))
-        for u in s.commands[1:]:
-            mean, acting = lagged(acting, u, self.dt, self.tau.astype(x.p.dtype))
-            x = PointMass(self.dt).step(x, mean, d)
-        return x, acting
+            actuators = dataclasses.replace(actuators, command=Command(actuators.command.c, omega))
+        x = ahead(x, actuators.command, d, self.age.astype(x.p.dtype))
+        delay, response = self.path.delay.astype(x.p.dtype), self.path.response
+        for back in range(self.ticks, 0, -1):  # ticks since the command was issued
+            u: Command = jax.tree.map(lambda leaf, at=-back: leaf[at], s.queue.commands)
+            h = jnp.clip(delay - (back - 1) * self.dt, 0.0, self.dt)
+            away, actuators = response(actuators, u, h)
+            over = jnp.maximum(h, FASTEST)
+            mean = jax.tree.map(lambda target, each, over=over: target + each / over, response.target(u), away)
+            x = runge_kutta(x, mean, d, h)
+        return x, actuators.command
 
     def issued(self, s: Underway, u: Command) -> Underway:
         """Return the memory after the command ``u`` was issued for the tick that begins."""
-        return Underway(self.acted(s)[1], (*s.commands[1:], u))
+        return Underway(self.acted(s)[1], s.queue.push(u))
 
     def accepted(self, s: Underway, u: Command) -> Underway:
         """Return the memory after the plant accepted ``u`` instead of the command that was issued last."""
-        return Underway(s.before, (*s.commands[:-1], u))
+        return Underway(s.before, s.queue.amend(u))

@@ -25,14 +25,14 @@ class LagState(eqx.Module, Generic[X]):
     actuators: ActuatorState
 
 
-def lagged(acting: U, u: U, dt: float, tau: Float[Array, ""] | Command) -> tuple[U, U]:
+def lagged(acting: U, u: U, dt: float, tau: Float[Array, "*axes"] | Command) -> tuple[U, U]:
     """Return the output of a first-order lag for a command over a tick.
 
     Args:
         acting: Command at the actuators at the beginning of the tick; or arrays of commands.
         u: Command that reaches them, of the same kind.
         dt: Length of the tick [s].
-        tau: Time constant [s], of all parts or of each part of a command.
+        tau: Time constant [s], of all parts or of each part of a command; an array broadcasts with arrays of commands.
 
     Returns:
         Mean output over the tick, and output at its end.

@@ -151,12 +151,26 @@ class CommandPath(eqx.Module):
             Mean of thrust and body rates over the tick, and the state at its end.
         """
         queue = s.queue.push(u)
+        mean, end = self.advance(queue, s.actuators, dt)
+        return mean, PathState(queue, end)
+
+    def advance(self, queue: CommandQueue, actuators: ActuatorState, dt: float) -> tuple[Command, ActuatorState]:
+        """Advance the actuators by the tick whose command is the newest of the queue.
+
+        Args:
+            queue: Commands.
+            actuators: State at the beginning of the tick.
+            dt: Length of the tick [s].
+
+        Returns:
+            Mean of thrust and body rates over the tick, and the state at its end.
+        """
         before, after, change = queue.pieces(self.delay, dt)
-        first, middle = self.response(s.actuators, before, change)
+        first, middle = self.response(actuators, before, change)
         second, end = self.response(middle, after, dt - change)
         target = self.response.target(queue.arrival(self.delay, dt))
         mean = jax.tree.map(lambda each, a, b: each + (a + b) / dt, target, first, second)
-        return mean, PathState(queue, end)
+        return mean, end
 
     def thrust(self, queue: CommandQueue, c: Float[Array, ""], dt: float) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """Advance the thrust alone by the tick whose command is the newest of the queue.

@@ -102,15 +102,26 @@ class PointMass(AbstractDynamics[State]):
 
     def step(self, s: State, u: Command, a_ext: Float[Array, "3"]) -> State:
         """Advance by one Runge-Kutta step of ``dt`` seconds."""
-        h = self.dt
-        middle = so3.mul(s.R, so3.exp(0.5 * h * u.omega))
-        end = so3.mul(s.R, so3.exp(h * u.omega))
-        a1 = f_a(s, u, a_ext).v
-        a2 = f_a(State(s.p, middle, s.v), u, a_ext).v  # = a3, since the acceleration depends on R, c and a_ext alone
-        a4 = f_a(State(s.p, end, s.v), u, a_ext).v
-        p = s.p + h * s.v + h**2 / 6.0 * (a1 + 2.0 * a2)
-        v = s.v + h / 6.0 * (a1 + 4.0 * a2 + a4)
-        return State(p, end, v)
+        return runge_kutta(s, u, a_ext, self.dt)
+
+
+def runge_kutta(s: State, u: Command, a_ext: Float[Array, "3"], h: float | Float[Array, ""]) -> State:
+    """Return the state after one step of Eq. (1); see :class:`PointMass`.
+
+    Args:
+        s: State.
+        u: Command, held over the step.
+        a_ext: External acceleration, world [m/s^2].
+        h: Length of the step [s]; zero is allowed.
+    """
+    middle = so3.mul(s.R, so3.exp(0.5 * h * u.omega))
+    end = so3.mul(s.R, so3.exp(h * u.omega))
+    a1 = f_a(s, u, a_ext).v
+    a2 = f_a(State(s.p, middle, s.v), u, a_ext).v  # = a3, since the acceleration depends on R, c and a_ext alone
+    a4 = f_a(State(s.p, end, s.v), u, a_ext).v
+    p = s.p + h * s.v + h**2 / 6.0 * (a1 + 2.0 * a2)
+    v = s.v + h / 6.0 * (a1 + 4.0 * a2 + a4)
+    return State(p, end, v)
 
 
 @runtime_checkable
