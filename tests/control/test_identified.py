@@ -69,12 +69,17 @@ class Still(AbstractController[None]):
         return Command(jnp.asarray(9.81, t.dtype), jnp.zeros(3, t.dtype)), None
 
 
-def simulation(delay, lag, *, damping=1.0, gain=1.0):
+def simulation(delay, lag, *, damping=1.0, gain=1.0, lift=0.0):
+    """Return a vehicle that is lifted by ``lift`` [m/s^2] from 2 s on."""
     limits = (small().command_min, small().command_max)
     response = ActuatorResponse.of(0.03, lag, inverse_damping=1.0 / damping, thrust_gain=gain)
-    calm = lambda t, x: ExternalEffects.calm(x.p.dtype)  # noqa: E731
+
+    def lifted(t, x):
+        push = jnp.where(t >= 2.0, lift, 0.0) * jnp.array([0.0, 0.0, 1.0], x.p.dtype)
+        return dataclasses.replace(ExternalEffects.calm(x.p.dtype), push=push.astype(x.p.dtype))
+
     model = SecondOrderQuadrotor(response, jnp.array(1.0), jnp.array(0.3), limits, DT)
-    return Simulation(model, calm, None, random.key(0), jnp.array(delay))
+    return Simulation(model, lifted, None, random.key(0), jnp.array(delay))
 
 
 @eqx.filter_jit
@@ -124,6 +129,17 @@ def test_excitation_identifies_a_vehicle_that_stands_still():
     assert abs(float(estimate.rate_lag.mean[at]) - 0.1) < 0.02
     assert abs(float(estimate.thrust_gain.mean[at]) - 1.2) < 0.024
     assert not bool(flights["still"].delay.excited[at])
+
+
+@pytest.mark.parametrize("lift", [2.0, -2.0])
+def test_a_push_is_not_a_gain_of_the_thrust(x0, lift):
+    """The controller reduces its thrust under a lift, as it would with a larger gain."""
+    controller = IdentifiedFlight(Weak(), PathEstimator.of(DT), family(), PathBelief.unknown())
+    for senses in (True, False):
+        plant = simulation(0.02, 0.08, gain=0.8, lift=lift)
+        _, memory = fly(plant, controller, x0, ticks=300, senses=senses)
+        gain = memory.path.estimate.thrust_gain
+        assert np.abs(np.asarray(gain.mean)[60:] - 0.8).max() < 0.04
 
 
 def test_belief_and_gain_never_jump(x0):

@@ -92,7 +92,7 @@ def _linear_channel(kind, kinds, sigma, n=60):
             jnp.zeros(()),
             jnp.zeros(()),
         )
-        channel = channel.measured(jnp.array(features, float)[None], sample, jnp.ones(()), DT)
+        channel = channel.measured(jnp.array(features, float)[None], sample, jnp.ones(()), DT, pushed=True)
         if k % 10 == 9:
             channel = channel.predicted_by(posterior.path_posterior(channel, prior, None, DT))
         u = np.array([0.0, 0.0, 0.0, rng.choice([-1.0, 1.0])])

@@ -178,8 +178,8 @@ class PathEstimator(eqx.Module):
             turned = Reading(omega, jnp.all(jnp.abs(omega) < RATE), DIRECT, jnp.zeros_like(age), 0.0)
             turning = omega
         now = s.channels
-        rates = now.rates.measured(features[1:3], turned.sample(slice(0, 2), none[1:3]), keep, dt)
-        yaw = now.yaw.measured(features[3:], turned.sample(slice(2, 3), none[3:]), keep, dt)
+        rates = now.rates.measured(features[1:3], turned.sample(slice(0, 2), none[1:3]), keep, dt, pushed=False)
+        yaw = now.yaw.measured(features[3:], turned.sample(slice(2, 3), none[3:]), keep, dt, pushed=False)
 
         settled = certain & (s.elapsed > SETTLING)
         up = jnp.array([0.0, 0.0, STANDARD_GRAVITY], dtype)
@@ -188,9 +188,8 @@ class PathEstimator(eqx.Module):
         fading = jnp.exp(-s.elapsed / jnp.array(FADING, dtype))
         other = jnp.concatenate([drag[None], fading])[None]
         lift = jnp.sum(axis * ((x.v - s.x.v) / dt + up)) - STANDARD_GRAVITY
-        thrust = now.thrust.measured(
-            features[:1], Reading(lift[None], settled, DIFFERENCE, age, dt).sample(slice(0, 1), other), keep, dt
-        )
+        lifted = Reading(lift[None], settled, DIFFERENCE, age, dt).sample(slice(0, 1), other)
+        thrust = now.thrust.measured(features[:1], lifted, keep, dt, pushed=True)
         force = now.force
         if a is not None:
             # The accelerometer has no latency, even if the attitude has.
@@ -199,7 +198,7 @@ class PathEstimator(eqx.Module):
             lift = jnp.sum(axis * (a + up)) - STANDARD_GRAVITY
             usable = settled & jnp.all(jnp.abs(a) < ACCELERATION)
             now_read = Reading(lift[None], usable, DIRECT, jnp.zeros_like(age), dt)
-            force = force.measured(features[:1], now_read.sample(slice(0, 1), other), keep, dt)
+            force = force.measured(features[:1], now_read.sample(slice(0, 1), other), keep, dt, pushed=True)
         channels = Channels(rates, yaw, thrust, force)
         return PathState(history, x, t, s.elapsed + dt, consistency, channels, s.estimate)
 

@@ -52,8 +52,16 @@ class Whitening(eqx.Module):
         innovation: Float[Array, "kinds axes columns"],
         kinds: Float[Array, "kinds 2"],
         counts: Bool[Array, ""],
+        jumped: Bool[Array, ""],
     ) -> "Whitening":
-        """Return the memory after a row with this innovation; if it does not count, only the time advances."""
+        """Return the memory after a row with this innovation.
+
+        Args:
+            innovation: Result of :meth:`innovation`.
+            kinds: :data:`DIRECT` or :data:`DIFFERENCE`.
+            counts: Whether the row counts; otherwise only the time advances.
+            jumped: Whether the disturbance has jumped, so that nothing is known about it.
+        """
         mu, wander = kinds.T
         b, cross, error = self.spread.T
         cross, error = mu * cross, mu**2 * error
@@ -64,8 +72,9 @@ class Whitening(eqx.Module):
         left = (b * (error + 1.0) - cross**2) / total
         seen = jnp.stack([left + wander, gain, 1.0 - 1.0 / total], axis=1)
         passed = jnp.stack([b + wander, jnp.zeros_like(b), jnp.ones_like(b)], axis=1)
+        unknown = jnp.stack([jnp.full_like(b, DIFFUSE), jnp.zeros_like(b), jnp.ones_like(b)], axis=1)
         return Whitening(
             self.disturbance + jnp.where(counts, gain, 0.0)[:, None, None] * innovation,
             jnp.where(counts, 1.0 / total, 0.0)[:, None, None] * innovation,
-            jnp.where(counts, seen, passed),
+            jnp.where(jumped, unknown, jnp.where(counts, seen, passed)),
         )
