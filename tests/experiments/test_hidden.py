@@ -109,7 +109,7 @@ def test_the_table_has_a_row_for_each_flight(tmp_path, imagine, drawn, monkeypat
         assert row["lost"] == (row["method"] == "indi")
         assert all((row[name] is None) == row["lost"] for name in columns)
     text = (tmp_path / "hidden.md").read_text()
-    assert "| `" + preset + "` | INDI | not told | 12 of 12 | ∞ / ∞ / ∞ |" in text
+    assert "| `" + preset + "` | INDI | not known | 12 of 12 | ∞ / ∞ / ∞ |" in text
 
 
 def test_what_cannot_be_flown_is_refused_before_training(tmp_path):

@@ -34,7 +34,7 @@ def figures_table(found: Sequence[dict[str, Any]], title: str, levels: Mapping[s
     about = (
         "The interval is a bootstrap's over seeds and flights that did not crash; medians are over all flights, a "
         "crash counting as infinite; "
-        "rates are root mean squares of what is commanded after 5 s."
+        "rates are root mean squares of the commands after 5 s."
     )
     return TableSection(("method", *columns), lines, f"{title}: {levels[level]}", about)
 

@@ -21,7 +21,7 @@ from .study import table_presets
 
 INTRO = """\
 Made by `retrim reproduce efficiency`. Steps are control ticks of one simulated vehicle. Training: its time without
-compiling, and what compiling took, both cold or from the compile cache as the machine had it. An update in flight: a
+compiling, and the time of compiling, which depends on the compile cache of the machine. An update in flight: a
 fit of the residual on the window, and a re-training of the policy, each the median of nine runs on all cores of an idle
 process; the window is all the flight data that an update needs. A decision: the median of 200, in one call from Python.
 The paper's figures are from a workstation with a large GPU."""

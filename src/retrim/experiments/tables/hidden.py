@@ -31,7 +31,7 @@ INTRO = """\
 Made by `retrim gauntlet --vehicles hidden{option}`: {count} vehicles, drawn from one size factor (seed {seed}), from
 30 g to 3 kg: lag of the body rates 15 to 150 ms (second order, damping ratio 0.4 to 1.2), command delay 0 to 60 ms,
 thrust lag 10 to 80 ms, thrust gain 0.6 to 1.6, and at full command 1.4 times the weight or more. Plant `second-order`,
-{sensors} sensors. Vehicle "not told": the method receives no vehicle file. Vehicle "known": the method receives the
+{sensors} sensors. Vehicle "not known": the method receives no vehicle file. Vehicle "known": the method receives the
 true mass, limits, delay and lags, but not the thrust gain. lost: flights that left the bounds. {metrics} Cells: median
 over all flights, 95th percentile, and worst; a lost flight counts as infinite (∞)."""
 
@@ -276,7 +276,7 @@ def _section(
         cells = [_quantiles([row[name] for row in own], name) for name in scoring.columns]
         survived = [row[coloured] for row in own if row[coloured] is not None]
         cells += [metres(float(np.mean(survived))) if survived else "-"] if means else []
-        known = "known" if entrant.told else "not told"
+        known = "known" if entrant.told else "not known"
         lines.append((f"`{entrant.preset}`", label, known, f"{lost} of {len(own)}", *cells))
         worst = np.full(len(vehicles), -np.inf)
         for row in own:

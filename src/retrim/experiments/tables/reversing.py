@@ -32,7 +32,7 @@ INTRO = """\
 Made by `retrim reproduce reversing`. ±0.5 m/s² on each axis, reversed every 15 s. Mean error [m] over a second, or
 over the time between two updates if that is less: before the reversal, before the next update takes effect, and
 before later ones or the next reversal (of many, the 1st, 2nd, 4th, 8th and so on); mean ± standard deviation over
-flights. The first update that takes effect after a reversal was still learnt before it. Learning is charged to
+flights. The first update that takes effect after a reversal was still computed before it. Learning is charged to
 flight time by the preset's fixed latencies."""
 
 

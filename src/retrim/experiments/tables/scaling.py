@@ -66,10 +66,10 @@ def scaling(
     refuse_misfits(loaded, scenarios, methods=METHODS, starts=1, seconds=seconds)
     intro = (
         f"Made by `retrim reproduce scaling`: flights of {seconds:g} s on plant `bem` in gusts or "
-        "with a load, half of them adapting twice a second, in lots of at most 64 on each core; flights are scored and "
-        "forgotten as they land. Compiling: what was not in the machine's compile cache; what another core flew "
-        "meanwhile counts as compiling, so that a second has fewer flights than it says where much was compiled. "
-        "Memory: the most that the process had until then."
+        "with a load, half of them adapting twice a second, in batches of at most 64 on each core; flights are "
+        "scored when they end, and not stored. Compiling: programs that were not in the compile cache of the machine; "
+        "flights on another core during that time count as compiling, so that the stated rate of flights is too large "
+        "if much was compiled. Memory: the largest memory of the process until then."
     )
     document = Document(run, "scaling", "Flights by the thousand", intro, [0], reporter)
     study = train_all(loaded, (0,), run, reporter)

@@ -36,7 +36,7 @@ PAPER: dict[str, PaperRows] = {  # Table II [m]
     },
 }
 INTRO = """\
-Made by `retrim reproduce track`. Mean distance from where the reference is at the time [m], over the last 10
+Made by `retrim reproduce track`. Mean distance from the present point of the reference [m], over the last 10
 s: mean ± standard deviation over flights. In step: after the best constant shift in time. Cross-track:
 distance from the nearest point of the lap. Small quadrotor. Presets `track/retrim` and `track/preview`: one
 policy, trained on all three references, observes them ahead; `track/retrim` flies and adapts in the frame of

@@ -10,10 +10,10 @@ from .levels import Levels, fly_levels
 from .study import table_presets
 
 INTRO = """\
-Made by `retrim reproduce transfer`. What the paper flew for real, on the blade-element plant: a load of 70 g below the
+Made by `retrim reproduce transfer`. The real flights of the paper, on the blade-element plant: a load of 70 g below the
 small quadrotor (190 g become 260 g, +37 %, and another inertia), a fan that blows diagonally, and policies of the small
 quadrotor on the large one (600 g, other rotors, another rate controller's response). Error over the last 2 s of hover
-and the last 10 s of tracking [m]: mean ± standard deviation over flights. No method knows of load, fan or vehicle; the
+and the last 10 s of tracking [m]: mean ± standard deviation over flights. No method knows load, fan or vehicle; the
 thrust command is normalised by the mass that the flight controller knows. Learning is charged to flight time by the
 preset's fixed latencies. The paper gives no figures for these flights."""
 FLOWN = ("base", "base-i", "base-do", "geometric-i", "indi", "l1-mpc", "full", "lora")

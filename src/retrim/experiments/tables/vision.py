@@ -27,9 +27,9 @@ TITLES = {
 INTRO = """\
 Made by `retrim reproduce vision`. Steady-state error [m], the mean over the last 2 s: mean ± standard deviation
 over flights. Small quadrotor; seven points on the ground, five frames, three past commands, no state. The
-residual is learnt from the state, as in the paper. Learning is charged to flight time by the preset's fixed
+residual is learned from the state, as in the paper. Learning is charged to flight time by the preset's fixed
 latencies. Controllers without a policy fly by the estimate of the pose filter, which sees the points that the
-policy sees; INDI has an inertial unit beside it, which the policy has not. In brackets the paper's figures,
+policy sees; INDI also has an inertial unit, which the policy does not have. In brackets the paper's figures,
 which are from its own plant."""
 
 
