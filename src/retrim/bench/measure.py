@@ -24,8 +24,8 @@ COLUMNS = (
 INTRO = """\
 Made by `retrim bench`. Each work runs in a process of its own, from an empty compile cache unless the work names
 another one; where one core is given, the process was kept on one. Times are medians. A unit is the time of this
-machine, on as many cores and in the same seconds, for 1,000 products of 10 rows with a matrix of 512 x 512 in a scan, so
-units compare machines where seconds do not. of the limit: the time of the products of an update at the rate of a unit,
+machine, on as many cores and in the same seconds, for 1,000 products of 10 rows with a matrix of 512 x 512 in a scan.
+Units compare machines where seconds do not. of the limit: the time of the products of an update at the rate of a unit,
 as a share of its time. Where there is an accelerator, the process of all cores uses it, and that of one core
 does not. paper: reported for an RTX 4090. peak: memory of the process, JAX included."""
 

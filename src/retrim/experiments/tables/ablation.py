@@ -27,7 +27,8 @@ REFERENCES: dict[str, tuple[str | None, ...]] = {"hover": (None,), "track": ("ci
 INTRO = """\
 Made by `retrim reproduce ablation`. Mean error after 5 s of flight [m]: mean ± standard deviation over training seeds
 and starts; the error after a change of the world counts, and not only the error at the end. Small quadrotor on
-plant `bem`, ideal sensors. Learning is charged to flight time by fixed latencies. A setting of pretraining has its own policies."""
+plant `bem`, ideal sensors. Learning is charged to flight time by fixed latencies. A setting of pretraining has its own
+policies."""
 
 
 def ablation(
