@@ -68,7 +68,7 @@ test-links: dev
 # A sweep by a Dask scheduler and three workers, one of which is killed, while the connection is cut for five seconds; and
 # what eight simulated devices share, beside one.
 test-cluster: dev
-	$(BIN)/pytest -n 0 -m slow tests/experiments/test_cluster.py tests/learn/test_devices.py
+	$(BIN)/pytest -n 0 -m slow tests/evaluation/test_cluster.py tests/learn/test_devices.py
 
 # Flights through PX4's own simulation, in a network namespace, since it listens on every address. RETRIM_PX4 names the
 # folder of an unpacked PX4, with bin/px4 and etc.

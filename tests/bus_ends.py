@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import pytest
 
-from retrim.experiments.latency import free_port, rosmaster
+from retrim.evaluation.latency import free_port, rosmaster
 from retrim.transport.bus import Bus
 from retrim.transport.in_process import InProcessBus
 from retrim.transport.remote import Address

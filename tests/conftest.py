@@ -30,7 +30,7 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
-from retrim.experiments.compile_cache import enable_compile_cache, release_programs  # noqa: E402
+from retrim.runkit.compile_cache import enable_compile_cache, release_programs  # noqa: E402
 
 enable_compile_cache()  # shared by the workers and by the commands that tests start
 # Only what takes long to compile is worth a file: thousands of small programs are not written from test workers.
@@ -42,7 +42,7 @@ settings.register_profile("repeatable", derandomize=True)  # the same examples o
 settings.load_profile("repeatable")
 
 
-LONG = ("test_examples.py", "cli/", "docs/", "live/", "experiments/")
+LONG = ("test_examples.py", "cli/", "docs/", "live/", "evaluation/")
 """Files whose tests fly whole flights: they begin first, so that both workers are done at about the same time."""
 
 
@@ -98,7 +98,7 @@ def key():
 @pytest.fixture(scope="module")
 def as_a_user():
     """Single precision and JAX's own rules of promotion, also in threads, as where no test is set up."""
-    from retrim.experiments.jobs import setup_for
+    from retrim.evaluation.jobs import setup_for
 
     def configure(values):
         for name, value in values.items():

@@ -30,7 +30,7 @@ from retrim.config import changed, load, overlaid, read_vehicle
 from retrim.config.loading import dump, values
 from retrim.config.names import PLAIN
 from retrim.config.references import make_reference
-from retrim.experiments.sweep import Sweep, _Kept, read_sweep
+from retrim.evaluation.sweep import Sweep, _Kept, read_sweep
 from retrim.io.checkpoint import architecture, load_delta, lora_header
 from retrim.io.logs import read_flight_log, read_map
 from retrim.io.logs.log_map import LogMap
@@ -343,7 +343,7 @@ class Maker:
         def read(text):
             sweep: Sweep = read_sweep(self.file(text(), ".toml"))
             from retrim.config.methods import find_method
-            from retrim.experiments.limits import check_seeds
+            from retrim.evaluation.limits import check_seeds
 
             check_seeds(sweep.seeds)
             sweep.scenarios()

@@ -5,10 +5,10 @@ import contextlib
 import numpy as np
 
 from retrim import Log, Scenario
-from retrim.experiments import Flight, FlightSpec
-from retrim.experiments.gathering import Flights
-from retrim.experiments.reporter import Silent
-from retrim.experiments.tables.study import Study
+from retrim.evaluation.gathering import Flights
+from retrim.evaluation.tables.study import Study
+from retrim.runkit import Flight, FlightSpec
+from retrim.runkit.reporter import Silent
 from retrim.runtime.flight import States
 
 DT = 0.02

@@ -9,8 +9,8 @@ import pytest
 from retrim.bench import measure, timing
 from retrim.bench.machine import UNIT_FLOP
 from retrim.errors import ConfigError
-from retrim.experiments.reporter import Silent
-from retrim.experiments.run import Run
+from retrim.runkit.reporter import Silent
+from retrim.runkit.run import Run
 
 
 def test_a_time_is_told_in_units_of_its_moment(monkeypatch):

@@ -1,6 +1,6 @@
 """Plant faults in the wiring, one at a time, and report the share that the tests notice.
 
-``make mutants`` draws faults at random (seeded) from config, adapt, runtime and experiments: a comparison turned round,
+``make mutants`` draws faults at random (seeded) from config, adapt, runtime and evaluation: a comparison turned round,
 a number changed, two arguments exchanged, a keyword left out, a condition negated. The suite runs once to learn which
 tests reach which line. Then each fault is planted in a copy of the tree, and tests run until one fails: those that
 reach it, first those of its own room, the quick ones before the slow ones; then the others of its room, since a line of
@@ -37,7 +37,7 @@ TESTS = {
     "adapt": ("tests/adapt", "tests/runtime", "tests/control", "tests/test_house"),
     "runtime": ("tests/runtime", "tests/plants", "tests/test_house"),
     "config": ("tests/config", "tests/runtime", "tests/io", "tests/plants", "tests/test_house"),
-    "experiments": ("tests/experiments", "tests/cli", "tests/test_house"),
+    "evaluation": ("tests/evaluation", "tests/cli", "tests/test_house"),
 }
 REACH, BESIDE = 300.0, 60.0  # [s] of tests that run for one fault: of those that reach it, and of others of its room
 SWAPS: dict[type, type] = {

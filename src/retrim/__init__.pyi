@@ -41,8 +41,7 @@ from .errors import ConfigError as ConfigError
 from .errors import MessageError as MessageError
 from .errors import PlantError as PlantError
 from .errors import RetrimError as RetrimError
-from .experiments import Fleet as Fleet
-from .experiments import enable_compile_cache as enable_compile_cache
+from .evaluation import Fleet as Fleet
 from .io import load_delta as load_delta
 from .io import load_learnt as load_learnt
 from .io import load_policy as load_policy
@@ -82,6 +81,7 @@ from .plants import SensorModel as SensorModel
 from .plants import SimPlant as SimPlant
 from .plants import as_numpy as as_numpy
 from .plants import check_command as check_command
+from .runkit import enable_compile_cache as enable_compile_cache
 from .runtime import AdaptivePilot as AdaptivePilot
 from .runtime import ControllerPilot as ControllerPilot
 from .runtime import Event as Event

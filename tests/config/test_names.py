@@ -12,8 +12,8 @@ from retrim import ConfigError
 from retrim.config import PRESETS, changed, load, read_vehicle
 from retrim.config.loading import load_for
 from retrim.config.names import plain_from
-from retrim.experiments.tables.document import TableSection, as_text
 from retrim.export.c_header import remark
+from retrim.runkit.document import TableSection, as_text
 from retrim.viz.panels import Curve, Panel, bars, panel_figure
 from retrim.viz.plots import save
 

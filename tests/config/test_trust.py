@@ -10,7 +10,7 @@ from helpers import tiny_preset
 from retrim import CheckpointError, ConfigError, Setup, load_learnt, load_policy, save_learnt, save_policy
 from retrim.config import changed, load, overlaid
 from retrim.config.trust import check_trust, python_names
-from retrim.experiments.sweep import read_sweep
+from retrim.evaluation.sweep import read_sweep
 from retrim.io.logs import read_map
 
 

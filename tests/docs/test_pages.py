@@ -14,7 +14,7 @@ from retrim.cli.main import COMMANDS
 from retrim.config.loading import overlaid
 from retrim.config.named_presets import PRESETS
 from retrim.config.vehicle_file import VehicleSpec, read_vehicle
-from retrim.experiments.sweep import Sweep, read_sweep
+from retrim.evaluation.sweep import Sweep, read_sweep
 from retrim.io.logs import read_map
 from retrim.io.logs.named_maps import names
 from retrim.io.logs.plausibility import DOUBTFUL, REFUSED

@@ -14,7 +14,6 @@ from helpers import tiny_preset
 from retrim.config.setup import Setup
 from retrim.control.controller import PolicyController
 from retrim.control.finite_controller import LARGEST, FiniteController
-from retrim.experiments.reporter import Silent
 from retrim.export import runner
 from retrim.export.checking import FLAGS
 from retrim.export.export import export
@@ -22,6 +21,7 @@ from retrim.export.runner import Runner
 from retrim.io.trained import save_policy
 from retrim.physics import State
 from retrim.physics.so3 import exp
+from retrim.runkit.reporter import Silent
 from retrim.testing import check_controller
 
 BEFORE, AFTER, SHARE = 6, 12, 1e-5

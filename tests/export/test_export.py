@@ -18,7 +18,6 @@ from retrim.config.setup import Setup
 from retrim.control.controller import PolicyController
 from retrim.control.lora import LoraPolicy
 from retrim.errors import CheckpointError, ConfigError
-from retrim.experiments.reporter import Silent
 from retrim.export import runner
 from retrim.export.checking import FLAGS
 from retrim.export.export import FORMATS, PARITY, export
@@ -28,6 +27,7 @@ from retrim.io.checkpoint import save_delta
 from retrim.io.trained import save_policy
 from retrim.physics import Command, State
 from retrim.physics.so3 import exp
+from retrim.runkit.reporter import Silent
 
 HAS_C = pytest.mark.skipif(shutil.which("gcc") is None, reason="there is no C compiler")
 NEEDS = {"npz": (), "onnx": ("onnx", "onnxruntime"), "c": ()}

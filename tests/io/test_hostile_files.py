@@ -18,7 +18,7 @@ from hostile import TEXTS, Maker, Watch
 from retrim import load_learnt, load_policy
 from retrim.config import read_vehicle
 from retrim.errors import CheckpointError, ConfigError, LogError, RetrimError
-from retrim.experiments import sweep
+from retrim.evaluation import sweep
 from retrim.io.logs import npz_members, read_flight_log, read_map
 from retrim.io.logs.npz_members import NpzMembers
 from retrim.live.page import free_port

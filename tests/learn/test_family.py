@@ -3,7 +3,7 @@
 import pytest
 
 from retrim.config import Setup, changed, load
-from retrim.experiments.training import nominal_error
+from retrim.runkit.training import nominal_error
 
 
 @pytest.mark.usefixtures("optax_promotion")

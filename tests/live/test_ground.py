@@ -13,7 +13,7 @@ from live_processes import HOME, DrillPlan, level
 from retrim.config import PRESETS, changed
 from retrim.config.loading import dump
 from retrim.errors import ConfigError, MessageError, PlantError
-from retrim.experiments.latency import free_port as unused_port
+from retrim.evaluation.latency import free_port as unused_port
 from retrim.live import ground, remote_learners
 from retrim.live.events import LiveEvents
 from retrim.live.ground import Ground, learn_for

@@ -10,7 +10,7 @@ import pytest
 from live_helpers import TOPICS
 from retrim import ConfigError, Scenario, Setup, changed, load
 from retrim.config.vehicle_file import VehicleSpec
-from retrim.experiments.fleet import Fleet
+from retrim.evaluation.fleet import Fleet
 from retrim.live.controllers import plain_source, vehicle_half
 from retrim.live.identifier_process import IdentifierLoop
 from retrim.onboard.messages import COLUMNS, COMMAND, MEASURED, FlightRows, Parameters, last_note

@@ -9,7 +9,7 @@ import pytest
 
 from peers import peer
 from retrim import PlantError, Scenario, testing
-from retrim.experiments.latency import rosmaster
+from retrim.evaluation.latency import rosmaster
 from retrim.onboard.guard import Mode
 from retrim.onboard.recorder import read_log
 from retrim.plants.bridges import ros

@@ -11,7 +11,7 @@ import pytest
 from live_helpers import holding, plan
 from live_processes import DT, HOME, DrillPlan, level
 from retrim import ConfigError, PlantError, Scenario, load
-from retrim.experiments import Fleet
+from retrim.evaluation import Fleet
 from retrim.live.events import LiveEvents
 from retrim.live.spec import MAINS, VEHICLE, LiveSpec
 from retrim.live.status import Status

@@ -16,7 +16,7 @@ from helpers import random_state
 from retrim import ConfigError, PlantError, load
 from retrim.config import PRESETS, Scenario, Setup
 from retrim.control import AbstractController
-from retrim.experiments.asked import Where
+from retrim.evaluation.asked import Where
 from retrim.physics import Command, Constant, Payload, State, small, so3
 from retrim.plants import Plant, crazyflow
 from retrim.plants.crazyflow import CrazyflowPlant

@@ -11,8 +11,8 @@ from jax import lax, random
 from commands import results, retrim
 from helpers import GOAL, hover_task, tiny_preset
 from retrim import ConfigError, Scenario, Setup
-from retrim.experiments import Fleet
-from retrim.experiments.metrics import record
+from retrim.evaluation import Fleet
+from retrim.evaluation.metrics import record
 from retrim.physics import Command, ExternalEffects, State, kingfisher, so3
 from retrim.physics.bem import BemQuadrotor
 from retrim.plants.raptor import RaptorNet, RaptorQuadrotor
@@ -96,7 +96,7 @@ def test_what_it_cannot_fly_is_refused_before_anything_flies(scenario, said, unt
 
 
 def test_it_flies_beside_others_by_its_command(tmp_path, monkeypatch, as_a_user):
-    table = importlib.import_module("retrim.experiments.tables.raptor")  # the package has a function of that name
+    table = importlib.import_module("retrim.evaluation.tables.raptor")  # the package has a function of that name
     monkeypatch.setattr(table, "DISTURBED", {"none": "calm"})
     words = "--methods", "raptor", "--vehicles", "kingfisher", "--seeds", "0", "--starts", "1"
     retrim("reproduce", "raptor", *words, "--seconds", "2", "--out", "t", cwd=tmp_path)

@@ -9,7 +9,7 @@ from retrim import Scenario, Setup, load
 from retrim.cli.flight_vehicle import check_vehicle_file, save_flight_vehicle
 from retrim.config.vehicle_file import VehicleSpec, read_vehicle
 from retrim.errors import ConfigError
-from retrim.experiments.fleet import Fleet
+from retrim.evaluation.fleet import Fleet
 
 pytestmark = pytest.mark.usefixtures("as_a_user")
 

@@ -16,8 +16,6 @@ from retrim.config.setup import Setup
 from retrim.config.vehicle_file import read_vehicle
 from retrim.config.vehicles import make_vehicle
 from retrim.errors import ConfigError, LogError
-from retrim.experiments.reporter import Silent
-from retrim.experiments.run import Run
 from retrim.io.logs import read_flight_log, read_map
 from retrim.io.trained import save_policy
 from retrim.replay import identification
@@ -27,6 +25,8 @@ from retrim.replay.identification import Estimate, Identified
 from retrim.replay.predictors import learnt, mean_of, ridge, yardsticks
 from retrim.replay.replay import Replay, replay
 from retrim.replay.rows import rows_of
+from retrim.runkit.reporter import Silent
+from retrim.runkit.run import Run
 
 pytestmark = pytest.mark.usefixtures("optax_promotion")
 

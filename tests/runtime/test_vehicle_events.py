@@ -6,7 +6,7 @@ import pytest
 from jax import random
 
 from retrim.config import Scenario, Setup, changed, load
-from retrim.experiments.fleet import Fleet
+from retrim.evaluation.fleet import Fleet
 from retrim.runtime.flight import fly
 
 pytestmark = pytest.mark.usefixtures("as_a_user")

@@ -13,7 +13,7 @@ import pytest
 from bus_ends import LOCAL, NETWORK, arrived, network, two_ends
 from live_processes import answer, write_for_ever
 from retrim.errors import ConfigError, MessageError
-from retrim.experiments.latency import free_port
+from retrim.evaluation.latency import free_port
 from retrim.transport import ros
 from retrim.transport.network import NetworkBus
 from retrim.transport.remote import Address

@@ -5,7 +5,7 @@ from jax import random
 from ..adapt.learner import LearnerState, OnlineLearner
 from ..config.loading import load
 from ..config.setup import Setup
-from ..experiments.effort import full_window
+from ..evaluation.effort import full_window
 from ..learn.window import Window
 
 

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import ConfigError
-from ..experiments.reporter import Reporter
-from ..experiments.run import Run
-from ..experiments.tables.document import Document, TableSection
 from ..onboard.launch import PYTHON
+from ..runkit.document import Document, TableSection
+from ..runkit.reporter import Reporter
+from ..runkit.run import Run
 from .machine import UNIT_FLOP
 from .works import WORKS
 

@@ -6,10 +6,10 @@ from jax import random
 
 from ..config.loading import load
 from ..config.setup import Setup
-from ..experiments.stopwatch import Stopwatch
-from ..experiments.training import nominal_error, train
 from ..learn.bptt import PolicyState
 from ..learn.pretrain import train_chunk
+from ..runkit.stopwatch import Stopwatch
+from ..runkit.training import nominal_error, train
 from .timing import compiled, timed
 
 

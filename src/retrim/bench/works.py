@@ -15,10 +15,10 @@ from ..adapt.learner import HELD_OUT, OnlineLearner
 from ..config.loading import load
 from ..config.scenario import Scenario
 from ..config.setup import Setup
-from ..experiments.fleet import Fleet
-from ..experiments.stopwatch import Stopwatch
+from ..evaluation.fleet import Fleet
 from ..onboard.launch import PYTHON
 from ..physics.state import Command
+from ..runkit.stopwatch import Stopwatch
 from ..runtime.flight import fly
 from .beside import policies
 from .fleet import eight_flights, on_threads, one_after_another, side_by_side

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from ..bench.measure import bench as measure
 from ..bench.works import WORKS
-from ..experiments.run import Run
+from ..runkit.run import Run
 from .console import RichReporter, show_paths, started
 
 

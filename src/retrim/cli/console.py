@@ -11,9 +11,9 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from rich.table import Table
 
 from ..errors import one_line, printable
-from ..experiments.reporter import Advance
-from ..experiments.run import Run
-from ..experiments.tables.document import TableSection
+from ..runkit.document import TableSection
+from ..runkit.reporter import Advance
+from ..runkit.run import Run
 
 console = Console(highlight=False)
 Trust = tyro.conf.UseAppendAction[tuple[str, ...]]  # `--trust a:b --trust c:d`

@@ -6,8 +6,8 @@ import webbrowser
 from collections.abc import Callable
 from pathlib import Path
 
-from ..experiments.demo import demonstrate
-from ..experiments.run import INTERRUPTED, Run
+from ..evaluation.demo import demonstrate
+from ..runkit.run import INTERRUPTED, Run
 from .console import RichReporter, console, show_paths, show_table, started
 
 

@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 from rich.table import Table
 
-from ..experiments.known_fault import wrong_rows
-from ..experiments.provenance import commit, describe_hardware, versions
+from ..evaluation.known_fault import wrong_rows
+from ..runkit.provenance import commit, describe_hardware, versions
 from .console import console
 
 

@@ -4,9 +4,9 @@ from pathlib import Path
 
 from ..config.setup import Setup
 from ..errors import ConfigError, LogError
-from ..experiments.flights import Flight
 from ..io.files import write_whole
 from ..replay.flight_vehicle import flight_vehicle_toml
+from ..runkit.flights import Flight
 from .console import refuse
 
 

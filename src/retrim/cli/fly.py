@@ -10,16 +10,16 @@ from ..config.loading import overlaid
 from ..config.scenario import Scenario
 from ..config.setup import Latency, Setup
 from ..errors import ConfigError
-from ..experiments.asked import Where, loaded, same_policy, with_residual
-from ..experiments.figures import picture
-from ..experiments.fleet import Fleet
-from ..experiments.flights import Flight
-from ..experiments.gathering import told_by
-from ..experiments.interrupts import interrupts_only_set
-from ..experiments.metrics import cell, notes, rows
-from ..experiments.outlet import Outlet
-from ..experiments.run import INTERRUPTED, Run
-from ..experiments.tables.document import TableSection
+from ..evaluation.asked import Where, loaded, same_policy, with_residual
+from ..evaluation.figures import picture
+from ..evaluation.fleet import Fleet
+from ..evaluation.gathering import told_by
+from ..evaluation.metrics import cell, notes, rows
+from ..runkit.document import TableSection
+from ..runkit.flights import Flight
+from ..runkit.interrupts import interrupts_only_set
+from ..runkit.outlet import Outlet
+from ..runkit.run import INTERRUPTED, Run
 from .console import RichReporter, Trust, console, refuse, show_paths, show_table, started
 from .flight_vehicle import check_vehicle_file, save_flight_vehicle
 

@@ -1,6 +1,6 @@
 """``retrim gauntlet``."""
 
-from ..experiments import tables
+from ..evaluation import tables
 from .reproduce import command_of
 
 gauntlet = command_of(tables.gauntlet, "gauntlet")

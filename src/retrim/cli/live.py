@@ -12,13 +12,9 @@ from rich.table import Table
 from ..config.loading import load_for
 from ..config.setup import Setup
 from ..errors import ConfigError
-from ..experiments.asked import Where, loaded, with_residual
-from ..experiments.figures import picture
-from ..experiments.interrupts import interrupts_only_set
-from ..experiments.limits import check_seeds
-from ..experiments.run import INTERRUPTED, Run
-from ..experiments.tables.document import TableSection
-from ..experiments.training import train
+from ..evaluation.asked import Where, loaded, with_residual
+from ..evaluation.figures import picture
+from ..evaluation.limits import check_seeds
 from ..io.logs.viewers import check_recording
 from ..live.display import figures, live_line, live_rows
 from ..live.events import LiveEvents
@@ -27,6 +23,10 @@ from ..live.page import page_address
 from ..live.page_opening import open_page
 from ..live.session import LONGEST, LiveRequest, check_limits, learners_at
 from ..live.status import Status
+from ..runkit.document import TableSection
+from ..runkit.interrupts import interrupts_only_set
+from ..runkit.run import INTERRUPTED, Run
+from ..runkit.training import train
 from ..runtime.events import Event
 from ..transport.remote import LOOPBACK
 from .console import RichReporter, Trust, console, refuse, show_paths, show_table, started

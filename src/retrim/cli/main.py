@@ -90,7 +90,7 @@ def _command(name: str, words: list[str], stop: threading.Event) -> int:
 
     from ..config.registry import told_of_own_module
     from ..errors import RetrimError
-    from ..experiments.compile_flags import compile_for
+    from ..runkit.compile_flags import compile_for
     from .console import console, refuse
 
     compile_for(name)

@@ -9,11 +9,11 @@ import tyro
 from ..config.presets import Preset
 from ..config.setup import Setup
 from ..errors import CheckpointError
-from ..experiments.asked import asked_preset
-from ..experiments.limits import check_seeds
-from ..experiments.outputs import write_trained
-from ..experiments.run import INTERRUPTED, Run
-from ..experiments.training import nominal_error, train
+from ..evaluation.asked import asked_preset
+from ..evaluation.limits import check_seeds
+from ..runkit.outputs import write_trained
+from ..runkit.run import INTERRUPTED, Run
+from ..runkit.training import nominal_error, train
 from .console import RichReporter, Trust, console, show_paths, started
 
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import tyro
 
-from ..experiments.run import Run
 from ..replay.replay import Replay
 from ..replay.replay import replay as replayed
+from ..runkit.run import Run
 from .console import RichReporter, show_paths, started
 
 LEFT = ("replay.md", "replay.png", "vehicle.toml", "adapted.safetensors", "delta.safetensors")

@@ -7,10 +7,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from ..experiments import tables
-from ..experiments.cluster import joined
-from ..experiments.run import Run
-from ..experiments.tables.quick import folder_of, help_of, looked, options_of
+from ..evaluation import tables
+from ..evaluation.cluster import joined
+from ..evaluation.tables.quick import folder_of, help_of, looked, options_of
+from ..runkit.run import Run
 from .console import RichReporter, show_paths, started
 
 Ordered = Callable[[threading.Event], int]

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import tyro
 
-from ..experiments.cluster import joined
-from ..experiments.run import Run
-from ..experiments.sweep import read_sweep, run_sweep
+from ..evaluation.cluster import joined
+from ..evaluation.sweep import read_sweep, run_sweep
+from ..runkit.run import Run
 from .console import RichReporter, Trust, show_paths
 
 

@@ -8,9 +8,9 @@ import numpy as np
 
 from ..config.setup import Setup
 from ..errors import ConfigError
-from ..experiments.reporter import Reporter
 from ..io.checkpoint import load_delta
 from ..io.trained import load_policy
+from ..runkit.reporter import Reporter
 from .c_header import write_c
 from .checking import ROWS, Parity, check_c, check_npz, check_onnx
 from .npz_file import write_delta, write_npz

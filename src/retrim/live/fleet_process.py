@@ -13,11 +13,11 @@ from pathlib import Path
 import jax
 
 from ..errors import RetrimError
-from ..experiments.compile_cache import enable_compile_cache
 from ..io.files import write_whole
 from ..onboard.launch import launch
 from ..onboard.messages import pack_note
 from ..onboard.realtime import Lifeline
+from ..runkit.compile_cache import enable_compile_cache
 from ..transport.shared_memory import SharedMemoryBus
 from .fleet_learner import FleetLearner
 from .learner_process import CHECK_EVERY, NICE, LearnerPlan

@@ -12,16 +12,16 @@ import numpy as np
 
 from ..adapt.learner import LearnerState
 from ..errors import PlantError
-from ..experiments.flights import Flight
-from ..experiments.outlet import Outlet
-from ..experiments.outputs import clear_outputs, write_events, write_learnt, write_state
-from ..experiments.reporter import Reporter
-from ..experiments.run import Run
 from ..io.logs.recording import Recording, write_npz
 from ..io.logs.viewers import can_record, record
 from ..onboard.guard import Mode
 from ..onboard.log_file import log_path
 from ..onboard.messages import ACCOUNTS, COMMAND, MEASURED, TRUE
+from ..runkit.flights import Flight
+from ..runkit.outlet import Outlet
+from ..runkit.outputs import clear_outputs, write_events, write_learnt, write_state
+from ..runkit.reporter import Reporter
+from ..runkit.run import Run
 from ..runtime.events import Event
 from ..tasks.transition import spliced
 from .events import LiveEvents

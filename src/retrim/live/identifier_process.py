@@ -20,7 +20,6 @@ from ..control.vehicle_report import REPORTS, VehicleEstimate, VehicleReport
 from ..errors import ConfigError, MessageError
 from ..estimation.command_path import PathEstimator
 from ..estimation.command_path import PathState as EstimatorState
-from ..experiments.compile_cache import enable_compile_cache
 from ..io.trained import load_learnt
 from ..onboard.heart import Pacemaker
 from ..onboard.messages import COLUMNS, COMMAND, MEASURED, FlightRows, Parameters, pack_note
@@ -28,6 +27,7 @@ from ..onboard.realtime import Lifeline
 from ..onboard.topics import VEHICLE
 from ..physics.path_family import PathFamily
 from ..physics.state import Command, State
+from ..runkit.compile_cache import enable_compile_cache
 from ..transport import wire
 from ..transport.bus import Bus
 from ..transport.shared_memory import SharedMemoryBus

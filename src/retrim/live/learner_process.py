@@ -22,9 +22,6 @@ from ..adapt.workers import PolicyWorker, ResidualWorker
 from ..config.presets import Preset
 from ..config.setup import Setup
 from ..errors import MessageError
-from ..experiments.compile_cache import enable_compile_cache
-from ..experiments.outlet import Outlet
-from ..experiments.outputs import write_state
 from ..io.trained import load_learnt
 from ..learn.window import Window
 from ..onboard.heart import Pacemaker
@@ -32,6 +29,9 @@ from ..onboard.messages import COMMAND, MEASURED, FlightRows, Parameters, last_n
 from ..onboard.realtime import Lifeline
 from ..onboard.topics import REFERENCE
 from ..physics.state import Command, State
+from ..runkit.compile_cache import enable_compile_cache
+from ..runkit.outlet import Outlet
+from ..runkit.outputs import write_state
 from ..transport import wire
 from ..transport.bus import Bus
 from ..transport.shared_memory import SharedMemoryBus

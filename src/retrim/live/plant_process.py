@@ -12,14 +12,14 @@ import numpy as np
 
 from ..config.scenario import Scenario
 from ..errors import MessageError, PlantError
-from ..experiments.compile_cache import enable_compile_cache
-from ..experiments.flying import FLOOR
 from ..onboard.messages import Sample, Setpoint, pack_note
 from ..onboard.orders import wait_for_take_off
 from ..onboard.realtime import Lifeline, be_punctual, sleep_until
 from ..onboard.shares import SHARE
 from ..physics.state import Command
 from ..plants.plant import Measurement, as_numpy
+from ..runkit.compile_cache import enable_compile_cache
+from ..runkit.flying import FLOOR
 from ..transport.bus import Bus
 from ..transport.shared_memory import SharedMemoryBus
 from .knobs import KnobbedPlant, Knobs

@@ -8,15 +8,15 @@ import numpy as np
 
 from ..adapt.learner import LearnerState
 from ..errors import PlantError
-from ..experiments.flights import Flight
-from ..experiments.flying import scored, until_terminated
-from ..experiments.recovery import change_times, recoveries
 from ..io.trained import load_learnt
 from ..onboard.accounts import EDGES_MS, accounted, measured, summary
 from ..onboard.guard import HOVER, Mode
 from ..onboard.messages import ACCOUNTS, COMMAND, MEASURED, STOPPED, TRUE
 from ..onboard.recorder import read_log
 from ..onboard.stalls import lost_in
+from ..runkit.flights import Flight
+from ..runkit.flying import scored, until_terminated
+from ..runkit.recovery import change_times, recoveries
 from ..runtime.events import Event
 from ..runtime.flight import Log, States
 from ..transport.bus import Bus

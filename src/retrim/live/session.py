@@ -21,12 +21,12 @@ from ..config.setup import Setup
 from ..config.trust import python_names
 from ..control.policy import Policy
 from ..errors import ConfigError
-from ..experiments.flights import FlightSpec
 from ..io.trained import save_learnt
 from ..onboard.guard import Limits
 from ..onboard.messages import MOST_TICKS
 from ..physics.state import State
 from ..plants.plant import as_numpy
+from ..runkit.flights import FlightSpec
 from ..runtime.pilot import ControllerPilot
 from ..transport.remote import Address
 from ..transport.shared_key import read_key

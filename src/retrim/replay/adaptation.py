@@ -13,12 +13,12 @@ from ..adapt.learner import LearnerState
 from ..config.setup import Setup
 from ..control.policy import Policy
 from ..errors import LogError
-from ..experiments.reporter import Reporter
-from ..experiments.training import model_error
 from ..learn.residuals.model import FittedResidual
 from ..learn.residuals.targets import Targets
 from ..learn.window import Window
 from ..physics.state import Command
+from ..runkit.reporter import Reporter
+from ..runkit.training import model_error
 from .predictors import refitted
 
 SETTLED = 5  # refused updates in a row after which no further improvement is expected

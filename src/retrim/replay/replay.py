@@ -12,13 +12,13 @@ from ..config.loading import changed, load, with_vehicle
 from ..config.setup import Setup
 from ..control.policy import Policy
 from ..errors import ConfigError, LogError
-from ..experiments.outputs import write_state
-from ..experiments.reporter import Reporter
-from ..experiments.run import Run
-from ..experiments.tables.document import Document, TableSection
 from ..io.logs import FlightLog, read_flight_log, read_map
 from ..io.trained import load_policy
 from ..learn.residuals.targets import Targets
+from ..runkit.document import Document, TableSection
+from ..runkit.outputs import write_state
+from ..runkit.reporter import Reporter
+from ..runkit.run import Run
 from .adaptation import adapt_to
 from .foretelling import Foretold, Protocol, foretell
 from .identification import identify

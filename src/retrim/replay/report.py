@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ..experiments.tables.document import TableSection
 from ..io.logs import FlightLog
 from ..io.logs.plausibility import DOUBTFUL
 from ..learn.residuals.targets import Targets
+from ..runkit.document import TableSection
 from .foretelling import Foretold, Protocol
 from .identification import Estimate, Identified
 

@@ -1,0 +1,81 @@
+"""Cost of each method: steps and time of training, of an update in flight, and of one decision."""
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import random
+
+from ..adapt.buffer import RollingBuffer
+from ..adapt.learner import OnlineLearner
+from ..config.scenario import Scenario
+from ..config.setup import Setup
+from ..control.controller import AbstractController
+from ..learn.window import Window
+from ..physics.state import Command
+from ..runkit.stopwatch import Stopwatch
+
+RUNS = 9  # runs of each timed program
+DECISIONS = 200
+
+
+def timed(work: Callable[[], Any], runs: int) -> tuple[float, float]:
+    """Return the compile time, and the median time of a run [s]."""
+    watch = Stopwatch()
+    jax.block_until_ready(work())
+    times, compiled = list[float](), watch.compile_s
+    for _ in range(runs):
+        began = time.perf_counter()
+        jax.block_until_ready(work())
+        times.append(time.perf_counter() - began)
+    return compiled, float(np.median(times))
+
+
+def updates(setup: Setup, *, lora: bool = False) -> dict[str, Any]:
+    """Measure the time of a fit of the residual and of an update of the policy, both as in flight.
+
+    Args:
+        setup: Setup with the preset of adaptation.
+        lora: Whether to update a low-rank delta.
+    """
+    policy: Any = setup.new_policy(random.key(0))
+    if lora:
+        policy = setup.low_rank(policy, random.key(2))
+    learner, window = setup.learner, full_window(setup)
+    state = learner.init(policy, random.key(1))
+    fit_compile, fit_s = timed(lambda: OnlineLearner.fit_residual(learner, state.residual, window), RUNS)
+    fitted, _ = learner.fit_residual(state.residual, window)
+    key = random.key(0)
+    compile_s, run_s = timed(lambda: OnlineLearner.update_policy(learner, state.policy, fitted, window, key), RUNS)
+    a = setup.preset.adapt
+    return {
+        "fit_s": fit_s,
+        "update_s": run_s,
+        "compile_s": fit_compile + compile_s,
+        "update_steps": a.num_updates * a.num_envs * setup.flown.horizon,
+        "window_s": a.window * setup.preset.dt,
+    }
+
+
+def decision_s(setup: Setup, controller: AbstractController[Any]) -> float:
+    """Return the median time of one decision [s]."""
+    x = setup.flight_starts(1)[0]
+    decide = eqx.filter_jit(lambda controller, memory, t, x: controller(memory, t, x))
+    memory, t = controller.init(x), jnp.zeros_like(x.p[0])
+    _, memory = jax.block_until_ready(decide(controller, memory, t, x))
+    return timed(lambda: decide(controller, memory, t, x), DECISIONS)[1]
+
+
+def full_window(setup: Setup) -> Window:
+    """Return a full window of flight under the large disturbance, at hover commands."""
+    plant = Scenario("large").make(setup.preset.vehicle, dt=setup.preset.dt)
+    buffer = RollingBuffer(setup.preset.adapt.window)
+    measurement = plant.reset(setup.flight_starts(1)[0])
+    for _ in range(setup.preset.adapt.window):
+        buffer.push(measurement.t, measurement.x, Command.hover())
+        measurement, _ = plant.step(Command.hover())
+    return buffer.window()

@@ -1,0 +1,143 @@
+"""Pictures of flights."""
+
+import itertools
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from types import MappingProxyType
+
+import jax
+import numpy as np
+from jaxtyping import Array
+
+from ..config.methods import find_method
+from ..config.scenario import Scenario
+from ..config.setup import Setup
+from ..physics.effects import ExternalEffects
+from ..physics.state import State
+from ..runkit.flights import Flight
+from ..runkit.recovery import FEW, timeline
+from ..tasks.keypoints import Keypoints
+from ..tasks.reference import Reference
+from ..tasks.track import AbstractTrack
+from ..tasks.transition import Spliced
+from ..viz import plots
+
+BY_HAND = ("asked", "knobs", "reference")
+"""Kinds of events that a person causes in a live flight."""
+
+
+def picture(
+    flights: Sequence[Flight],
+    setup: Setup,
+    scenario: Scenario,
+    folder: Path,
+    *,
+    stem: str | None = None,
+    title: str | None = None,
+    labels: Mapping[str, str] = MappingProxyType({}),
+) -> list[Path]:
+    """Draw the flights of one scenario, with all methods in one picture.
+
+    Args:
+        flights: Flights; those of other scenarios are left out.
+        setup: Preset of the policy, on the scenario's reference.
+        scenario: Scenario whose flights are drawn.
+        folder: Output folder.
+        stem: Name of the files; by default task and disturbance.
+        title: Title of the picture; by default the conditions of the flights.
+        labels: Labels of methods by name; by default those of tables.
+
+    Returns:
+        Paths of the PNG and the SVG; an empty list if no flight has this scenario.
+    """
+    shown = [f for f in flights if f.spec.scenario == scenario]
+    if not shown:
+        return []
+    methods = list(dict.fromkeys(f.spec.method for f in shown))
+    by = {method: [f for f in shown if f.spec.method == method] for method in methods}
+    names = {method: labels.get(method, find_method(method).label.strip("*")) for method in methods}
+    colours = _colours(methods)
+    groups = [plots.Group(names[method], [_track(f) for f in by[method]], colours[method]) for method in methods]
+    seconds = max(float(track.t[-1]) for group in groups for track in group.tracks)
+    task, preset = setup.flown, setup.preset
+    where = f"{shown[0].vehicle} on plant {scenario.plant!r}"
+    kind = preset.task if ":" in preset.task else preset.task.capitalize()
+    title = title or f"{kind}: {where}, disturbance {scenario.disturbance!r}, preset {preset.name!r}"
+
+    observation = setup.env.task.observation
+    if isinstance(observation, Keypoints):
+        home = jax.tree.map(lambda leaf: leaf[None], State.at(task.home()))
+        seen = [
+            plots.Group(names[method], [_image_track(observation, by[method][0].log.true.as_state())], colours[method])
+            for method in methods
+        ]
+        beside = partial(plots.camera, groups=seen, wanted=_image_track(observation, home).pixel[0])
+    elif isinstance(task, AbstractTrack) and isinstance(task.reference, Reference):
+        beside = partial(plots.laps, groups=groups, lap=np.asarray(task.reference.rows)[:, :3])
+    elif isinstance(task, AbstractTrack) and isinstance(task.reference, Spliced):
+        last = shown[0].log.t >= shown[0].log.t[-1] - plots.LAPS_S
+        beside = partial(plots.laps, groups=groups, lap=np.asarray(shown[0].target)[last])
+    else:
+        x, y, z = (float(value) for value in task.home())
+        beside = partial(plots.paths, groups=groups, goal=(x, y, z))
+    figure = plots.flight_figure(title, groups, spans(scenario.disturbance, task.home(), seconds), beside)
+    clean = "".join(sign if sign.isalnum() or sign in "-." else "_" for sign in f"{preset.task}_{scenario.disturbance}")
+    return plots.save(figure, folder, stem or clean)
+
+
+def spans(name: str, home: Array, seconds: float) -> list[plots.Span]:
+    """Return times and labels of the disturbance in a flight; a disturbance that always changes has one span."""
+    times, found, changes = timeline(name, home, seconds)
+    if len(changes) > FEW:
+        return [plots.Span(0.0, seconds, name, strong=False)]
+    marked = []
+    for first, after in itertools.pairwise([0, *changes, len(times)]):
+        end = float(times[after]) if after < len(times) else seconds
+        here: ExternalEffects = jax.tree.map(lambda leaf, i=first: np.asarray(leaf)[i], found)
+        if label := _label(here):
+            marked.append(plots.Span(float(times[first]), end, label, strong=bool(here.push[0] < 0)))
+    return marked
+
+
+def _label(here: ExternalEffects) -> str:
+    """Return the effects in words; an empty text without effects."""
+    words = list[str]()
+    if np.any(here.push):
+        same = len(set(here.push.tolist())) == 1
+        vector = ", ".join(f"{a:+g}" for a in here.push)
+        words.append(f"pushed by {here.push[0]:+g} m/s² per axis" if same else f"pushed by ({vector}) m/s²")
+    if np.any(here.wind):
+        words.append(f"wind of {np.linalg.norm(here.wind):.1f} m/s")
+    if here.mass > 0:
+        words.append(f"{1000 * here.mass:.0f} g of load")
+    if np.any(here.gain != 1):
+        words.append("rotors at " + ", ".join(f"{100 * g:.0f}" for g in here.gain) + " %")
+    return "; ".join(words)
+
+
+def _colours(methods: Sequence[str]) -> dict[str, int]:
+    """Return a colour per method.
+
+    The base policy and full adaptation have fixed colours. Other methods get the remaining ones in order; the colour
+    of full adaptation is also free if that method is absent.
+    """
+    own = {"base": 0, "full": 1}
+    left = itertools.count(2 if "full" in methods else 1)
+    return {method: own[method] if method in own else next(left) for method in methods}
+
+
+def _track(flight: Flight) -> plots.Track:
+    return plots.Track(
+        flight.log.t, flight.log.p, flight.error, flight.swaps, flight.log.terminated, flight.steady_seconds,
+        tuple((event.t, event.note) for event in flight.log.events if event.kind in BY_HAND),
+    )  # fmt: skip
+
+
+def _image_track(observation: Keypoints, x: State) -> plots.ImageTrack:
+    return plots.ImageTrack(*map(np.asarray, _pixels(observation, x)))
+
+
+@jax.jit
+def _pixels(observation: Keypoints, x: State) -> tuple[Array, Array]:
+    return jax.vmap(observation.pixels)(x)

@@ -1,0 +1,216 @@
+"""Many flights of one preset: scenarios x methods x seeds x starts, on any executor."""
+
+import secrets
+import threading
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
+from typing import Any
+
+from jax import random
+
+from ..adapt.learner import LearnerState
+from ..config.loading import dump
+from ..config.methods import find_method
+from ..config.presets import Preset
+from ..config.scenario import Scenario
+from ..config.setup import Latency, Setup
+from ..errors import ConfigError
+from ..plants.plant import Measurement
+from ..runkit.compile_cache import release_programs
+from ..runkit.flights import Flight, FlightSpec
+from ..runkit.flying import fly_lot, fly_one, plant_of, program_of
+from .gathering import Flights, Progress, Submit, gathered
+from .jobs import Job, fly_job
+from .limits import check_flights, check_seeds
+from .lots import Lot, in_lots, lanes
+
+COMPILED_AFTER = 1.0  # [s] of flight: all programs of a batch have run by then
+
+
+class Fleet:
+    """Flies every combination of scenarios, methods, policies (one per seed) and starts."""
+
+    def __init__(
+        self,
+        preset: Preset,
+        policies: Any,
+        scenarios: Sequence[Scenario],
+        *,
+        methods: Sequence[str] = ("base", "full"),
+        starts: int = 8,
+        seconds: float | None = None,
+        latency: Latency = "fixed",
+        state: LearnerState | None = None,
+    ) -> None:
+        """Plan the flights.
+
+        Args:
+            preset: Preset of the policies.
+            policies: Policies by seed; a single one has the seed 0. A baseline may have its own network instead.
+            scenarios: Scenarios of the flights.
+            methods: Methods of the flights.
+            starts: Flights per scenario, method and seed, each from another start.
+            seconds: Length of a flight; the task's own by default.
+            latency: How learning is charged to flight time. ``measured`` flies one flight at a time, so that a flight
+                is not charged for the work of another.
+            state: Learner state of an earlier flight; adapting flights resume from it.
+
+        Raises:
+            ConfigError: A name does not exist, or two settings are incompatible.
+        """
+        if not scenarios or not methods:
+            raise ConfigError(f"{len(scenarios)} scenarios by {len(methods)} methods: there is nothing to fly")
+        check_flights(starts, seconds)
+        if vehicles := sorted({s.plant for s in scenarios if s.entry.is_vehicle}):
+            raise ConfigError(f"plant {vehicles[0]!r} is a vehicle: it is flown by itself, by `retrim live`")
+        self.preset = preset
+        self.policies: dict[int, Any] = dict(policies) if isinstance(policies, Mapping) else {0: policies}
+        check_seeds(tuple(self.policies))
+        self.setups = {name: Setup.of(preset, name) for name in {s.reference for s in scenarios}}
+        for method in methods:  # some methods do not support every task, network or plant
+            for setup in self.setups.values():
+                setup.pilot(next(iter(self.policies.values())), method, random.key(0))
+            if find_method(method).on_board is not None:
+                for scenario in scenarios:
+                    plant_of(self.setups[scenario.reference], FlightSpec(scenario, method, 0))
+        first = next(iter(self.setups.values()))
+        self.seconds = first.flown.flight_seconds if seconds is None else seconds
+        self._latency, self._state, self._id = latency, state, secrets.token_hex(8)
+        self._starts = {
+            (name, seed): setup.flight_starts(starts, seed)
+            for name, setup in self.setups.items()
+            for seed in self.policies
+        }
+        self.specs = [
+            FlightSpec(scenario, method, start, seed)
+            for scenario in scenarios
+            for method in methods
+            for seed in self.policies
+            for start in range(starts)
+        ]
+
+    def lots(self, specs: Sequence[FlightSpec]) -> list[Lot]:
+        """Return specifications in batches; flights that cannot share a program run individually."""
+        groups: dict[Hashable, list[FlightSpec]] = {}
+        for spec in specs:
+            groups.setdefault(spec.group, []).append(spec)
+
+        def program(group: list[FlightSpec]) -> Hashable | None:
+            setup, policy = self.setups[group[0].scenario.reference], self.policies[group[0].seed]
+            return program_of(setup, policy, group) if self._latency == "fixed" else None
+
+        return in_lots(groups.values(), program)
+
+    def warm_up(self, specs: Sequence[FlightSpec] | None = None) -> None:
+        """Compile the programs of single flights before their take-off, in this process.
+
+        Args:
+            specs: Flights; all of the fleet by default.
+        """
+        plants, pilots = set[Scenario](), set[Any]()
+        for spec in self.specs if specs is None else specs:
+            scenario, kind = spec.scenario, (spec.scenario.reference, spec.method)
+            setup, x0 = self.setups[scenario.reference], self._starts[scenario.reference, spec.seed][0]
+            if kind not in pilots:
+                pilots.add(kind)
+                pilot = setup.pilot(self.policies[spec.seed], spec.method, spec.key(), state=self._state)
+                pilot.warm_up(Measurement(0.0, x0))
+            if scenario not in plants:
+                plants.add(scenario)
+                fly_one(setup, self.policies[spec.seed], spec, x0, 2 * self.preset.dt, state=self._state)
+
+    def run(
+        self,
+        executor: Executor | None = None,
+        *,
+        progress: Progress | None = None,
+        landed: Callable[[Sequence[Flight]], None] | None = None,
+        stop: threading.Event | None = None,
+        only: Sequence[FlightSpec] | None = None,
+        by_lot: bool = False,
+        forget: bool = False,
+    ) -> Flights:
+        """Fly all or some of the flights.
+
+        Args:
+            executor: Any executor, which then flies one flight at a time; one with other processes builds its own
+                programs. By default flights of a simulated plant run in batches, each as one program, and the others
+                one by one, on one thread per core.
+            progress: Called in this thread when flights are completed, and periodically before.
+            landed: Receives completed flights, in this thread.
+            stop: Aborts the running flights. Ctrl-C does the same, and sets it.
+            only: Fly these specifications, a part of ``specs``.
+            by_lot: Submit the batches of the default to an executor with other processes, instead of single flights.
+                The flights are then the same bit for bit.
+            forget: Do not return flights: thousands of logs would fill the memory, and ``landed`` has received them.
+
+        Returns:
+            The completed flights, in the order of the specifications, and the flights whose job failed in another
+            process.
+
+        Raises:
+            PlantError: A plant refused, or its package is not installed.
+        """
+        stop = stop or threading.Event()
+        specs = self.specs if only is None else list(only)
+        if isinstance(executor, ThreadPoolExecutor):
+            lots = [Lot([spec], None) for spec in specs]
+            return gathered(
+                specs, lots, self._here(executor, stop), progress=progress, landed=landed, stop=stop, forget=forget
+            )
+        if executor is not None:
+            lots = self.lots(specs) if by_lot else [Lot([spec], None) for spec in specs]
+            submit = self._away(executor, learnt=not forget)
+            return gathered(
+                specs, lots, submit, progress=progress, landed=landed, stop=stop, outlive=True, forget=forget
+            )
+        lots = self.lots(specs)
+        self.warm_up([lot.specs[0] for lot in lots if lot.compiled is None])
+        with ThreadPoolExecutor(1 if self._latency == "measured" else lanes()) as pool:
+            return gathered(
+                specs, lots, self._here(pool, stop), progress=progress, landed=landed, stop=stop, forget=forget
+            )
+
+    def _here(self, pool: Executor, stop: threading.Event) -> Submit:
+        """Return a function that flies batches in this process."""
+        return lambda lot, aloft: pool.submit(self._fly, lot, aloft, stop)
+
+    def _away(self, executor: Executor, *, learnt: bool) -> Submit:
+        """Return a function that submits batches to an executor with other processes."""
+        return lambda lot, aloft: executor.submit(fly_job, self._job(lot.specs, learnt))
+
+    def _fly(self, lot: Lot, aloft: Callable[[float], None], stop: threading.Event) -> list[Flight]:
+        """Fly a batch in this process; ``aloft`` receives the completed share."""
+        first = lot.specs[0]
+        setup = self.setups[first.scenario.reference]
+        policies = [self.policies[spec.seed] for spec in lot.specs]
+        starts = [self._starts[spec.scenario.reference, spec.seed][spec.start] for spec in lot.specs]
+        seconds, state = self.seconds, self._state
+        if lot.compiled is None:
+            alone = fly_one(
+                setup, policies[0], first, starts[0], seconds, latency=self._latency, state=state, stop=stop
+            )
+            return [alone]
+        compiled, cold = lot.compiled, lot.compiles
+
+        def told(share: float) -> None:
+            if share * seconds > COMPILED_AFTER:
+                compiled.set()
+            aloft(share)
+
+        try:
+            if cold:
+                release_programs()
+            else:
+                compiled.wait()
+            return fly_lot(
+                setup, policies, lot.specs, starts, seconds, state=state, progress=told, stop=stop, cold=cold
+            )
+        finally:
+            compiled.set()
+
+    def _job(self, specs: Sequence[FlightSpec], learnt: bool) -> Job:
+        policies = tuple(self.policies[spec.seed] for spec in specs)
+        starts = tuple(self._starts[spec.scenario.reference, spec.seed][spec.start] for spec in specs)
+        about = self.seconds, self._latency, self._state, learnt
+        return Job(self._id, dump(self.preset), policies, tuple(specs), starts, *about)

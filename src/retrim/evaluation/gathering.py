@@ -1,0 +1,127 @@
+"""Collects the flights of a fleet: waits for them, reports progress, and keeps all completed ones after a stop."""
+
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from dataclasses import dataclass, field
+from functools import partial
+
+from ..errors import ConfigError, JobError
+from ..runkit.flights import Flight, FlightSpec
+from ..runkit.interrupts import interrupts_only_set
+from ..runtime.flight import FlightStopped
+from .lots import Lot
+from .metrics import Rows, rows
+
+GONE: "Future[list[Flight]]" = Future()
+"""Placeholder for a future whose flights are forgotten; it is cancelled and never waited for."""
+GONE.cancel()
+OFTEN = 1.0  # [s]: interval of progress reports while flights are running
+Progress = Callable[[float, int], None]
+"""Receives the number of completed flights and of all flights; a running flight counts by its completed share."""
+Submit = Callable[[Lot, Callable[[float], None]], "Future[list[Flight]]"]
+"""Starts a batch; its second argument is a callback that receives the completed share."""
+
+
+def told_by(advance: Callable[[float, str], None]) -> Progress:
+    """Return a progress callback for a progress bar; ``advance`` receives a share and a text."""
+    return lambda done, n: advance(done / n, f"{done:.0f} of {n} flights")
+
+
+@dataclass(frozen=True)
+class Flights:
+    """The completed flights of a fleet."""
+
+    flown: list[Flight]
+    interrupted: bool
+    """Some flights are missing: the fleet was stopped, or a job failed."""
+    failed: dict[FlightSpec, str] = field(default_factory=dict)
+    """Flights whose job failed in another process, and why, in one line."""
+
+    def rows(self) -> Rows:
+        """Return one row of results per scenario, method and seed."""
+        return rows(self.flown)
+
+
+def gathered(
+    specs: Sequence[FlightSpec],
+    lots: Sequence[Lot],
+    submit: Submit,
+    *,
+    progress: Progress | None,
+    landed: Callable[[Sequence[Flight]], None] | None,
+    stop: threading.Event,
+    outlive: bool = False,
+    forget: bool = False,
+) -> Flights:
+    """Start every batch, and wait until all flights are completed or aborted.
+
+    Args:
+        specs: Flights, in the order in which they are returned.
+        lots: The same flights, in batches.
+        submit: Starts one batch.
+        progress: Called in this thread when flights are completed, and periodically before.
+        landed: Receives completed flights, in this thread.
+        stop: Aborts the running flights. Ctrl-C does the same, and sets it.
+        forget: Discard each flight after ``landed`` has received it; thousands of logs would fill the memory.
+        outlive: Continue if a batch fails, and return the failures; a configuration error still ends everything.
+
+    Raises:
+        PlantError: A plant refused.
+        JobError: The executor cannot be reached any more.
+    """
+    futures: list[Future[list[Flight]]] = []
+    aloft, flown = dict[int, float](), dict[FlightSpec, Flight | None]()
+    failed = dict[FlightSpec, str]()
+    try:
+        for i, lot in enumerate(lots):
+            futures.append(submit(lot, partial(aloft.__setitem__, i)))
+        waiting = {future: i for i, future in enumerate(futures)}
+
+        def told() -> None:
+            in_air = sum(len(lots[i].specs) * aloft.get(i, 0.0) for i in waiting.values())
+            if progress is not None:
+                progress(len(flown) + len(failed) + in_air, len(specs))
+
+        while waiting:
+            over = wait(waiting, OFTEN, FIRST_COMPLETED).done
+            for future in over:
+                error = future.exception()
+                if error is not None and (not outlive or isinstance(error, ConfigError | JobError | FlightStopped)):
+                    raise error
+                if error is not None:
+                    failed |= dict.fromkeys(lots[waiting[future]].specs, _told(error))
+                else:
+                    flights = future.result()
+                    flown |= {flight.spec: None if forget else flight for flight in flights}
+                    if landed is not None:
+                        with interrupts_only_set(stop):
+                            landed(flights)
+                    if forget:
+                        futures[waiting[future]] = GONE
+                del waiting[future]
+                told()
+            if not over and aloft:
+                told()
+    except (KeyboardInterrupt, FlightStopped):
+        stop.set()
+    except BaseException:
+        stop.set()
+        raise
+    finally:
+        with interrupts_only_set(stop):  # a further Ctrl-C must not lose completed flights
+            for future in futures:
+                future.cancel()
+            late = [future for future in futures if stop.is_set() and not future.cancelled()]
+            kept = [flight for each in late if each.exception() is None for flight in each.result()]
+            new = [flight for flight in kept if flight.spec not in flown]
+            flown |= {flight.spec: None if forget else flight for flight in new}
+            if landed is not None and new:
+                landed(new)
+    kept_flights = [flight for spec in specs if (flight := flown.get(spec)) is not None]
+    return Flights(kept_flights, len(flown) < len(specs), failed)
+
+
+def _told(error: BaseException) -> str:
+    """Return an error in one line."""
+    return " ".join(f"{type(error).__name__}: {error}".split())

@@ -1,0 +1,56 @@
+"""A batch of flights as a job for another process. The job is a plain value; each process builds the set-up once."""
+
+import functools
+from dataclasses import dataclass, replace
+from typing import Any
+
+from ..adapt.learner import LearnerState
+from ..config.loading import parse
+from ..config.setup import Latency, Setup
+from ..physics.state import State
+from ..runkit.compile_cache import release_programs
+from ..runkit.flights import Flight, FlightSpec
+from ..runkit.flying import fly_lot, fly_one
+
+
+@dataclass(frozen=True)
+class Job:
+    """Everything that a batch of flights needs, in a form that can be sent to another process."""
+
+    fleet: str
+    """Identifier of its fleet."""
+    preset: str
+    policies: tuple[Any, ...]
+    """Policies or baseline networks, one for each flight."""
+    specs: tuple[FlightSpec, ...]
+    starts: tuple[State, ...]
+    seconds: float
+    latency: Latency
+    state: LearnerState | None
+    learnt: bool = True
+    """Whether to return the learner state of each flight, too, which is as large as its log."""
+
+
+def fly_job(job: Job) -> list[Flight]:
+    """Fly a job in another process: several flights as one program, or a single flight."""
+    setup: Setup = setup_for(job.preset, job.specs[0].scenario.reference, job.fleet)
+    if len(job.specs) > 1:
+        release_programs()
+        flights = fly_lot(setup, job.policies, job.specs, job.starts, job.seconds, state=job.state, cold=True)
+    else:
+        (policy,), (spec,), (x0,) = job.policies, job.specs, job.starts
+        flights = [fly_one(setup, policy, spec, x0, job.seconds, latency=job.latency, state=job.state)]
+    return flights if job.learnt else [replace(flight, learnt=None) for flight in flights]
+
+
+@functools.lru_cache(maxsize=16)
+def setup_for(preset: str, reference: str | None = None, fleet: str = "") -> Setup:
+    """Return a set-up, built once per process and fleet, for executors with other processes.
+
+    Args:
+        preset: As JSON.
+        reference: Name of the reference.
+        fleet: Identifier of the fleet; the file of a reference may have changed since another fleet.
+    """
+    del fleet
+    return Setup.of(parse(preset, source="preset"), reference)

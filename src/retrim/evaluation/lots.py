@@ -1,0 +1,64 @@
+"""Batches of flights, each of which runs as one program."""
+
+import threading
+from collections.abc import Callable, Hashable, Iterable
+from itertools import pairwise
+from typing import NamedTuple
+
+import jax
+
+from ..runkit.flights import FlightSpec
+from ..runkit.provenance import cores
+
+LOT, LARGE = 64, 2048  # largest number of flights of one program: on a CPU, on an accelerator
+SMALL = 2  # Python steps a single flight, and uses only one core for it
+
+
+class Lot(NamedTuple):
+    """A batch of flights."""
+
+    specs: list[FlightSpec]
+    compiled: threading.Event | None
+    """Set when the first batch of the same program has compiled it; None for a single flight."""
+    compiles: bool = False
+    """Whether it is the first batch of its program."""
+
+
+def in_lots(groups: Iterable[list[FlightSpec]], program: Callable[[list[FlightSpec]], Hashable | None]) -> list[Lot]:
+    """Divide flights into batches; flights that cannot share a program run individually.
+
+    The first batch of each program comes first, so that different programs compile at the same time.
+
+    Args:
+        groups: Flights that differ in numbers of the vehicle, start and seed only.
+        program: Returns a key that identifies the program of a group; None if its flights run one by one.
+    """
+    first, others = dict[Hashable, Lot](), list[Lot]()
+    for group in groups:
+        of_group = program(group)
+        for part in _parts(group, 1 if of_group is None else min(largest(), max(SMALL, -(-len(group) // lanes())))):
+            if len(part) == 1:
+                others.append(Lot(part, None))
+            elif (of_group, len(part)) in first:
+                others.append(Lot(part, first[of_group, len(part)].compiled))
+            else:
+                first[of_group, len(part)] = Lot(part, threading.Event(), compiles=True)
+    return [*first.values(), *others]
+
+
+def _parts(group: list[FlightSpec], size: int) -> list[list[FlightSpec]]:
+    """Divide a group into parts of ``size`` flights; a single remaining flight joins the part before it."""
+    bounds = [*range(0, len(group), size), len(group)]
+    if size > 1 and len(bounds) > 2 and bounds[-1] - bounds[-2] == 1:
+        del bounds[-2]
+    return [group[a:b] for a, b in pairwise(bounds)]
+
+
+def largest() -> int:
+    """Return the largest number of flights of one program, on all devices together."""
+    return (LOT if jax.default_backend() == "cpu" else LARGE) * jax.device_count()
+
+
+def lanes() -> int:
+    """Return the number of batches that run at once: one per core, or one for several devices or an accelerator."""
+    return cores() if jax.default_backend() == "cpu" and jax.device_count() == 1 else 1

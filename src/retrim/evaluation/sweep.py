@@ -1,0 +1,228 @@
+"""Sweeps: policies x scenarios x seeds from one TOML file, resumable after a kill."""
+
+import dataclasses
+import json
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+from jax import random
+from pydantic import ConfigDict, Field, Strict
+from pydantic.dataclasses import dataclass
+
+from ..config.loading import beside, changed, dump, load
+from ..config.presets import Preset
+from ..config.scenario import Scenario
+from ..config.setup import Setup
+from ..config.trust import check_trust
+from ..config.validation import read_toml, validated
+from ..config.vehicle_file import VehicleSpec
+from ..control.policy import Policy
+from ..io.files import write_whole
+from ..runkit.document import Document, TableSection
+from ..runkit.flights import Flight, FlightSpec
+from ..runkit.provenance import section_key
+from ..runkit.reporter import Reporter
+from ..runkit.run import Run
+from ..viz.panels import bars
+from ..viz.plots import save
+from .fleet import Fleet
+from .gathering import told_by
+from .limits import check_seeds
+from .metrics import EFFORT, Rows, cell, failed_record, metres, record, summary
+from .tables.kept import files_behind, named_by, named_in
+from .tables.kept_policies import trained_policies
+
+STRICT = ConfigDict(extra="forbid")
+GROUP = ("preset", "plant", "vehicle", "sensors", "reference", "disturbance", "method")
+FIGURES = ("error", "peak_after_5s", "settle_s", "cross_track_m", "behind_s", "unshifted_m", *EFFORT)
+
+
+@dataclass(frozen=True, config=STRICT)
+class Sweep:
+    """The content of a sweep file."""
+
+    presets: tuple[str, ...] = Field(default=("hover/retrim",), min_length=1)
+    """Presets to train a policy with, for each seed."""
+    seeds: tuple[Annotated[int, Strict()], ...] = Field(default=(0,), min_length=1)
+    """Training seeds; each also seeds starts, disturbances and learners of its flights."""
+    methods: tuple[str, ...] = Field(default=("base", "full"), min_length=1)
+    disturbances: tuple[str, ...] = Field(default=("none",), min_length=1)
+    plants: tuple[str, ...] = Field(default=("bem",), min_length=1)
+    vehicles: tuple[str | VehicleSpec, ...] = ()
+    """Vehicles of the flights; by default that of training. Paths are relative to the sweep file; contents are kept."""
+    sensors: tuple[str, ...] = Field(default=("ideal",), min_length=1)
+    references: tuple[str, ...] = ()
+    """References of tracking policies."""
+    starts: int = Field(default=1, ge=1, le=100_000, strict=True)
+    seconds: float | None = Field(default=None, ge=1.0, le=36_000.0, strict=True)
+    """Length of a flight; the task's own by default."""
+    overlay: dict[str, Any] = Field(default_factory=dict)
+    """Values on top of every preset, as in its TOML file; a vehicle file is relative to the sweep file."""
+
+    def scenarios(self) -> list[Scenario]:
+        """Return every combination of disturbance, plant, vehicle, sensors and reference."""
+        return [
+            Scenario(disturbance, plant, vehicle, sensors, reference=reference)
+            for plant in self.plants
+            for vehicle in self.vehicles or (None,)
+            for sensors in self.sensors
+            for reference in self.references or (None,)
+            for disturbance in self.disturbances
+        ]
+
+
+def read_sweep(path: Path, trust: Collection[str] = ()) -> Sweep:
+    """Read a sweep file.
+
+    Args:
+        path: The file.
+        trust: Python names that it may hold, as ``mine:task``.
+
+    Raises:
+        ConfigError: It cannot be read, a key or value is invalid, or it names Python code that is not trusted.
+    """
+    tables = read_toml(path)
+    if isinstance(overlay := tables.get("overlay"), dict):
+        tables["overlay"] = beside(overlay, path.parent)
+    if isinstance(names := tables.get("vehicles"), list):
+        tables["vehicles"] = [beside({"vehicle": name}, path.parent)["vehicle"] for name in names]
+    sweep = validated(Sweep, tables, source=str(path))
+    check_trust(tables, trust, source=str(path))
+    return sweep
+
+
+def run_sweep(sweep: Sweep, run: Run, reporter: Reporter) -> Rows:
+    """Train all policies and fly all flights that are not yet in the run's folder.
+
+    Policies are stored in ``policies/``, and a row for each flight in ``flights.jsonl``. After a kill the run resumes
+    from those that the same code made from the same files. ``sweep.md``, ``sweep.json`` and ``sweep.png`` are written
+    at the end, and after an interruption.
+
+    Returns:
+        One row per preset, scenario and method.
+
+    Raises:
+        ConfigError: A name does not exist, or two settings are incompatible; raised before any training.
+    """
+    check_seeds(sweep.seeds)
+    presets = [changed(load(name), **sweep.overlay) for name in sweep.presets]
+    fleets = [_fleet(preset, _untrained(preset, sweep), sweep) for preset in presets]
+    for fleet in fleets:
+        for scenario in sweep.scenarios():
+            scenario.make(fleet.preset.vehicle, dt=fleet.preset.dt)  # fails if a package is missing
+    kept = _Kept(run.folder / "flights.jsonl")
+    # The keys are made once, before the first flight; a file that changes meanwhile affects the next run only.
+    keys = [{spec: _key(fleet.preset, spec, fleet.seconds) for spec in fleet.specs} for fleet in fleets]
+    for preset, of_fleet in zip(presets, keys, strict=True):
+        with run.interruptible():
+            policies = trained_policies(preset, sweep.seeds, run, reporter)
+            if not run.interrupted:
+                _fly(_fleet(preset, policies, sweep), of_fleet, kept, run, reporter)
+        if run.interrupted:
+            break
+    every = [key for of_fleet in keys for key in of_fleet.values()]
+    run.taken_over += len(kept.earlier.intersection(every))
+    return _report(sweep, [kept.rows[key] for key in every if key in kept.rows], run, reporter)
+
+
+def _fleet(preset: Preset, policies: Mapping[int, Policy], sweep: Sweep) -> Fleet:
+    return Fleet(preset, policies, sweep.scenarios(), methods=sweep.methods, starts=sweep.starts, seconds=sweep.seconds)
+
+
+def _untrained(preset: Preset, sweep: Sweep) -> dict[int, Policy]:
+    """Return untrained policies, to plan the flights before training."""
+    return dict.fromkeys(sweep.seeds, Setup.of(preset).new_policy(random.key(0)))
+
+
+def _fly(fleet: Fleet, keys: Mapping[FlightSpec, str], kept: "_Kept", run: Run, reporter: Reporter) -> None:
+    """Fly the missing flights, and store the rows of completed ones."""
+    missing = [spec for spec, key in keys.items() if key not in kept.rows]
+    if not missing or run.interrupted:
+        return
+
+    def keep(flown: Sequence[Flight]) -> None:
+        kept.add({keys[flight.spec]: {"preset": fleet.preset.name, **record(flight)} for flight in flown})
+
+    with reporter.progress(f"flying {fleet.preset.name}") as advance:
+        advance(0.0, "compiling the programs of a flight")
+        flights = fleet.run(
+            run.executor, stop=run.stop, only=missing, landed=keep, progress=told_by(advance), by_lot=True, forget=True
+        )
+    for spec, why in flights.failed.items():
+        vehicle = spec.scenario.vehicle_name(fleet.preset.vehicle)
+        row = failed_record(spec, vehicle, fleet.setups[spec.scenario.reference].flown.metric, why)
+        kept.add({keys[spec]: {"preset": fleet.preset.name, **row}})
+    if flights.failed:
+        run.failed = True
+        why = next(iter(flights.failed.values()))
+        reporter.say(f"{len(flights.failed)} flights failed elsewhere, the first by {why}; the same command flies them")
+
+
+class _Kept:
+    """Rows of completed flights, one line of JSON each. Failed flights and those of unreadable lines fly again."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self.rows = path, dict[str, dict[str, Any]]()
+        for line in path.read_text(errors="replace").splitlines() if path.is_file() else ():
+            try:
+                row = json.loads(line)
+            except (ValueError, RecursionError):
+                continue
+            if _is_record(row) and row.get("failed") is None:
+                self.rows[row["key"]] = row
+        self.earlier = frozenset(self.rows)
+
+    def add(self, rows: Mapping[str, Mapping[str, Any]]) -> None:
+        """Add rows by their keys, and rewrite the file."""
+        self.rows |= {key: {"key": key, **row} for key, row in rows.items()}
+        write_whole(self._path, "".join(json.dumps(each) + "\n" for each in self.rows.values()))
+
+
+def _is_record(row: Any) -> bool:
+    """Return whether a line is the record of a flight, with valid types."""
+    if not (isinstance(row, dict) and isinstance(row.get("key"), str) and row.keys() >= {*GROUP, *FIGURES, "metric"}):
+        return False
+    texts = all(row[name] is None or isinstance(row[name], str) for name in (*GROUP, "metric"))
+    return texts and all(row[name] is None or type(row[name]) in (int, float) for name in FIGURES)
+
+
+def _key(preset: Preset, spec: FlightSpec, seconds: float) -> str:
+    files = files_behind(spec.method, *named_in(preset), *named_by(spec.scenario))
+    return section_key(preset=dump(preset), spec=repr(spec), seconds=seconds, files=files)
+
+
+def _report(sweep: Sweep, kept: Sequence[dict[str, Any]], run: Run, reporter: Reporter) -> Rows:
+    """Write the documents of the completed flights, in the order of the sweep."""
+    groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
+    for row in kept:
+        groups.setdefault(tuple(row[name] for name in GROUP), []).append(row)
+    found, cells = Rows(), list[tuple[str, ...]]()
+    varied = [name for i, name in enumerate(GROUP) if len({group[i] for group in groups}) > 1 or name == "method"]
+    for flights in groups.values():
+        row = summary(flights, GROUP)
+        found.append(row)
+        none = "crashed" if row["crashes"] else "-"
+        figures = (none if row[name] is None else metres(row[name]) for name in ("median", "max"))
+        cells.append((*(str(flights[0][name]) for name in varied), cell(row), *figures))
+    intro = "Made by `retrim sweep`. Error [m] over the last seconds of each flight, over seeds and starts."
+    more = {"sweep": dataclasses.asdict(sweep)}
+    document = Document(run, "sweep", "Sweep", intro, sweep.seeds, reporter, more)
+    if cells:
+        drawn = save(bars("Error at the end of the flights [m]", _bar_groups(groups)), run.folder, "sweep")
+        columns = (*varied, "mean ± std [m]", "median [m]", "maximum [m]")
+        document.add(TableSection(columns, tuple(cells), picture=drawn[0]), found)
+    document.write()
+    return found
+
+
+def _bar_groups(groups: Mapping[tuple[Any, ...], list[dict[str, Any]]]) -> dict[str, dict[str, list[float]]]:
+    """Return the errors of flights by scenario and method; they are infinite for crashed flights."""
+    shown: dict[str, dict[str, list[float]]] = {}
+    varied = [i for i, name in enumerate(GROUP[:-1]) if len({group[i] for group in groups}) > 1] or [5]
+    for group, flights in groups.items():
+        label = ", ".join(str(group[i]) for i in varied)
+        shown.setdefault(label, {})[str(group[-1])] = [
+            float("inf") if row["error"] is None else row["error"] for row in flights if not row.get("failed")
+        ]
+    return shown

@@ -1,0 +1,12 @@
+"""Parts of every run: training, one flight, its record and its scores, result files, provenance, the compile cache.
+
+Lockstep and live flights and the evaluation share them. This package never prints.
+"""
+
+from .compile_cache import enable_compile_cache as enable_compile_cache
+from .flights import Flight as Flight
+from .flights import FlightSpec as FlightSpec
+from .flying import fly_one as fly_one
+from .run import Run as Run
+from .training import nominal_error as nominal_error
+from .training import train as train

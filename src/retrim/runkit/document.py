@@ -1,0 +1,105 @@
+"""One renderer for all tables: sections of text cells, written as Markdown and JSON after each section."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ..errors import one_line
+from .provenance import describe_code, describe_hardware
+from .reporter import Reporter
+from .run import Run
+
+MOST = 2000  # largest number of characters of a text
+
+
+@dataclass(frozen=True)
+class TableSection:
+    """One table, as text."""
+
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    title: str = ""
+    about: str = ""
+    """Text above the table."""
+    picture: Path | None = None
+    """Picture below the table, in the folder of the document."""
+
+    def markdown(self) -> list[str]:
+        """Return the section as lines of Markdown."""
+        lines = [f"## {as_text(self.title)}", ""] if self.title else []
+        lines += [_escaped(self.about), ""] if self.about else []
+        if self.rows:
+            lines += ["| " + " | ".join(map(_cell, self.columns)) + " |", "|---" * len(self.columns) + "|"]
+            lines += ["| " + " | ".join(map(_cell, row)) + " |" for row in self.rows] + [""]
+        if self.picture is not None:
+            lines += [f"![{as_text(self.title or self.picture.stem)}]({self.picture.name})", ""]
+        return lines
+
+
+def as_text(text: str) -> str:
+    """Return a text on one line, escaped so that Markdown finds no links or HTML in untrusted text."""
+    return _escaped(one_line(text, MOST))
+
+
+def _escaped(text: str) -> str:
+    return re.sub(r"<(?=[A-Za-z/!?])", "&lt;", text).replace("](", "]\\(")
+
+
+class Link(str):
+    """A cell that links to a page of the run. It is Markdown, so both parts must be names of this package."""
+
+    @classmethod
+    def to(cls, page: str, name: str) -> "Link":
+        """Return the cell with the text ``name`` and the path ``page``."""
+        return cls(f"[{name}]({page})")
+
+
+def _cell(text: str) -> str:
+    if isinstance(text, Link):
+        return text
+    return re.sub(r"(?<!\\)\|", r"\\|", as_text(text))
+
+
+@dataclass
+class Document:
+    """``<name>.md`` and a JSON file in the folder of a run. Every section is written when it is added."""
+
+    run: Run
+    name: str
+    title: str
+    intro: str
+    seeds: Sequence[int]
+    reporter: Reporter
+    more: dict[str, Any] = field(default_factory=dict)
+    """Further values for the JSON file."""
+    data: str | None = None
+    """Name of the JSON file; that of the document by default."""
+    sections: list[TableSection] = field(default_factory=list)
+    """Sections so far."""
+    _rows: list[dict[str, Any]] = field(default_factory=list)
+
+    def add(self, section: TableSection, rows: Sequence[dict[str, Any]] = ()) -> None:
+        """Add a section and the rows of results behind it; write both files."""
+        self.sections.append(section)
+        self._rows += rows
+        self.reporter.say("\n".join(line for line in section.markdown() if not line.startswith("![")))
+        self.write()
+
+    def write(self) -> Path:
+        """Write both files; return the path of the Markdown."""
+        seeds = ", ".join(map(str, self.seeds))
+        remark = [self.run.remark, ""] if self.run.remark else []
+        head = [f"# {as_text(self.title)}", "", self.intro, "", *remark]
+        trained = f"; training seeds {seeds}" if seeds else ""
+        head += [f"{describe_code()}; {describe_hardware()}{trained}.", ""]
+        body = [line for section in self.sections for line in section.markdown()]
+        foot = self.run.watch.sentence() + (" Interrupted: incomplete." if self.run.interrupted else "")
+        if self.run.taken_over:
+            foot += f" An earlier run had made {self.run.taken_over} of the parts; its time is not counted."
+        self.run.write_results(self._rows, seeds=self.seeds, name=self.data or self.name, **self.more)
+        page = self.run.write_text(f"{self.name}.md", "\n".join([*head, *body, foot, ""]))
+        if page not in self.run.pages:
+            self.run.pages.append(page)
+        return page

@@ -1,0 +1,51 @@
+"""Short commands compile quickly, and only where the compiler is known to understand how."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from retrim.runkit import compile_flags
+
+EMITTERS, LEVEL = compile_flags.QUICK
+
+
+@pytest.fixture
+def told(monkeypatch):
+    """What ``XLA_FLAGS`` says after a command has begun."""
+    monkeypatch.setattr(compile_flags, "enable_compile_cache", lambda: None)
+
+    def begin(command, given="", *, jaxlib="0.10.1", plugins=()):
+        monkeypatch.setenv("XLA_FLAGS", given)
+        monkeypatch.setattr(compile_flags, "version", lambda name: jaxlib)
+        monkeypatch.setattr(compile_flags, "entry_points", lambda group: plugins)
+        compile_flags.compile_for(command)
+        return os.environ["XLA_FLAGS"].split()
+
+    return begin
+
+
+def test_a_short_command_compiles_quickly_and_the_user_s_flags_stand(told):
+    assert told("fly") == [EMITTERS, LEVEL]
+    assert told("demo", "--xla_dump_to=x") == ["--xla_dump_to=x", EMITTERS, LEVEL]
+    assert told("demo", "--xla_backend_optimization_level=3") == ["--xla_backend_optimization_level=3", EMITTERS]
+
+
+@pytest.mark.parametrize(
+    ("command", "about"),
+    [(name, {}) for name in compile_flags.LONG] + [("fly", {"jaxlib": "0.11.0"}), ("fly", {"plugins": ("cuda",)})],
+)
+def test_nothing_changes_for_long_commands_unknown_compilers_and_accelerators(told, command, about):
+    assert told(command, "--xla_dump_to=x", **about) == ["--xla_dump_to=x"]
+
+
+def test_the_installed_compiler_knows_the_flags():
+    """One that does not ends the process."""
+    code = (
+        "from retrim.runkit.compile_flags import compile_for; compile_for('fly')\n"
+        "import jax; print(jax.jit(lambda x: x + 1)(2))"
+    )
+    plain = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
+    done = subprocess.run([sys.executable, "-c", code], env=plain, capture_output=True, text=True, check=False)
+    assert done.stdout.strip() == "3", done.stderr

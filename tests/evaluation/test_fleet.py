@@ -1,0 +1,323 @@
+"""Fleets: the same rows on any executor, progress, and what an interruption keeps."""
+
+import dataclasses
+import multiprocessing
+import re
+import signal
+import threading
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import made_up
+from helpers import brief_preset, tiny_preset
+from retrim import ConfigError, Fleet, PlantError, Scenario, Setup, enable_compile_cache, load
+from retrim.config.loading import dump
+from retrim.evaluation import fleet as fleet_module
+from retrim.evaluation import gathering, jobs, lots
+from retrim.evaluation.jobs import setup_for
+from retrim.physics import State
+from retrim.runkit import flying
+from retrim.runkit.flights import FlightSpec
+
+pytestmark = pytest.mark.usefixtures("as_a_user")
+
+SCENARIOS = [Scenario("small", plant="simple"), Scenario("gusts", plant="simple", sensors="mocap")]
+
+
+@pytest.fixture(scope="module")
+def fleet(as_a_user):
+    """Eight flights, too short to crash, of two policies that were never trained."""
+    preset = brief_preset()
+    setup = Setup.of(preset)
+    policies = {seed: setup.new_policy(jax.random.key(seed)) for seed in (0, 5)}
+    return Fleet(preset, policies, SCENARIOS, starts=1, seconds=1.2)
+
+
+def two_lots(fleet):
+    """Flights of two programs: of those that adapt, and of those whose world and measurements are random."""
+    wanted = {("small", "full"), ("gusts", "base")}
+    return [spec for spec in fleet.specs if (spec.scenario.disturbance, spec.method) in wanted]
+
+
+@pytest.fixture(scope="module")
+def compiled(fleet):
+    """Programs that were compiled in the fleet's first flights, after its warm-up."""
+    found = list[str]()
+
+    def note(name, seconds, **about):
+        if name.endswith("backend_compile_duration"):
+            found.append(name)
+
+    fleet.warm_up()
+    jax.monitoring.register_event_duration_secs_listener(note)
+    with ThreadPoolExecutor(2) as pool:
+        flights = fleet.run(pool)
+    jax.monitoring.unregister_event_duration_listener(note)
+    return flights, found
+
+
+@pytest.fixture(scope="module")
+def flights(compiled):
+    return compiled[0]
+
+
+def test_nothing_of_a_tick_is_compiled_after_the_warm_up(compiled, fleet):
+    """What scores a flight may be; it is compiled once, after the first flights have landed."""
+    assert len(compiled[1]) <= 3
+
+
+def test_every_combination_is_flown_once_and_in_order(fleet, flights):
+    assert [flight.spec for flight in flights.flown] == fleet.specs
+    assert len(set(fleet.specs)) == 8
+    assert not flights.interrupted
+    found = flights.rows()
+    assert [(row["disturbance"], row["method"], row["n"], row["crashes"]) for row in found] == [
+        (name, method, 2, 0) for name in ("small", "gusts") for method in ("base", "full")
+    ]
+    assert all(np.isfinite(row["mean"]) for row in found)
+    kinds = {event.kind for flight in flights.flown for event in flight.events}
+    assert {"residual", "policy"} & kinds == {"residual"} | ({"policy"} & kinds)
+    assert all(flight.events == () for flight in flights.flown if flight.spec.method == "base")
+
+
+def test_one_thread_and_two_processes_fly_the_same(fleet, flights):
+    with ThreadPoolExecutor(1) as pool:
+        assert fleet.run(pool).rows() == flights.rows()
+    context, part = multiprocessing.get_context("spawn"), [fleet.specs[5], fleet.specs[7]]
+    assert [(spec.scenario, spec.method, spec.seed) for spec in part] == [
+        (SCENARIOS[1], "base", 5), (SCENARIOS[1], "full", 5)
+    ]  # fmt: skip
+    with ProcessPoolExecutor(2, mp_context=context, initializer=enable_compile_cache) as pool:
+        elsewhere = fleet.run(pool, only=part)
+    assert [flight.spec for flight in elsewhere.flown] == part
+    for there, here in zip(elsewhere.flown, (flights.flown[5], flights.flown[7]), strict=True):
+        np.testing.assert_array_equal(there.log.p, here.log.p)
+        assert there.events == here.events
+        assert (there.learnt is None) == (here.learnt is None)
+
+
+@pytest.mark.parametrize("cores", [1, 2, 3, 8, 16, 64])
+@pytest.mark.parametrize("n", [1, 2, 3, 5, 7, 8, 9, 24, 65])
+def test_no_flight_of_a_program_is_left_by_itself(monkeypatch, n, cores):
+    """However many cores there are: Python steps a single flight, and that uses one of them."""
+    monkeypatch.setattr(lots, "lanes", lambda: cores)
+    group = [FlightSpec(Scenario("small"), "base", start) for start in range(n)]
+    found = lots.in_lots([group], lambda specs: "program")
+    assert sorted((spec for lot in found for spec in lot.specs), key=group.index) == group
+    sizes = [len(lot.specs) for lot in found]
+    assert n == 1 or min(sizes) > 1
+    assert max(sizes) <= max(2, -(-n // cores)) + 1
+    assert [len(lot.specs) for lot in lots.in_lots([group], lambda specs: None)] == [1] * n
+
+
+def test_other_lots_of_a_program_wait_until_it_is_compiled_not_until_it_has_landed(monkeypatch):
+    preset = brief_preset()
+    policy = Setup.of(preset).new_policy(jax.random.key(0))
+    fleet = Fleet(preset, policy, SCENARIOS[:1], methods=("base",), starts=4, seconds=2.0)
+    order, other = [], threading.Event()
+
+    def flown(setup, policies, specs, *_, progress, cold, **__):
+        order.append("first" if cold else "other")
+        if cold:
+            progress(0.1)
+            assert not other.wait(0.1)
+            progress(0.6)
+            assert other.wait(20.0)
+        other.set()
+        order.append("first landed" if cold else "other landed")
+        return [made_up.flight(0.1, spec=spec) for spec in specs]
+
+    monkeypatch.setattr(lots, "lanes", lambda: 2)
+    monkeypatch.setattr(fleet_module, "lanes", lambda: 2)
+    monkeypatch.setattr(fleet_module, "fly_lot", flown)
+    fleet.run()
+    assert order[:2] == ["first", "other"]
+
+
+def test_lots_fly_the_same_to_rounding_and_land_once(fleet, flights, monkeypatch):
+    """Two flights of a scenario and a method are one program; a third one is left for itself."""
+    monkeypatch.setattr(lots, "LOT", 2)
+    monkeypatch.setattr(lots, "lanes", lambda: 1)
+    assert [len(lot.specs) for lot in fleet.lots(fleet.specs)] == [2, 2, 2, 2]
+    assert [len(lot.specs) for lot in fleet.lots(fleet.specs[:3])] == [2, 1]
+    assert [lot.compiles for lot in fleet.lots(fleet.specs)] == [True] * 4  # other disturbances: other programs
+    landed, told = [], []
+    together = fleet.run(only=two_lots(fleet), landed=landed.append, progress=lambda done, n: told.append(done))
+    alone = {flight.spec: flight for flight in flights.flown}
+    assert [flight.spec for flight in together.flown] == two_lots(fleet)
+    assert sorted(len(lot) for lot in landed) == [2, 2]
+    assert told == sorted(told)
+    assert told[-1] == 4
+    for flight in together.flown:
+        other = alone[flight.spec]
+        np.testing.assert_allclose(flight.log.p, other.log.p, atol=2e-4)
+        assert [(e.t, e.kind) for e in flight.events] == [(e.t, e.kind) for e in other.events]
+        assert (flight.learnt is None) == (other.learnt is None)
+
+
+def test_flights_that_are_forgotten_have_landed(fleet, flights, monkeypatch):
+    monkeypatch.setattr(lots, "LOT", 2)
+    monkeypatch.setattr(lots, "lanes", lambda: 1)
+    landed = []
+    gone = fleet.run(only=two_lots(fleet), landed=landed.extend, forget=True)
+    assert gone.flown == []
+    assert not gone.interrupted
+    assert {flight.spec for flight in landed} == set(two_lots(fleet))
+
+
+def test_a_lot_ends_each_flight_where_it_is_terminated(fleet):
+    """A vehicle that is pushed to the ground is cut off at the same tick as when it flies alone."""
+    scenario = Scenario("push=-8", plant="simple")
+    down = Fleet(fleet.preset, fleet.policies, [scenario], methods=("base",), starts=2, seconds=2.0)
+    with ThreadPoolExecutor(1) as pool:
+        alone = down.run(pool).flown
+    together = down.run().flown
+    assert any(flight.log.terminated for flight in alone)
+    for flight, other in zip(together, alone, strict=True):
+        assert flight.log.terminated == other.log.terminated
+        assert len(flight.log.t) == len(other.log.t) == len(flight.error) == len(flight.log.u)
+
+
+def test_a_lot_with_an_odd_flight_is_flown_one_by_one(fleet, flights, monkeypatch):
+    """The first two of a lot look alike; all of them are looked at before they fly."""
+
+    looked = []
+
+    def alike(plants, pilots):
+        looked.append(len(plants))
+        return len(looked) == 1  # when it is planned, not when it is flown
+
+    monkeypatch.setattr(lots, "lanes", lambda: 1)
+    monkeypatch.setattr(flying, "can_fly_together", alike)
+    part = [spec for spec in fleet.specs if spec.method == "base"][:2]
+    alone = {flight.spec: flight for flight in flights.flown}
+    flown = fleet.run(only=part).flown
+    assert looked == [2, 2]
+    assert [flight.spec for flight in flown] == part
+    for flight in flown:
+        np.testing.assert_array_equal(flight.log.p, alone[flight.spec].log.p)
+
+
+def test_progress_counts_the_flights_that_are_over(fleet):
+    told = []
+    part = fleet.specs[:3]
+    with ThreadPoolExecutor(1) as pool:
+        flown = fleet.run(pool, only=part, progress=lambda done, n: told.append((done, n)))
+    assert told == [(1, 3), (2, 3), (3, 3)]
+    assert [flight.spec for flight in flown.flown] == part
+
+
+def test_progress_of_a_lot_is_told_before_it_lands(fleet, monkeypatch):
+    monkeypatch.setattr(gathering, "OFTEN", 0.001)
+    monkeypatch.setattr(lots, "lanes", lambda: 1)
+    told = []
+    part = [spec for spec in fleet.specs if spec.method == "full"][:2]
+    fleet.run(only=part, progress=lambda done, n: told.append(done))
+    assert told == sorted(told)
+    assert any(0.0 < done < 2.0 for done in told)
+    assert told[-1] == 2
+
+
+@pytest.mark.parametrize("by", ["event", "ctrl-c"])
+def test_an_interruption_keeps_what_was_flown(fleet, by):
+    stop = threading.Event()
+
+    def progress(done, n):
+        if done == 2:
+            stop.set() if by == "event" else signal.raise_signal(signal.SIGINT)
+
+    with ThreadPoolExecutor(1) as pool:
+        found = fleet.run(pool, stop=stop, progress=progress)
+    assert stop.is_set()
+    assert found.interrupted
+    assert 2 <= len(found.flown) < 8
+    assert [flight.spec for flight in found.flown] == fleet.specs[: len(found.flown)]
+    assert sum(row["n"] for row in found.rows()) == len(found.flown)
+    assert fleet.run(stop=stop).flown == []
+
+
+def test_a_plant_that_fails_ends_the_fleet(fleet, monkeypatch):
+    def broken(setup, policy, spec, *rest, **more):
+        raise PlantError(f"no plant for {spec.method}")
+
+    monkeypatch.setattr(fleet_module, "fly_one", broken)
+    with ThreadPoolExecutor(1) as pool, pytest.raises(PlantError, match="no plant for"):
+        fleet.run(pool)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"starts": 0}, "0 starts: must be 1 to"),
+        ({"seconds": 0.0}, "flights of 0 s: must be"),
+        ({"seconds": float("nan")}, "flights of nan s: must be"),
+        ({"scenarios": []}, "nothing to fly"),
+        ({"methods": ()}, "nothing to fly"),
+        ({"methods": ("best",)}, "no method 'best'"),
+        ({"scenarios": [Scenario(reference="circle")]}, "a hover policy follows none"),
+        ({"seed": 2**32}, "seed 4294967296: must be 0 to"),
+    ],
+)
+def test_a_fleet_that_cannot_fly_is_refused(fleet, change, message):
+    policy = next(iter(fleet.policies.values()))
+    scenarios, seed = change.pop("scenarios", SCENARIOS), change.pop("seed", 0)
+    with pytest.raises(ConfigError, match=message):
+        Fleet(load("hover/fast"), {seed: policy}, scenarios, **change)
+
+
+def test_a_process_builds_a_set_up_once_for_a_fleet():
+    text = dump(dataclasses.replace(tiny_preset(), name="once"))
+    assert setup_for(text, None, "a") is setup_for(text, None, "a")
+    assert setup_for(text, None, "a") is not setup_for(text, None, "b")
+    assert setup_for(text).preset.name == "once"
+
+
+@pytest.mark.parametrize(
+    ("off", "why"),
+    [
+        ((0.0, 0.0, -1.499), r"^below -0\.5 m, under the ground, at \(0\.00, 0\.00, -0\.5\d\) m$"),
+        ((-4.99, 0.0, 0.0), r"^5\.\d\d m off, out of the task's bounds, at \(-5\.\d\d, 0\.00, 1\.00\) m$"),
+    ],
+)
+def test_a_crash_says_why(fleet, off, why):
+    """As the last event of the flight, alone or in a lot."""
+    setup, policy, spec = fleet.setups[None], fleet.policies[0], fleet.specs[0]
+    x0 = State(jnp.array(fleet.preset.goal) + jnp.array(off), jnp.eye(3), 3.0 * jnp.array(off))
+    alone = flying.fly_one(setup, policy, spec, x0, 0.4)
+    for flight in (
+        alone,
+        *flying.fly_lot(setup, [policy] * 2, [spec, dataclasses.replace(spec, start=1)], [x0, x0], 0.4),
+    ):
+        assert flight.log.terminated
+        assert flight.events[-1].kind == "terminated"
+        assert flight.events[-1].t == pytest.approx(flight.log.t[-1])
+        assert re.search(why, flight.events[-1].note)
+
+
+def test_what_was_learnt_before_reaches_every_flight(monkeypatch):
+    """Flown by itself, in a lot, or as a job elsewhere."""
+    preset, told = brief_preset(), []
+    setup = Setup.of(preset)
+    policy = setup.new_policy(jax.random.key(0))
+    state = setup.learner.init(policy, jax.random.key(1))
+    fleet = Fleet(preset, policy, SCENARIOS[:1], methods=("full",), starts=2, seconds=1.2, state=state)
+
+    def flies(kind, answer):
+        def flown(*_, state=None, **__):
+            told.append((kind, state))
+            return answer
+
+        return flown
+
+    for module in (fleet_module, jobs):
+        monkeypatch.setattr(module, "fly_lot", flies("lot", []))
+        monkeypatch.setattr(module, "fly_one", flies("one", made_up.flight(0.1)))
+    for lot in (*fleet.lots(fleet.specs), *fleet.lots(fleet.specs[:1])):
+        fleet._fly(lot, lambda share: None, threading.Event())
+        jobs.fly_job(fleet._job(lot.specs, True))
+    assert [kind for kind, _ in told] == ["lot", "lot", "one", "one"]
+    assert all(each is state for _, each in told)

@@ -1,0 +1,88 @@
+"""Flights of a table that was killed: kept, to the last bit, until the table is made."""
+
+import jax
+import numpy as np
+import pytest
+
+from helpers import brief_preset
+from made_up import Watching
+from retrim import Scenario, Setup
+from retrim.evaluation.packed_flights import packed, unpacked
+from retrim.evaluation.tables.kept_flights import FLIGHTS, forget_flights
+from retrim.evaluation.tables.study import Study, fly_all
+from retrim.runkit import Run, provenance
+from retrim.runkit.reporter import Silent
+
+pytestmark = pytest.mark.usefixtures("as_a_user")
+
+CALM, PUSH = Scenario(plant="simple"), Scenario("large", plant="simple")
+
+
+@pytest.fixture(scope="module")
+def study():
+    preset = brief_preset()
+    policies = {seed: Setup.of(preset).new_policy(jax.random.key(seed)) for seed in (0, 1)}
+    return Study(preset, policies, ())
+
+
+def flown(study, folder, *, methods=("base", "indi"), reporter=None, starts=2):
+    """Fly in a folder as a new run; return the flights, and how many groups were there before."""
+    run = Run("test", folder)
+    told = Silent() if reporter is None else reporter
+    flights = fly_all(study, [CALM, PUSH], run, told, methods=methods, starts=starts, seconds=1.0)
+    return flights, run.taken_over
+
+
+def bits(flights):
+    """All that is in flights but what they learnt, arrays as bytes."""
+    parts = [(f.spec, f.vehicle, f.metric, f.steady_seconds, f.log, f.error, f.cross, f.target) for f in flights]
+    return [leaf.tobytes() if isinstance(leaf, np.ndarray) else leaf for leaf in jax.tree.leaves(parts)]
+
+
+@pytest.fixture(scope="module")
+def whole(study, tmp_path_factory):
+    return flown(study, tmp_path_factory.mktemp("whole"))[0].flown
+
+
+def test_a_file_of_flights_is_the_flights(whole):
+    specs = [flight.spec for flight in whole]
+    assert bits(unpacked(packed(whole), specs)) == bits(whole)
+    with pytest.raises(ValueError, match="argument"):
+        unpacked(packed(whole), specs[1:])
+
+
+def test_an_interrupted_table_flies_what_is_left_and_is_the_same(study, whole, tmp_path):
+    stop = Run("test", tmp_path)
+    watching = Watching(lambda share: share >= 0.5 and stop.stop.set())
+    some = fly_all(study, [CALM, PUSH], stop, watching, methods=("base", "indi"), starts=2, seconds=1.0)
+    kept = list((tmp_path / FLIGHTS).iterdir())
+    assert some.interrupted
+    assert 0 < len(kept) < 4
+    watching = Watching()
+    flights, earlier = flown(study, tmp_path, reporter=watching)
+    assert earlier == len(kept)
+    assert not flights.interrupted
+    assert bits(flights.flown) == bits(whole)
+    watching = Watching()
+    flights, earlier = flown(study, tmp_path, reporter=watching)
+    assert (earlier, watching.told) == (4, [])
+    assert bits(flights.flown) == bits(whole)
+
+
+def test_only_the_same_is_taken_and_nothing_once_it_is_forgotten(study, tmp_path, monkeypatch):
+    taken = lambda study=study, **how: flown(study, tmp_path, **how)[1]  # noqa: E731
+    assert taken(methods=("base",)) == 0
+    assert taken(methods=("indi", "base")) == 2
+    assert taken(methods=("base", "base")) == 2
+    assert taken(starts=3) == 0
+    assert taken(Study(study.preset, {0: study.policies[0], 1: study.policies[0]}, ())) == 0
+    assert taken(Study(brief_preset(adapt={"update_every": 0.4}), study.policies, ())) == 0
+    for path in (tmp_path / FLIGHTS).iterdir():
+        path.write_bytes(path.read_bytes()[:1000])
+    assert taken() == 0
+    assert taken() == 4
+    monkeypatch.setattr(provenance, "code", lambda: "changed")
+    assert taken() == 0
+    forget_flights(Run("test", tmp_path))
+    assert not (tmp_path / FLIGHTS).exists()
+    assert taken() == 0

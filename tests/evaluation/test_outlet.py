@@ -1,0 +1,72 @@
+"""What cannot be written where it should be is written elsewhere, and is told."""
+
+import errno
+import os
+
+import pytest
+
+from retrim import ConfigError
+from retrim.io.files import write_whole
+from retrim.runkit.outlet import Outlet
+from retrim.runkit.run import Run
+
+
+@pytest.fixture
+def outlet(tmp_path):
+    made = Outlet(tmp_path / "out")
+    made.spare = tmp_path / "full", tmp_path / "spare"
+    return made
+
+
+def test_what_can_be_written_is_where_it_should_be(outlet):
+    assert outlet.write("a file", lambda folder: write_whole(folder / "a", "1")) is None
+    assert (outlet.folder / "a").read_text() == "1"
+    assert outlet.faults == []
+    assert not any(folder.exists() for folder in outlet.spare)
+
+
+def test_a_full_disk_loses_nothing_and_each_file_is_told_with_its_folder(outlet):
+    def put(folder):
+        if folder.name != "spare":
+            raise OSError(errno.ENOSPC, "No space left on device")
+        write_whole(folder / "a", "1")
+        return folder / "a"
+
+    assert outlet.write("a file", put) == outlet.spare[1] / "a"
+    assert outlet.faults == [
+        f"a file cannot be written to {outlet.folder} (No space left on device); it is in {outlet.spare[1]}"
+    ]
+    assert not outlet.spare[0].exists()
+    assert os.stat(outlet.spare[1]).st_mode & 0o077 == 0
+
+
+def test_what_can_be_written_nowhere_is_told_and_does_not_end_the_rest(outlet):
+    def put(folder):
+        raise OSError(errno.EIO, "Input/output error")
+
+    assert outlet.write("a file", put) is None
+    assert outlet.faults == [
+        f"a file cannot be written to {outlet.folder} (Input/output error), nor to any temporary folder"
+    ]
+
+
+def test_results_in_a_temporary_folder_tell_why_they_are_there(outlet):
+    run = Run("fly", outlet.folder)
+    outlet.folder.parent.mkdir(exist_ok=True)
+    outlet.folder.write_text("a file of that name")
+    path = outlet.write_results(run, [], seeds=[0])
+    assert path == outlet.spare[0] / "results.json"
+    assert outlet.faults == [f"results.json cannot be written to {outlet.folder} (File exists); it is in {path.parent}"]
+    assert run.folder == outlet.folder
+    with pytest.raises(ConfigError, match="results cannot be written there"):
+        Run("fly", outlet.folder)
+
+
+def test_a_full_disk_names_the_file(tmp_path, monkeypatch):
+    def full(descriptor):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left on device") as raised:
+        write_whole(tmp_path / "a", "1")
+    assert raised.value.filename == str(tmp_path / "a")

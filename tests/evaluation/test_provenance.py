@@ -1,0 +1,133 @@
+"""What a results file says of the command that made it, and of its time."""
+
+import importlib.metadata
+import json
+import signal
+import subprocess
+import sys
+import threading
+
+import pytest
+
+import retrim
+from retrim.errors import ConfigError
+from retrim.runkit import Run, provenance
+from retrim.runkit.interrupts import interrupts_only_set
+from retrim.runkit.provenance import command_line, versions
+from retrim.runkit.stopwatch import Stopwatch
+
+
+@pytest.mark.parametrize(
+    ("words", "kept"),
+    [
+        ("reproduce plants --out {here}/results --starts 2", "reproduce plants --starts 2"),
+        ("demo --out={here}/d --seed=3", "demo --seed=3"),
+        ("fly --policy {here}/p --config={here}/a.toml", "fly --policy p --config=a.toml"),
+        ("fly --policy runs/h --reference circle", "fly --policy runs/h --reference circle"),
+        ("demo --out", "demo"),
+    ],
+)
+def test_no_place_on_this_machine_is_recorded(words, kept, tmp_path):
+    assert command_line(words.format(here=tmp_path).split()) == f"retrim {kept}"
+
+
+def test_versions_are_those_of_what_is_installed():
+    found = versions()
+    assert {"retrim", "jax", "jaxlib", "equinox", "optax", "numpy", "python"} <= found.keys()
+    for name in found.keys() - {"python"}:
+        assert importlib.metadata.version(name) == found[name]
+
+
+def test_programs_traced_inside_others_count_once():
+    watch = Stopwatch()
+    for start, end in ((1.0, 2.0), (1.5, 2.5), (4.0, 4.5), (3.5, 5.0), (7.0, 8.0)):  # by their ends, as they come
+        watch.compiled(start, end)
+    assert watch.compile_s == pytest.approx(1.5 + 1.5 + 1.0)
+
+
+def test_a_run_leaves_no_folder_until_it_writes(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["retrim", "demo", "--out", str(tmp_path)])
+    run = Run("demo", tmp_path / "a" / "b")
+    assert not list(tmp_path.iterdir())
+    path = run.write_results([{"x": 1}], seeds=[3], losses=[0.5])
+    found = json.loads(path.read_text())
+    assert (found["command"], found["rows"], found["seeds"], found["losses"]) == ("retrim demo", [{"x": 1}], [3], [0.5])
+    assert (found["interrupted"], run.exit_code) == (False, 0)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match="file: results cannot be written there"):
+        Run("demo", tmp_path / "file")
+    kept = tmp_path / "kept"
+    kept.mkdir()
+    Run("demo", kept)
+    assert kept.is_dir()
+    assert not list(kept.iterdir())
+
+
+def test_ctrl_c_is_remembered_and_raises_where_it_may(tmp_path):
+    run = Run("demo", tmp_path / "never")
+    with run.interruptible():
+        raise KeyboardInterrupt
+    assert run.interrupted
+    assert run.exit_code == 130
+    assert not (tmp_path / "never").exists()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        stop = threading.Event()
+        with interrupts_only_set(stop):
+            signal.raise_signal(number)
+        assert stop.is_set()
+    with pytest.raises(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)
+
+
+def test_a_commit_is_that_of_the_checkout_and_tells_local_changes(monkeypatch):
+    status = "status --porcelain -- :/src :/pyproject.toml"
+    said = {"rev-parse --short=12 HEAD": "abc", status: ""}
+
+    def run(words, **_):
+        asked = " ".join(words[3:])
+        root = str(provenance.Path(provenance.__file__).resolve().parents[3])
+        if asked == "rev-parse --show-toplevel":
+            return subprocess.CompletedProcess(words, 0, stdout=f"{root if 'elsewhere' not in said else '/'}\n")
+        return subprocess.CompletedProcess(words, 0, stdout=f"{said[asked]}\n")
+
+    monkeypatch.setattr(provenance.subprocess, "run", run)
+    asked = provenance.commit.__wrapped__
+    assert asked() == "abc"
+    said[status] = " M file"
+    assert asked() == "abc-dirty"
+    said["elsewhere"] = ""
+    assert asked() == "unknown"  # a checkout of something else around an installed package
+
+    def nothing(*_, **__):
+        raise FileNotFoundError("git")
+
+    monkeypatch.setattr(provenance.subprocess, "run", nothing)
+    assert asked() == "unknown"
+
+
+def test_code_is_told_apart_wherever_it_lies(tmp_path, monkeypatch):
+    """By what is in its files and by their names, not by a version, a commit, or what Python left beside them."""
+    here = tmp_path / "retrim" / "runkit"
+    here.mkdir(parents=True)
+    monkeypatch.setattr(provenance, "__file__", str(here / "provenance.py"))
+    code = provenance.code.__wrapped__
+    (here / "one.py").write_text("a = 1\n")
+    (tmp_path / "retrim" / "data.toml").write_text("x = 1\n")
+    first = code()
+    (here / "__pycache__").mkdir()
+    (here / "__pycache__" / "one.pyc").write_bytes(b"1")
+    (tmp_path / "beside.py").touch()
+    assert code() == first
+    found = {first}
+    for path, text in ((here / "one.py", "a = 2\n"), (tmp_path / "retrim" / "data.toml", "x = 2\n")):
+        path.write_text(text)
+        found.add(code())
+    (here / "one.py").rename(here / "two.py")
+    assert len(found | {code()}) == 4
+
+
+def test_a_page_says_what_it_was_made_by(monkeypatch):
+    monkeypatch.setattr(provenance, "commit", lambda: "abc-dirty")
+    assert provenance.describe_code() == "Commit abc-dirty"
+    monkeypatch.setattr(provenance, "commit", lambda: "unknown")
+    assert provenance.describe_code() == f"retrim {retrim.__version__}, installed, code {provenance.code()}"
