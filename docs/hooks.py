@@ -1,6 +1,7 @@
 """Parts of the site that are made from the code when it is built: tables of keys, of presets and of public names.
 
-A page asks for a table by a comment: ``<!-- keys: module:Class -->``, ``<!-- presets -->`` or ``<!-- names -->``.
+A page asks for a table by a comment: ``<!-- keys: module:Class -->``, ``<!-- presets -->``, ``<!-- names -->`` or
+``<!-- primitives -->``.
 """
 
 import ast
@@ -14,6 +15,7 @@ from typing import Any
 from pydantic import TypeAdapter
 
 import retrim
+from retrim.compile.expressions import EXPRESSIONS
 from retrim.config.named_presets import PRESETS
 
 KEYS = re.compile(r"<!-- keys: (?P<module>[\w.]+):(?P<name>\w+) -->")
@@ -27,6 +29,8 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
         markdown = markdown.replace("<!-- presets -->", _presets())
     if "<!-- names -->" in markdown:
         markdown = markdown.replace("<!-- names -->", _names())
+    if "<!-- primitives -->" in markdown:
+        markdown = markdown.replace("<!-- primitives -->", ", ".join(f"`{name}`" for name in sorted(EXPRESSIONS)))
     return markdown
 
 

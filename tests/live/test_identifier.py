@@ -38,7 +38,7 @@ def rows(setup):
         name="slow", mass=1.0, inertia=(0.01, 0.01, 0.02), arm=(0.1, 0.1), thrust_max=40.0,
         rates_max=(6.0, 6.0, 4.0), motor_tau=0.03, rate_lag=(0.08, 0.08, 0.08), rate_damping=(1.0, 1.0, 1.0),
     )  # fmt: skip
-    scenario = Scenario("small", plant="second-order", vehicle=vehicle, delay=0.04, thrust_error=-0.2)
+    scenario = Scenario("none", plant="second-order", vehicle=vehicle, delay=0.04, thrust_error=-0.2)
     known = dataclasses.replace(setup.preset, vehicle=dataclasses.replace(vehicle, command_delay=0.04))
     policy = setup.new_policy(jax.random.key(0))
     (flight,) = Fleet(known, policy, [scenario], methods=("geometric",), starts=1, seconds=6.0).run().flown

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..adapt.learner import LearnerState
+from ..compile.trace import numpy_program, plain
 from ..config.families import make_family
 from ..config.setup import Setup
 from ..control.condition import Condition
@@ -24,7 +25,6 @@ from ..onboard.topics import REFERENCE, VEHICLE
 from ..physics.dynamics import f_a
 from ..physics.state import Command, State
 from ..transport import wire
-from .numpy_code import numpy_program, plain
 
 
 def flown(policy: Policy, residual: Any) -> dict[str, Any]:

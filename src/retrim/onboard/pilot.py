@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from ..compile.ops.program import Arrays, NumpyProgram, ProgramSource
 from .messages import STATE, Parameters
-from .program import Arrays, NumpyProgram, ProgramSource
 from .topics import UNLEARNED, VEHICLE
 
 BLEND = 5  # ticks over which a jump of the command at a swap is faded out

@@ -1,6 +1,6 @@
 """A controller as a NumPy program: source text and constants.
 
-:mod:`retrim.live.numpy_code` generates them before take-off.
+:mod:`retrim.compile.trace` generates them before take-off.
 """
 
 from collections.abc import Callable, Sequence

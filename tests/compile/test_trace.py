@@ -10,14 +10,14 @@ import pytest
 from jax import lax, random
 
 from retrim import Measurement
+from retrim.compile.ops.program import NumpyProgram
+from retrim.compile.trace import numpy_program, plain
 from retrim.config.named_presets import PRESETS
 from retrim.config.setup import Setup
 from retrim.control.mppi import Mppi
 from retrim.errors import ConfigError
 from retrim.live.controllers import plain_source
-from retrim.live.numpy_code import numpy_program, plain
 from retrim.onboard.pilot import LivePilot
-from retrim.onboard.program import NumpyProgram
 from retrim.physics import so3
 from retrim.physics.state import State
 from retrim.runtime import ControllerPilot

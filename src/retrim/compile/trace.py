@@ -16,9 +16,9 @@ import numpy as np
 from jax import random
 from jax.extend.core import ClosedJaxpr, Jaxpr, Var
 
-from ..onboard import lax, threefry
-from ..onboard.program import ProgramSource
-from .primitives import EXPRESSIONS, no_form
+from .expressions import EXPRESSIONS, no_form
+from .ops import lax, threefry
+from .ops.program import ProgramSource
 
 CONSTANT, PARAMETER, INPUT = range(3)
 INLINE = ("jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "remat", "checkpoint")

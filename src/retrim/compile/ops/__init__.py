@@ -1,0 +1,1 @@
+"""Runtime of compiled programs: operations of JAX in NumPy."""
