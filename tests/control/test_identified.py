@@ -1,4 +1,4 @@
-"""Flights of an identified vehicle: the controller inside is told the vehicle, thrust and rates, slowly and truly."""
+"""Flights of an identified vehicle: the controller inside receives the vehicle, thrust and rates."""
 
 import dataclasses
 
@@ -36,7 +36,7 @@ SHORT = {"num_updates": 10, "num_envs": 2, "horizon": 20, "hidden_sizes": (16, 1
 
 
 class Weak(AbstractController[Command]):
-    """A soft hover that needs no policy; its memory is what it was told last."""
+    """A soft hover that needs no policy; its memory contains its last inputs."""
 
     told: ActuatorState = dataclasses.field(default_factory=lambda: ActuatorState.at(Command.hover()))
     member: Member = dataclasses.field(
@@ -115,7 +115,7 @@ def test_the_vehicle_is_identified_in_flight(x0, delay, lag, gain):
 
 
 def test_excitation_identifies_a_vehicle_that_stands_still():
-    """Without the doublets nothing is identified."""
+    """Without the doublets, delay and lag are not excited."""
     flights = {}
     for name, excitation in {"still": None, "excited": Excitation.of()}.items():
         controller = IdentifiedFlight(

@@ -1,4 +1,4 @@
-"""What is predicted of the moment when a command begins to act is what the nominal model does until then."""
+"""The predicted state when a command begins to act is the state of the nominal model at that time."""
 
 import jax
 import jax.numpy as jnp

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from retrim.control.condition import Cause, Stage
 from retrim.errors import MessageError
 from retrim.onboard.messages import last_note, pack_note, unpack_note
 from retrim.onboard.note_fields import FIELDS, plain, read_fields, shown
@@ -90,3 +91,11 @@ def test_what_is_quoted_is_short_and_moves_no_cursor():
     assert len(shown("x" * 10_000)) == 80
     assert plain("a\x1b[2J\nb") == r"a\x1b[2J\nb"
     assert len(plain("\x00" * 10_000)) == 1000
+
+
+def test_every_stage_and_cause_passes():
+    stages = [[1.0, int(stage), int(cause)] for stage in Stage for cause in Cause]
+    assert read_fields("status", {"stages": stages})["stages"] == stages
+    for beyond in ([1.0, max(Stage) + 1, 0], [1.0, 0, max(Cause) + 1]):
+        with pytest.raises(MessageError):
+            read_fields("status", {"stages": [beyond]})

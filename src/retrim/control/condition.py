@@ -7,7 +7,7 @@ from jaxtyping import Array, Int
 
 
 class Stage(IntEnum):
-    """Active parts of an adapted flight."""
+    """Active parts of a flight."""
 
     ADAPTED = 0
     OBSERVED = 1
@@ -28,7 +28,7 @@ class Cause(IntEnum):
 
 
 PARTS = {
-    Stage.ADAPTED: "the adapted policy flies",
+    Stage.ADAPTED: "the flight uses all of its parts",
     Stage.OBSERVED: "the base policy flies with the disturbance observer",
     Stage.SLOW: "the base policy flies with a slow mean of the estimated disturbance",
     Stage.BASE: "the base policy flies alone",

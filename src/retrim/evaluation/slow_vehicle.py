@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,6 +20,7 @@ from ..runkit.run import Run
 from ..runkit.training import train
 from .figures import picture
 from .metrics import metres, rows
+from .tables.hidden import PUSHED
 from .tables.study import Study, fly_all
 
 UPDATES = 200  # a fifth of the preset's training: less agile, and trained in ten seconds
@@ -62,7 +64,7 @@ class SlowVehicle(NamedTuple):
 
     table: TableSection
     rows: list[dict[str, Any]]
-    pictures: list[Any]
+    pictures: list[Path]
 
 
 def fly_slow_vehicle(
@@ -119,7 +121,7 @@ def _fly(each: Entrant, scenario: Scenario, run: Run, reporter: Reporter, starts
 
 def _line(each: Entrant, flights: Sequence[Flight]) -> tuple[str, ...]:
     left = [flight for flight in flights if not flight.log.terminated]
-    peak = metres(max(float(np.max(flight.error[flight.log.t >= 4.0])) for flight in left)) if left else "-"
+    peak = metres(max(float(np.max(flight.error[flight.log.t >= PUSHED])) for flight in left)) if left else "-"
     error = metres(float(np.mean([flight.steady for flight in left]))) if left else "-"
     label = find_method(each.method).label
     return label, each.vehicle, f"{len(flights) - len(left)} of {len(flights)}", error, peak

@@ -11,6 +11,9 @@ Read = Callable[[Any], Any]
 MANY, MOST, LONG = 2**53, 1e300, 1000
 """Largest whole number and largest number that every reader accepts, and length of the longest text."""
 
+# Largest numbers of `Stage` and `Cause` in retrim.control.condition, which needs JAX; a test compares them.
+LAST_STAGE, LAST_CAUSE = 4, 5
+
 
 def shown(value: Any) -> str:
     """Return a short text of a value, without control characters, for use in an error message."""
@@ -118,7 +121,7 @@ FIELDS: Mapping[str, Mapping[str, Read]] = {
     "status": {
         **dict.fromkeys(("mode", "reason"), text),
         **dict.fromkeys(("missed", "late_samples"), whole()),
-        "stages": list_of(list_of(_time, whole(0, 3), whole(0, 3))),
+        "stages": list_of(list_of(_time, whole(0, LAST_STAGE), whole(0, LAST_CAUSE))),
         **dict.fromkeys(("versions", "newest", "refused"), map_of(whole())),
         **dict.fromkeys(("felt", "estimate", "target"), _vector),
         "error": _any,
