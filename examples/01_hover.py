@@ -18,7 +18,7 @@ QUICK = {
 def main(*, quick: bool = False) -> None:
     """Pretrain a policy, fly it as it is, and fly it as it adapts."""
     preset = changed(load("hover/fast"), **(QUICK if quick else {}))
-    setup, ticks = Setup.of(preset), 100 if quick else 1500
+    setup, ticks = Setup.from_preset(preset), 100 if quick else 1500
 
     # The model of training is one equation; it knows nothing of what follows.
     *_, (policy, losses) = setup.pretraining()

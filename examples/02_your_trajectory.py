@@ -33,7 +33,7 @@ def main(*, quick: bool = False) -> None:
     preset = changed(load("track/retrim"), **(QUICK if quick else {}))
     mine = Reference.of(climb, seconds=11.0, lap=3.0)  # from 3 s on it repeats
     hasty = Reference.of(lambda t: climb(3.0 * t), seconds=11.0 / 3.0, lap=1.0)
-    setup = Setup.of(preset, mine)  # trains on the preset's references, flies mine
+    setup = Setup.from_preset(preset, mine)  # trains on the preset's references, flies mine
     print(f"Can the small quadrotor fly it? {setup.limits_exceeded() or 'yes'}")
     print(f"Three times as fast? {hasty.infeasibility(setup.vehicle) or 'yes'}")
 
@@ -53,7 +53,7 @@ def main(*, quick: bool = False) -> None:
         file = Path(folder) / "climb.csv"
         rows = [f"{t},{','.join(f'{value:.5f}' for value in climb(t))}" for t in np.arange(0.0, 11.01, 0.25)]
         file.write_text("\n".join(["t,x,y,z,yaw", *rows]))
-        filed = Setup.of(preset, from_csv(file))
+        filed = Setup.from_preset(preset, from_csv(file))
     print(f"from the file, as it is:              {error(filed, 'base'):.3f} m off")
 
 

@@ -21,7 +21,7 @@ QUICK = {
 def main(*, quick: bool = False) -> None:
     """Learn to see, learn to fly, and fly in wind."""
     preset = changed(load("vision/retrim"), **(QUICK if quick else {}))
-    setup, ticks = Setup.of(preset), 100 if quick else 1500
+    setup, ticks = Setup.from_preset(preset), 100 if quick else 1500
     # The encoder learns first, to tell position, attitude and velocity from the pixels of random motions.
     *_, (policy, losses) = setup.pretraining()
     print(f"pretraining ended at a loss of {float(losses[-1]):.3f}")

@@ -29,7 +29,7 @@ def change(before: object, after: object) -> float:
 def main(*, quick: bool = False) -> None:
     """Adapt a delta, then merge it."""
     preset = changed(load("hover/fast"), **(QUICK if quick else {}))
-    setup, ticks = Setup.of(preset), 100 if quick else 1500
+    setup, ticks = Setup.from_preset(preset), 100 if quick else 1500
     policy = setup.pretrained()
     thin = setup.low_rank(policy, jax.random.key(1))  # ranks 4, 10, 1; it starts as a delta of zero
     print(f"trained in flight: {size(thin.params)} numbers instead of {size(policy.params)}")

@@ -197,7 +197,7 @@ class Maker:
     def __init__(self, folder: Path) -> None:
         self.folder, self.n, self.written = folder, 0, list[Path]()
         self.preset = changed(tiny_preset(), pretrain={"hidden_sizes": (12, 12)}, adapt={"residual": "linear"})
-        self.setup = Setup.of(self.preset)
+        self.setup = Setup.from_preset(self.preset)
         with jax.numpy_dtype_promotion("standard"):
             self.policy = self.setup.new_policy(random.key(0))
             self.state = self.setup.learner.init(self.policy, random.key(1))
@@ -317,7 +317,7 @@ class Maker:
             for name, text, fine in variants(tables, toml=True):
 
                 def read(text=text, below=below):
-                    return Setup.of(overlaid(below, self.file(text(), ".toml")))
+                    return Setup.from_preset(overlaid(below, self.file(text(), ".toml")))
 
                 yield Case(f"{below.task} {name}", read, fine)
 
@@ -349,7 +349,7 @@ class Maker:
             sweep.scenarios()
             [make_reference(name) for name in sweep.references]
             [find_method(name) for name in sweep.methods]
-            return [Setup.of(changed(load(name), **sweep.overlay)) for name in sweep.presets]
+            return [Setup.from_preset(changed(load(name), **sweep.overlay)) for name in sweep.presets]
 
         for name, text, fine in variants(tables, toml=True):
             yield Case(name, lambda text=text: read(text), fine or name.startswith(("references", "seconds: 2")))

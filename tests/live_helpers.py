@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from live_processes import DT, HOME
-from retrim.config import load
 from retrim.config.setup import Setup
 from retrim.control import AbstractController
 from retrim.live.controllers import _source, plain_source
@@ -41,7 +40,7 @@ class Holds(AbstractController[Float[Array, ""]]):
 
 
 def setup() -> Setup:
-    return Setup.of(load("hover/retrim"))
+    return Setup.from_preset("hover/retrim")
 
 
 def plan(controller, *, folder=Path(), parent=0, window=50, delay_ticks=1, seconds=1e9, **limits) -> ControlPlan:

@@ -1,14 +1,23 @@
 """Public names of retrim, by the module that they come from; see :mod:`retrim`."""
 
+from .adapt import AbstractPolicyOptimiser as AbstractPolicyOptimiser
 from .adapt import LearnerState as LearnerState
 from .adapt import OnlineLearner as OnlineLearner
+from .adapt import PolicyUpdate as PolicyUpdate
+from .adapt import PolicyWorker as PolicyWorker
+from .adapt import Rejection as Rejection
+from .adapt import ResidualUpdate as ResidualUpdate
+from .adapt import ResidualWorker as ResidualWorker
 from .adapt import RollingBuffer as RollingBuffer
 from .adapt import Update as Update
+from .adapt import Worker as Worker
 from .adapt import pack_update as pack_update
 from .adapt import unpack_update as unpack_update
 from .config import PRESETS as PRESETS
+from .config import LearnerRequest as LearnerRequest
 from .config import MethodEntry as MethodEntry
 from .config import MethodRequest as MethodRequest
+from .config import NetworkRequest as NetworkRequest
 from .config import PlantEntry as PlantEntry
 from .config import PlantRequest as PlantRequest
 from .config import Preset as Preset
@@ -20,12 +29,16 @@ from .config import TaskRequest as TaskRequest
 from .config import VehicleSpec as VehicleSpec
 from .config import changed as changed
 from .config import disturbance as disturbance
+from .config import learning_method as learning_method
 from .config import load as load
 from .config import overlaid as overlaid
 from .config import read_vehicle as read_vehicle
 from .config import register_disturbance as register_disturbance
 from .config import register_fault as register_fault
+from .config import register_learner as register_learner
 from .config import register_method as register_method
+from .config import register_network as register_network
+from .config import register_optimiser as register_optimiser
 from .config import register_plant as register_plant
 from .config import register_reference as register_reference
 from .config import register_residual as register_residual
@@ -33,7 +46,9 @@ from .config import register_sensor as register_sensor
 from .config import register_task as register_task
 from .config import register_vehicle as register_vehicle
 from .control import AbstractController as AbstractController
+from .control import AbstractPolicy as AbstractPolicy
 from .control import LoraPolicy as LoraPolicy
+from .control import NetworkPolicy as NetworkPolicy
 from .control import Policy as Policy
 from .control import PolicyController as PolicyController
 from .errors import CheckpointError as CheckpointError
@@ -66,6 +81,8 @@ from .physics import BemQuadrotor as BemQuadrotor
 from .physics import Command as Command
 from .physics import CommandPath as CommandPath
 from .physics import Constant as Constant
+from .physics import Disturbance as Disturbance
+from .physics import ExternalEffects as ExternalEffects
 from .physics import Hybrid as Hybrid
 from .physics import LinearDragQuadrotor as LinearDragQuadrotor
 from .physics import PointMass as PointMass

@@ -17,7 +17,7 @@ pytestmark = pytest.mark.usefixtures("optax_promotion")
 def trained():
     """The environment of a preset, a fresh policy and one that hovers better."""
     with jax.numpy_dtype_promotion("standard"):
-        setup = Setup.of(tiny_preset())
+        setup = Setup.from_preset(tiny_preset())
         return setup.env, setup.new_policy(random.key(0)), setup.pretrained(1)
 
 

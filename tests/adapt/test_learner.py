@@ -25,7 +25,7 @@ pytestmark = pytest.mark.usefixtures("optax_promotion")
 @pytest.fixture(scope="module")
 def setup():
     """Its rate for low-rank deltas is another than that for all weights."""
-    return Setup.of(tiny_preset(adapt={"low_rank_learning_rate": 0.04}))
+    return Setup.from_preset(tiny_preset(adapt={"low_rank_learning_rate": 0.04}))
 
 
 @pytest.fixture(scope="module")
@@ -249,7 +249,7 @@ def test_the_gate_flies_other_starts_than_training(setup, fresh, window, monkeyp
 @pytest.fixture(scope="module")
 def low_rank(window):
     """A low-rank policy, and the state after an update of a single step."""
-    setup = Setup.of(tiny_preset(adapt={"num_updates": 1, "low_rank_learning_rate": 0.04}))
+    setup = Setup.from_preset(tiny_preset(adapt={"num_updates": 1, "low_rank_learning_rate": 0.04}))
     policy = setup.low_rank(setup.new_policy(random.key(0)), random.key(0))
     with jax.numpy_dtype_promotion("standard"):
         state = setup.learner.init(policy, random.key(0))
@@ -274,7 +274,7 @@ def test_a_low_rank_delta_has_a_learning_rate_of_its_own(low_rank):
 @pytest.mark.parametrize("name", ["ensemble", "regression", "layered", "linear"])
 def test_what_was_learnt_has_the_types_of_nothing_learnt(window, name, key):
     """Weak types, too: a program that took the first state must not be compiled again for the second, in flight."""
-    learner = Setup.of(tiny_preset(adapt={"residual": name, "fit_steps": 2})).learner
+    learner = Setup.from_preset(tiny_preset(adapt={"residual": name, "fit_steps": 2})).learner
     fresh = jax.eval_shape(learner.residual_model.init, key)
     fitted, _ = eqx.filter_eval_shape(type(learner).fit_residual, learner, fresh, window)
     types = lambda tree: [(leaf.shape, leaf.dtype, leaf.weak_type) for leaf in jax.tree.leaves(tree)]  # noqa: E731

@@ -79,7 +79,7 @@ def test_the_heading_is_that_of_the_flight_however_it_leans(key):
 
 
 def test_a_camera_at_rest_has_no_noise(key):
-    observation = Setup.of(load("vision/retrim")).env.task.observation
+    observation = Setup.from_preset("vision/retrim").env.task.observation
 
     @eqx.filter_jit
     def both(observation, x):
@@ -94,6 +94,6 @@ def test_a_camera_at_rest_has_no_noise(key):
 
 def test_what_has_no_rest_is_refused():
     with pytest.raises(ConfigError, match=r"adapt.trim = 'rest' is for a task that rests"):
-        Setup.of(changed(load("track/retrim"), adapt={"trim": "rest"}))
+        Setup.from_preset(changed(load("track/retrim"), adapt={"trim": "rest"}))
     with pytest.raises(ConfigError, match=r"adapt.trim = 'rest' needs adapt.frame = 'gravity'"):
         changed(load("hover/retrim"), adapt={"frame": "world"})

@@ -15,7 +15,7 @@ from jax import random
 from helpers import tiny_preset
 from retrim import MessageError
 from retrim.adapt import PolicyUpdate, Rejection, ResidualUpdate, Skip, pack_update, unpack_update
-from retrim.adapt.learner import LearnerState
+from retrim.adapt.learner_state import LearnerState
 from retrim.config import Setup
 from retrim.transport import wire
 
@@ -27,7 +27,7 @@ SMALL = {"pretrain": {"hidden_sizes": (12, 12)}}
 def learnt(method):
     """A learner state with numbers in every leaf: weights, moments and counters."""
     with jax.numpy_dtype_promotion("standard"):
-        setup = Setup.of(tiny_preset(**SMALL))
+        setup = Setup.from_preset(tiny_preset(**SMALL))
         policy = setup.new_policy(random.key(0))
         state = setup.learner.init(setup.low_rank(policy, random.key(1)) if method == "lora" else policy, random.key(2))
 
@@ -167,7 +167,7 @@ def test_foreign_bytes(states):
 
 def test_a_state_of_another_shape(states):
     """Of another network, and a low-rank state where all weights are expected."""
-    setup = Setup.of(tiny_preset(pretrain={"hidden_sizes": (12, 14)}))
+    setup = Setup.from_preset(tiny_preset(pretrain={"hidden_sizes": (12, 14)}))
     with jax.numpy_dtype_promotion("standard"):
         other = setup.learner.init(setup.new_policy(random.key(0)), random.key(1))
     data = pack_update(PolicyUpdate(1.0, 0.1, 0.2, other.policy))

@@ -221,18 +221,18 @@ def test_an_interruption_before_the_first_flight_is_over_is_a_line(folder, monke
 
 
 def test_a_user_s_own_task_is_pretrained_and_flown_by_its_file(folder, monkeypatch):
-    text = (Path(__file__).parents[2] / "examples" / "08_your_task.py").read_text()
-    (folder / "follow_task.py").write_text(text)
+    text = (Path(__file__).parents[2] / "examples" / "extensions" / "moving_goal.py").read_text()
+    (folder / "moving_goal.py").write_text(text)
     monkeypatch.syspath_prepend(str(folder))
     words = "--config", "small.toml", "--updates", "10", "--out", "own"
-    out = retrim("pretrain", "follow_task:entry", *words, cwd=folder)
-    assert "follow_task:entry error in its own model" in out
+    out = retrim("pretrain", "moving_goal:task", *words, cwd=folder)
+    assert "moving_goal:task error in its own model" in out
     fly = "fly", "--policy", "own", "--seconds", "1", "--adapt", "none", "--out", "ownf"
     refusal = retrim(*fly, cwd=folder, code=1)
-    assert "names Python code, 'follow_task:entry'" in refusal
-    assert "pass --trust follow_task:entry" in refusal
-    retrim(*fly, "--trust", "mine:other", "--trust", "follow_task:entry", cwd=folder)
-    assert (folder / "ownf" / "follow_task_entry_large.png").exists()
+    assert "names Python code, 'moving_goal:task'" in refusal
+    assert "pass --trust moving_goal:task" in refusal
+    retrim(*fly, "--trust", "mine:other", "--trust", "moving_goal:task", cwd=folder)
+    assert (folder / "ownf" / "moving_goal_task_large.png").exists()
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ def folder(tmp_path_factory, as_a_user):
     brief = SMALL.replace("[64, 64]", "[8]\nnum_envs = 2\nhorizon = 20").replace("= 150", "= 20")
     (here / "small.toml").write_text(brief)
     preset = tiny_preset()
-    save_policy(here / "p" / "policy.safetensors", Setup.of(preset).new_policy(jax.random.key(0)), preset)
+    save_policy(here / "p" / "policy.safetensors", Setup.from_preset(preset).new_policy(jax.random.key(0)), preset)
     return here
 
 

@@ -49,7 +49,7 @@ def folder(tmp_path_factory, as_a_user):
         (here / name).write_bytes(text.encode("latin-1"))
     circle = {"reference": "circle"}
     for name, preset in (("p", tiny_preset()), ("t", changed(load("track/preview"), track=circle))):
-        setup = Setup.of(preset)
+        setup = Setup.from_preset(preset)
         policy = setup.new_policy(jax.random.key(0))
         save_policy(here / name / "policy.safetensors", policy, preset)
         if name == "p":

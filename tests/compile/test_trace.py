@@ -166,7 +166,7 @@ def test_what_has_no_numpy_form_is_named_before_take_off():
     ],
 )
 def test_a_preset_flies_the_same_commands(preset, reference):
-    setup = Setup.of(PRESETS[preset], reference)
+    setup = Setup.from_preset(PRESETS[preset], reference)
     with jax.numpy_dtype_promotion("standard"):
         state = setup.learner.init(setup.new_policy(random.key(0)), random.key(1))
     parameters, fixed = eqx.partition(state, eqx.is_array)
@@ -195,7 +195,7 @@ def test_a_preset_flies_the_same_commands(preset, reference):
 
 def test_a_controller_that_plans_by_random_roll_outs_flies_the_same_commands():
     """MPPI: loops, and a random key among the parameters."""
-    setup = Setup.of(PRESETS["hover/fast"])
+    setup = Setup.from_preset(PRESETS["hover/fast"])
     pilot = setup.pilot(setup.new_policy(random.key(0)), "mppi", random.key(1))
     assert isinstance(pilot, ControllerPilot)
     assert isinstance(pilot.controller, Mppi)

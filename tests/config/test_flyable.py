@@ -36,7 +36,7 @@ def test_a_large_quadrotor_hovers_in_wind_with_a_load(spec):
     preset = changed(
         PRESETS["hover/retrim"], vehicle=spec, pretrain={"num_updates": 300, "num_envs": 16, "hidden_sizes": (64, 64)}
     )
-    setup = Setup.of(preset)
+    setup = Setup.from_preset(preset)
     with jax.numpy_dtype_promotion("standard"):  # optax's schedule divides integers
         policy = setup.pretrained()
     pilot = setup.pilot(policy, "base-do", random.key(0))
@@ -68,8 +68,8 @@ def test_the_model_of_training_follows_as_the_vehicle_does(spec):
 def test_classical_controllers_are_as_slow_as_the_vehicle(spec):
     """A time that is n times as long makes gains of 1/s, 1/s^2 and 1/s^3 so many times n, n^2 and n^3 less."""
     for name in ("hover/retrim", "hover/fast", "track/retrim", "track/fast"):
-        assert slowness(Setup.of(PRESETS[name])) == 1.0
-    usual, slow = (Setup.of(changed(PRESETS["hover/retrim"], vehicle=vehicle)) for vehicle in ("small", spec))
+        assert slowness(Setup.from_preset(PRESETS[name])) == 1.0
+    usual, slow = (Setup.from_preset(changed(PRESETS["hover/retrim"], vehicle=vehicle)) for vehicle in ("small", spec))
     n = slowness(slow)
     assert n == pytest.approx((0.02 + step_responses(slow.vehicle)[0].rise) / 0.053)
     for method in ("geometric-i", "indi"):
@@ -87,7 +87,7 @@ def test_a_vehicle_that_no_rate_loop_can_fly_is_refused_with_its_step_response(t
         lambda: read_vehicle(tmp_path / "slow.toml"),
         lambda: make_vehicle(slow),
         lambda: make_vehicle("slow-one"),
-        lambda: Setup.of(changed(PRESETS["hover/fast"], vehicle=slow)),
+        lambda: Setup.from_preset(changed(PRESETS["hover/fast"], vehicle=slow)),
         lambda: Scenario().make(slow),
     ):
         with pytest.raises(

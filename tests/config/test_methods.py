@@ -5,7 +5,7 @@ import pytest
 from jax import random
 
 from helpers import brief_preset
-from retrim import ConfigError, Setup, load
+from retrim import ConfigError, Setup
 from retrim.config.methods import METHODS, MethodRequest, find_method
 from retrim.control.passive import Passive
 from retrim.control.seen_pose import SeenPose
@@ -15,7 +15,7 @@ from retrim.plants.plant import Measurement
 @pytest.fixture(scope="module")
 def seeing():
     """Set-ups whose policies see keypoints: with a pose filter, and without."""
-    return {name: Setup.of(brief_preset(f"vision/{name}")) for name in ("retrim", "ideal")}
+    return {name: Setup.from_preset(brief_preset(f"vision/{name}")) for name in ("retrim", "ideal")}
 
 
 @pytest.mark.parametrize(
@@ -48,17 +48,17 @@ def test_a_controller_flies_by_the_pose_that_the_filter_sees(seeing, key):
     pilot = setup.pilot(setup.new_policy(key), "indi", key)
     assert type(pilot.controller) is SeenPose
     pilot.reset(Measurement(0.0, setup.flight_starts(1)[0]))
-    plain = Setup.of(brief_preset()).pilot(None, "indi", key)
+    plain = Setup.from_preset(brief_preset()).pilot(None, "indi", key)
     assert type(plain.controller) is not SeenPose
     own = Passive()
-    assert MethodRequest(Setup.of(brief_preset()), None).by_state(own) is own
+    assert MethodRequest(Setup.from_preset(brief_preset()), None).by_state(own) is own
     with pytest.raises(ConfigError, match="method 'Passive' needs the state"):
         MethodRequest(seeing["ideal"], None).by_state(own)
 
 
 @pytest.mark.parametrize("method", ["full", "lora"])
 def test_a_method_that_learns_needs_a_key(method):
-    setup = Setup.of(brief_preset(pretrain={"hidden_sizes": (16, 16)}))
+    setup = Setup.from_preset(brief_preset(pretrain={"hidden_sizes": (16, 16)}))
     with pytest.raises(ValueError, match="a method that learns needs a key"):
         setup.pilot(setup.new_policy(random.key(0)), method)
 
@@ -72,7 +72,7 @@ def test_every_method_has_a_label_of_its_own_and_only_raptor_is_on_board():
 
 
 def test_a_low_rank_delta_is_drawn_from_the_key_and_kept_where_there_is_one(key):
-    setup = Setup.of(load("hover/retrim"))
+    setup = Setup.from_preset("hover/retrim")
     policy = setup.new_policy(key)
     one, same, other = (setup.low_rank(policy, random.key(seed)).delta[0].down for seed in (1, 1, 2))
     assert jnp.array_equal(one, same)

@@ -29,8 +29,8 @@ def test_the_papers_numbers():
         10,
     )
     assert (paper.command_history, paper.delay_ticks, paper.dt) == (0, 0, 0.02)
-    assert Setup.of(paper).env.task.observation.size == 15
-    assert Setup.of(load("hover/released")).env.task.observation.size == 27
+    assert Setup.from_preset(paper).env.task.observation.size == 15
+    assert Setup.from_preset("hover/released").env.task.observation.size == 27
     assert load("track/paper").adapt.window == load("track/preview").adapt.window == 250
     vision = load("vision/paper")
     assert (vision.pretrain.num_updates, vision.pretrain.num_envs) == (500, 300)
@@ -80,9 +80,29 @@ def test_several_mistakes_are_all_named():
 
 
 DEFAULTS = {
-    "pretrain": (300, 100, 150, 5e-3, 0.999, None, (512, 512), math.pi),
+    "pretrain": (300, 100, 150, 5e-3, 0.999, None, (512, 512), "mlp", math.pi),
     "adapt": (
-        *(100, "ensemble", 0.5, 0.05, 3.0, 100, 1e-2, 1e-3, 5.0, 30, 10, 1e-3, None, None, "fresh", None, 0.1, "world"),
+        *(
+            100,
+            "ensemble",
+            0.5,
+            0.05,
+            3.0,
+            100,
+            1e-2,
+            1e-3,
+            5.0,
+            30,
+            10,
+            1e-3,
+            None,
+            None,
+            "bptt",
+            "fresh",
+            None,
+            0.1,
+            "world",
+        ),
         *("free", 0.2, 1.0),
     ),
     "rest": ("small", 0.02, (0.0, 0.0, 1.0), 5.0, 0, 0, 1, None),

@@ -76,10 +76,10 @@ def test_every_registered_name_makes_a_reference():
 def test_a_flight_lasts_as_long_as_a_reference_that_ends(lap):
     """Its last seconds are what is scored: a flight of 60 s would be scored while it hovers."""
     preset = load("track/preview")
-    assert Setup.of(preset, str(lap)).flown.flight_seconds == 60.0
-    assert Setup.of(preset, f"{lap}:once").flown.flight_seconds == pytest.approx(math.pi, abs=1e-3)
-    assert Setup.of(preset, "circle").flown.flight_seconds == 60.0
-    assert Setup.of(preset).flown.flight_seconds == 60.0
+    assert Setup.from_preset(preset, str(lap)).flown.flight_seconds == 60.0
+    assert Setup.from_preset(preset, f"{lap}:once").flown.flight_seconds == pytest.approx(math.pi, abs=1e-3)
+    assert Setup.from_preset(preset, "circle").flown.flight_seconds == 60.0
+    assert Setup.from_preset(preset).flown.flight_seconds == 60.0
 
 
 def test_limits_are_those_of_the_vehicle_that_flies():
@@ -87,9 +87,9 @@ def test_limits_are_those_of_the_vehicle_that_flies():
     preset = load("track/preview")
     hasty = circle(radius=3.0, period=1.4)
     assert hasty.infeasibility(small()) != hasty.infeasibility(large())
-    setup = Setup.of(preset, hasty)
+    setup = Setup.from_preset(preset, hasty)
     for vehicle in (None, "small", "large"):
         flies = Scenario(vehicle=vehicle).make_vehicle(preset.vehicle)
         assert setup.limits_exceeded(flies) == hasty.infeasibility({"large": large()}.get(vehicle, small()))
     assert setup.limits_exceeded() == hasty.infeasibility(small())
-    assert Setup.of(load("hover/fast")).limits_exceeded() is None
+    assert Setup.from_preset("hover/fast").limits_exceeded() is None

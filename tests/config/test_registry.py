@@ -203,14 +203,14 @@ def test_a_python_name_is_a_module_and_a_name_in_it(name):
 
 def test_ones_own_task(mine):
     preset = changed(tiny_preset(), task=f"{mine}:task", options={"height": 2.5})
-    setup = Setup.of(preset)
+    setup = Setup.from_preset(preset)
     assert type(setup.env.task).__name__ == "Higher"
     np.testing.assert_array_equal(setup.flown.home(), [0.0, 0.0, 2.5])
     assert setup.env.task.horizon == preset.pretrain.horizon
     assert setup.learner.env.task is setup.flown
     assert float(setup.flight_starts(1)[0].p[2]) == pytest.approx(2.5, abs=1.0)
     entry = changed(tiny_preset(), task=f"{mine}:entry", options={"height": 2.5})
-    assert type(Setup.of(entry).env.task).__name__ == "Higher"
+    assert type(Setup.from_preset(entry).env.task).__name__ == "Higher"
 
 
 @pytest.mark.parametrize(
@@ -223,7 +223,7 @@ def test_ones_own_task(mine):
 )
 def test_a_task_that_is_none(mine, name, message):
     with pytest.raises(ConfigError, match=message):
-        Setup.of(changed(tiny_preset(), task=f"{mine}:{name}"))
+        Setup.from_preset(changed(tiny_preset(), task=f"{mine}:{name}"))
 
 
 def test_ones_own_plant_vehicle_sensors_and_disturbance(mine):
@@ -261,26 +261,26 @@ def test_a_vehicle_that_is_none(mine):
     with pytest.raises(ConfigError, match=r"gives a str, expected a retrim\.Vehicle"):
         Scenario(vehicle=f"{mine}:no_vehicle").make()
     with pytest.raises(ConfigError, match="vehicle"):
-        Setup.of(changed(tiny_preset(), vehicle=f"{mine}:NUMBER"))
+        Setup.from_preset(changed(tiny_preset(), vehicle=f"{mine}:NUMBER"))
 
 
 def test_ones_own_residual(mine):
-    setup = Setup.of(changed(tiny_preset(), adapt={"residual": f"{mine}:residual"}))
+    setup = Setup.from_preset(changed(tiny_preset(), adapt={"residual": f"{mine}:residual"}))
     assert type(setup.learner.residual_model).__name__ == "Zero"
     assert setup.learner.residual_model.steps == 2
     state = setup.learner.init(setup.new_policy(random.key(0)), random.key(1))
     assert isinstance(state.residual, eqx.Module)
-    with pytest.raises(ConfigError, match="gives a int without init, fit, predict and spread"):
-        Setup.of(changed(tiny_preset(), adapt={"residual": f"{mine}:no_residual"}))
+    with pytest.raises(ConfigError, match="gives a int without init, fit and predict"):
+        Setup.from_preset(changed(tiny_preset(), adapt={"residual": f"{mine}:no_residual"}))
 
 
 def test_ones_own_reference(mine):
     found = make_reference(f"{mine}:reference")
     np.testing.assert_allclose(found(jnp.array(2.0)).p, [0.0, 0.0, 1.2], atol=1e-6)
-    setup = Setup.of(changed(load("track/paper"), pretrain={"hidden_sizes": (8,)}), f"{mine}:reference")
+    setup = Setup.from_preset(changed(load("track/paper"), pretrain={"hidden_sizes": (8,)}), f"{mine}:reference")
     np.testing.assert_allclose(setup.flown.reference(jnp.array(2.0)).p, [0.0, 0.0, 1.2], atol=1e-6)
     with pytest.raises(ConfigError, match=r"reference 'circle': a hover policy follows none"):
-        Setup.of(tiny_preset(), "circle")
+        Setup.from_preset(tiny_preset(), "circle")
     with pytest.raises(ConfigError, match=rf"reference '{mine}:no_vehicle' is a str, not a function that gives"):
         make_reference(f"{mine}:no_vehicle")
     with pytest.raises(ConfigError, match=rf"reference {mine}:no_task: "):

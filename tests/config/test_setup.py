@@ -56,7 +56,7 @@ def built(request):
     """A preset, with a small network, and its set-up."""
     preset = changed(load(request.param), pretrain={"hidden_sizes": (12, 12)})
     with jax.numpy_dtype_promotion("standard"):
-        return preset, Setup.of(preset)
+        return preset, Setup.from_preset(preset)
 
 
 # ---- the environment
@@ -321,7 +321,7 @@ def test_what_does_not_fit_is_one_line():
         changed(load("vision/occluded"), plant_delay_ticks=9),
     ):
         with pytest.raises(ConfigError, match=r"preset 'vision/(ideal|occluded)': ") as error:
-            Setup.of(wrong)
+            Setup.from_preset(wrong)
         assert "\n" not in str(error.value)
 
 
@@ -329,7 +329,7 @@ def test_what_does_not_fit_is_one_line():
     ("hidden", "message"), [((16, 16, 16), "3 ranks .* for 4 layers"), ((8, 16), "rank 10 for weights 16 x 8")]
 )
 def test_a_network_that_low_rank_cannot_take(hidden, message):
-    made = Setup.of(tiny_preset(pretrain={"hidden_sizes": hidden}))
+    made = Setup.from_preset(tiny_preset(pretrain={"hidden_sizes": hidden}))
     with pytest.raises(ConfigError, match=f"preset 'hover/fast': LoRA: {message}") as error:
         made.pilot(made.new_policy(random.key(0)), "lora", random.key(1))
     assert "\n" not in str(error.value)
@@ -339,7 +339,10 @@ def test_a_network_that_low_rank_cannot_take(hidden, message):
 
 
 def test_flight_starts_follow_from_seed_and_home_alone():
-    one, other = Setup.of(tiny_preset()), Setup.of(changed(load("hover/released"), pretrain={"hidden_sizes": (8,)}))
+    one, other = (
+        Setup.from_preset(tiny_preset()),
+        Setup.from_preset(changed(load("hover/released"), pretrain={"hidden_sizes": (8,)})),
+    )
     for a, b in zip(one.flight_starts(3, seed=5), other.flight_starts(3, seed=5), strict=True):
         np.testing.assert_array_equal(a.vector(), b.vector())
     starts = one.flight_starts(40)
@@ -357,21 +360,21 @@ def test_a_frame_is_refused_for_what_cannot_be_turned():
         def target(self, t):
             return self.goal + t
 
-    fixed = Setup.of(tiny_preset())
+    fixed = Setup.from_preset(tiny_preset())
     f = fixed.flown
     check_frame(fixed.preset, f)
-    with pytest.raises(ConfigError, match="Moving moves its target: it must say how that is turned"):
+    with pytest.raises(ConfigError, match="Moving overrides target"):
         check_frame(fixed.preset, Moving(f.goal, f.observation, f.box, f.heading, f.dt, f.horizon))
     with pytest.raises(ConfigError, match=r"'vision/ideal' has no frame of felt gravity: .* occlusion = true"):
-        Setup.of(changed(load("vision/ideal"), adapt={"frame": "gravity"}))
-    seeing = Setup.of(load("vision/retrim"))
+        Setup.from_preset(changed(load("vision/ideal"), adapt={"frame": "gravity"}))
+    seeing = Setup.from_preset("vision/retrim")
     assert isinstance(seeing.learner.view, RestView)
     assert isinstance(seeing.pilot(seeing.new_policy(random.key(0)), "base-do").controller, SeenFrame)
 
 
 def test_training_follows_references_as_they_are_felt():
     """Every member of the family is a built-in reference, level or tilted and scaled; flight follows the plain one."""
-    made = Setup.of(changed(load("track/retrim"), track={"reference": "circle+star", "felt_copies": 2}))
+    made = Setup.from_preset(changed(load("track/retrim"), track={"reference": "circle+star", "felt_copies": 2}))
     trained, flown = made.env.task.reference, made.flown.reference
     assert trained.joins.shape[0] == 2 * (1 + 2)
     assert flown.joins.shape[0] == 2
@@ -394,7 +397,7 @@ def test_a_hundred_hertz_trains_flies_and_adapts():
         adapt={"fit_steps": 20, "num_updates": 3, "num_envs": 4, "window": 60}
         | {"fit_every": 0.5, "update_every": 0.8, "fit_latency": 0.1, "update_latency": 0.25},
     )
-    made = Setup.of(preset)
+    made = Setup.from_preset(preset)
     chunks = list(made.pretraining(1))
     assert sum(losses.shape[0] for _, losses in chunks) == 150
     policy = chunks[-1][0]
@@ -418,7 +421,7 @@ def test_a_hundred_hertz_trains_flies_and_adapts():
 def test_a_vehicle_whose_lag_is_known_is_modelled_with_it():
     spec = VehicleSpec("made_up", 1.0, (0.02, 0.02, 0.03), (0.2, 0.2), 20.0, (4.0, 4.0, 3.0), 0.05, (0.07, 0.08, 0.4))
     for name in ("hover/retrim", "track/retrim"):
-        made = Setup.of(changed(load(name), vehicle=spec))
+        made = Setup.from_preset(changed(load(name), vehicle=spec))
         response = made.env.dynamics.response
         np.testing.assert_allclose([response.thrust_lag, *response.rate_lag], [0.05, 0.07, 0.08, 0.4])
         prior = made.learner.residual_model.init(jax.random.key(0))
@@ -429,17 +432,17 @@ def test_a_vehicle_whose_lag_is_known_is_modelled_with_it():
 @pytest.mark.parametrize(("delay", "ticks"), [(0.041, 2), (0.0, 0), (None, 1)])
 def test_a_vehicle_whose_delay_is_known_is_trained_with_it(delay, ticks):
     body = ("made_up", 1.0, (0.02, 0.02, 0.03), (0.2, 0.2), 20.0, (4.0, 4.0, 3.0), 0.05)
-    made = Setup.of(changed(load("hover/retrim"), vehicle=VehicleSpec(*body, command_delay=delay)))
+    made = Setup.from_preset(changed(load("hover/retrim"), vehicle=VehicleSpec(*body, command_delay=delay)))
     assert made.learner.plant_delay_ticks == made.preset.plant_delay_ticks == ticks
     exact = 0.02 if delay is None else delay  # the model, and the observer in flight
     observer = made.controller(made.learner.init(made.new_policy(random.key(0)), random.key(2))).frame.observer
     assert [float(made.env.delay), float(observer.path.delay)] == pytest.approx([exact, exact])
-    assert Setup.of(made.preset).preset == made.preset
+    assert Setup.from_preset(made.preset).preset == made.preset
 
 
 def test_a_delay_of_too_many_ticks_is_one_line_that_says_why():
     body = ("made_up", 1.0, (0.02, 0.02, 0.03), (0.2, 0.2), 20.0, (4.0, 4.0, 3.0), 0.05)
     preset = changed(load("hover/retrim"), dt=0.005, vehicle=VehicleSpec(*body, command_delay=0.15))
     with pytest.raises(ConfigError, match=r"'made_up': command_delay = 0.15 s is 30 ticks of dt = 0.005 s") as error:
-        Setup.of(preset)
+        Setup.from_preset(preset)
     assert "\n" not in str(error.value)

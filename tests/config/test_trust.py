@@ -64,7 +64,7 @@ def test_a_refusal_is_one_short_line_with_the_way_out():
 @pytest.mark.parametrize("key", ["task", "vehicle"])
 def test_a_policy_file_imports_what_is_trusted_and_nothing_else(mine, tmp_path, key):
     name, preset = f"{mine}:{key}", tiny_preset()
-    setup = Setup.of(preset)
+    setup = Setup.from_preset(preset)
     policy = setup.new_policy(random.key(0))
     state = setup.learner.init(policy, random.key(1))
     save_policy(tmp_path / "p.safetensors", policy, changed(preset, **{key: name}))

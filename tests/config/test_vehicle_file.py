@@ -105,7 +105,7 @@ def test_a_preset_keeps_the_content_of_its_vehicle_file(vehicle_file, tmp_path):
     preset = load("hover/fast", overlay)
     path.unlink()
     assert preset.vehicle.name == "seven_inch"
-    setup = Setup.of(preset)
+    setup = Setup.from_preset(preset)
     assert float(setup.vehicle.mass) == 1.2
     np.testing.assert_array_equal(setup.env.task.observation.omega_max, [8.0, 8.0, 4.0])
     assert float(Scenario().make(preset.vehicle).simulation.model.vehicle.mass) == 1.2

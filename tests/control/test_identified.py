@@ -98,7 +98,7 @@ def fly(plant, controller, x0, ticks=200, *, senses=True):
 
 @pytest.fixture(scope="module")
 def x0(as_a_user):
-    return Setup.of(load("hover/retrim")).flight_starts(1, 3)[0]
+    return Setup.from_preset("hover/retrim").flight_starts(1, 3)[0]
 
 
 @pytest.mark.parametrize(("delay", "lag", "gain"), [(0.0, 0.03, 1.0), (0.05, 0.12, 0.7), (0.03, 0.2, 1.4)])
@@ -171,7 +171,7 @@ def test_the_tracked_rates_are_those_of_the_vehicle(x0, sensed):
 @pytest.mark.parametrize("wrap", [FiniteController, "integral", "near", "tracking"])
 def test_controllers_around_another_one_pass_the_vehicle_on(wrap, x0):
     """A wrapper that swallowed it would fly a policy for the wrong vehicle without a word."""
-    task = Setup.of(load("hover/retrim")).flown
+    task = Setup.from_preset("hover/retrim").flown
     makers = {
         "integral": lambda inner: IntegralAction(inner, task, jnp.array(0.5), jnp.array(1.0)),
         "near": lambda inner: NearTarget(inner, task, jnp.array(1.0)),
@@ -206,7 +206,7 @@ def test_a_vehicle_file_is_believed_within_a_factor_of_two():
 
 
 def test_a_preset_for_one_vehicle_identifies_none():
-    setup = Setup.of(changed(load("hover/retrim"), pretrain=SHORT))
+    setup = Setup.from_preset(changed(load("hover/retrim"), pretrain=SHORT))
     with pytest.raises(ConfigError, match="hover/any"):
         setup.pilot(setup.new_policy(random.key(0)), "base-id")
 
@@ -217,7 +217,7 @@ def test_past_commands_must_cover_the_delays_of_the_family():
 
 
 def test_the_observer_is_as_fast_as_the_vehicle_permits(as_a_user):
-    setup = Setup.of(changed(load("hover/any"), pretrain=SHORT))
+    setup = Setup.from_preset(changed(load("hover/any"), pretrain=SHORT))
     flight = setup.pilot(setup.new_policy(random.key(0)), "base-id").controller
 
     def tau(low, high):

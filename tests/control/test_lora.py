@@ -184,7 +184,7 @@ def test_the_learner_beside_the_flight_takes_it(key, monkeypatch):
         return judge(candidate, incumbent, *rest, **options)
 
     monkeypatch.setattr("retrim.adapt.learner.judge", noting)
-    setup = Setup.of(preset)
+    setup = Setup.from_preset(preset)
     base = setup.new_policy(random.key(0))
     state = setup.learner.init(setup.low_rank(base, random.key(1)), random.key(2))
     buffer = RollingBuffer(preset.adapt.window)

@@ -30,7 +30,7 @@ DT = 0.02
 def flying(as_a_user):
     """A policy that hovers, and a monitor of it that has learned nothing."""
     brief = {"hidden_sizes": (32, 32), "num_envs": 8, "num_updates": 200, "horizon": 100, "learning_rate": 0.01}
-    setup = Setup.of(changed(load("hover/retrim"), pretrain=brief))
+    setup = Setup.from_preset(changed(load("hover/retrim"), pretrain=brief))
     policy = setup.pretrained(0)
     return setup, policy, setup.controller(setup.learner.init(policy, random.key(0)))
 

@@ -8,7 +8,7 @@ import pytest
 from jax import lax, random
 
 from helpers import GOAL, first_order, random_state, replaced
-from retrim import ConfigError, Setup, load
+from retrim import ConfigError, Setup
 from retrim.config.baselines import BASELINES
 from retrim.config.methods import MethodRequest
 from retrim.control.seen_pose import SeenPose
@@ -24,7 +24,7 @@ ELSEWHERE = State(jnp.array([2.0, -1.0, 3.0]), so3.exp(jnp.array([0.3, -0.2, 0.5
 @pytest.fixture(scope="module")
 def setup():
     with jax.numpy_dtype_promotion("standard"):
-        return Setup.of(load("vision/retrim"))
+        return Setup.from_preset("vision/retrim")
 
 
 def made(setup, name, **changed):
@@ -90,6 +90,6 @@ def test_accepted_commands_and_ages_reach_the_controller_inside(setup):
 
 def test_without_a_filter_there_is_no_state():
     with jax.numpy_dtype_promotion("standard"):
-        setup = Setup.of(load("vision/ideal"))
+        setup = Setup.from_preset("vision/ideal")
     with pytest.raises(ConfigError, match="'Geometric' needs the state, and preset 'vision/ideal' shows keypoints"):
         MethodRequest(setup, None).by_state(BASELINES["geometric"].controller(setup))

@@ -15,7 +15,7 @@ def test_every_lever_is_one_change_of_its_preset(task, kind):
     made = [(changed(preset, **lever.changes), lever.method) for lever in (*CONTROL, *each)]
     for one, method in made:
         find_method(method)
-        Setup.of(one)
+        Setup.from_preset(one)
     assert made.count((preset, "full")) == 1
     assert len({(str(one), method) for one, method in made}) == len(made)
     assert len({lever.label for lever in (*CONTROL, *each)}) == len(made)

@@ -11,7 +11,7 @@ from retrim.config.registry import told_of_own_module
 from retrim.evaluation.asked import Where, asked_preset, flown_reference, loaded, same_policy, with_residual
 from retrim.io.trained import load_policy, save_policy
 
-SEVEN_INCH = Path(__file__).parents[2] / "examples" / "seven_inch.toml"
+SEVEN_INCH = Path(__file__).parents[2] / "examples" / "extensions" / "vehicle.toml"
 
 
 def test_a_preset_is_that_of_the_task_with_what_was_asked_on_top(tmp_path):
@@ -85,7 +85,7 @@ def test_a_residual_is_another_one_but_not_in_a_flight_that_goes_on(key):
     preset = load("hover/fast")
     assert with_residual(preset, None, None) is preset
     assert with_residual(preset, "regression", None).adapt.residual == "regression"
-    setup = Setup.of(brief_preset())
+    setup = Setup.from_preset(brief_preset())
     state = setup.learner.init(setup.new_policy(key), key)
     assert with_residual(preset, None, state) is preset
     with pytest.raises(ConfigError, match="goes on with its own residual"):
@@ -103,7 +103,7 @@ def test_where_a_flight_takes_place_is_its_scenario():
 
 def test_weights_are_of_a_policy_or_of_an_earlier_flight(tmp_path, key):
     preset = brief_preset()
-    save_policy(tmp_path / "policy.safetensors", Setup.of(preset).new_policy(key), preset)
+    save_policy(tmp_path / "policy.safetensors", Setup.from_preset(preset).new_policy(key), preset)
     weights, found, state = loaded(tmp_path, None)
     assert (found, state) == (preset, None)
     assert weights.layers[0].weight.shape == load_policy(tmp_path)[0].layers[0].weight.shape

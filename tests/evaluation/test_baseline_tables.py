@@ -50,7 +50,7 @@ def test_settings_are_those_that_the_published_search_found(page, field):
     ("preset", "field"), [("hover/fast", "settings"), ("vision/retrim", "settings_from_keypoints")]
 )
 def test_a_baseline_flies_with_the_settings_for_what_it_is_shown(preset, field):
-    setup = Setup.of(load(preset))
+    setup = Setup.from_preset(load(preset))
     assert all(each.settings_for(setup) is getattr(each, field) for each in BASELINES.values())
 
 
@@ -76,7 +76,7 @@ def test_settings_are_searched_by_their_command(tmp_path):
 
 @pytest.mark.parametrize(("rotors", "own"), [(False, True), (True, True), (True, False)])
 def test_gradients_through_the_residual_change_gradients_alone(rotors, own, key):
-    setup = Setup.of(tiny_preset())
+    setup = Setup.from_preset(tiny_preset())
     x, u = random_state(key, 0.3), random_command(key)
 
     def end(x, backprop):
@@ -89,7 +89,7 @@ def test_gradients_through_the_residual_change_gradients_alone(rotors, own, key)
 
 
 def test_the_gradient_is_that_of_the_model_or_of_the_point_mass(key):
-    setup, x, u = Setup.of(tiny_preset()), random_state(key, 0.3), random_command(key)
+    setup, x, u = Setup.from_preset(tiny_preset()), random_state(key, 0.3), random_command(key)
 
     def jacobian(choice):
         model = design.design_dynamics(setup, lambda x, u: jnp.zeros(3), choice)
@@ -123,7 +123,7 @@ def test_the_design_study_s_rows_are_of_all_seeds_and_flights():
 
 
 def test_a_policy_is_retrained_from_where_it_was():
-    setup = Setup.of(tiny_preset())
+    setup = Setup.from_preset(tiny_preset())
     policy = setup.new_policy(random.key(0))
     logs = design.flown(setup, policy, 2, 1.0, 0)
     made = design.retrained(setup, policy, logs, random.key(1), design.CHOICES["low fidelity, res-fwd"],
@@ -221,7 +221,7 @@ def test_readings_of_the_papers_formulation_differ_as_they_say(tmp_path, monkeyp
     assert {section.scenario.reference for section in sections} == {presets[0].track.reference} == {"circle"}
     assert [preset.track.observation for preset in presets] == ["blind", "relative", "relative", "both"]
     assert [(preset.delay_ticks, preset.command_history) for preset in presets] == [(0, 0), (0, 0), (1, 2), (0, 0)]
-    assert [Setup.of(preset).env.task.observation.size for preset in presets] == [15, 15, 23, 21]
+    assert [Setup.from_preset(preset).env.task.observation.size for preset in presets] == [15, 15, 23, 21]
     assert presets[3] == load("track/paper")
     for wrong in ({"readings": ("printd",)}, {"references": ("line",)}):
         with pytest.raises(ConfigError, match="there are"):
@@ -319,7 +319,7 @@ def test_vision_flies_what_a_preset_can(tmp_path):
 
 def test_re_training_goes_on_from_chunk_to_chunk_and_forgets_the_first(monkeypatch):
     """Which compiles: what it came to is not kept, and its time is told apart."""
-    setup = Setup.of(tiny_preset())
+    setup = Setup.from_preset(tiny_preset())
     policy = setup.new_policy(random.key(0))
     logs = design.flown(setup, policy, 2, 1.0, 0)
     asked = []

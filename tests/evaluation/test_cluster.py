@@ -60,7 +60,7 @@ def here(as_a_user):
 @pytest.fixture(scope="module")
 def fleet(as_a_user):
     preset = small()
-    policy = Setup.of(preset).new_policy(jax.random.key(0))
+    policy = Setup.from_preset(preset).new_policy(jax.random.key(0))
     return Fleet(preset, policy, [Scenario("small", plant="simple")], starts=2, seconds=1.2)
 
 

@@ -18,7 +18,7 @@ pytestmark = pytest.mark.usefixtures("optax_promotion")
 
 def test_a_picture_with_crashes_and_without_adapted_flights(tmp_path):
     found = [flight(0.1), flight(3.0, terminated=True, seconds=1.0)]
-    made = picture(found, Setup.of(tiny_preset()), found[0].spec.scenario, tmp_path)
+    made = picture(found, Setup.from_preset(tiny_preset()), found[0].spec.scenario, tmp_path)
     assert [path.name for path in made] == ["hover_large.png", "hover_large.svg"]
     assert all(path.stat().st_size > 5_000 for path in made)
 
@@ -28,7 +28,7 @@ def test_a_picture_shows_the_flights_of_its_scenario_only(tmp_path):
     swap = Event(3.0, "policy", "cost 1 against 2")
     adapted = flight(0.02, spec=FlightSpec(scenario, "full", 0), events=[swap])
     assert adapted.swaps == (3.0,)
-    setup = Setup.of(tiny_preset())
+    setup = Setup.from_preset(tiny_preset())
     assert picture([adapted], setup, Scenario("none"), tmp_path) == []
     assert not list(tmp_path.iterdir())
     named = picture([adapted], setup, scenario, tmp_path / "deep" / "er")
@@ -39,7 +39,7 @@ def test_a_picture_shows_the_flights_of_its_scenario_only(tmp_path):
 
 def test_a_picture_calls_methods_what_they_are(tmp_path):
     """A controller that learns nothing is not called adapted."""
-    scenario, setup = Scenario("large"), Setup.of(tiny_preset())
+    scenario, setup = Scenario("large"), Setup.from_preset(tiny_preset())
     shown = [flight(error, spec=FlightSpec(scenario, name, 0)) for name, error in (("base", 0.3), ("indi", 0.1))]
     text = picture(shown, setup, scenario, tmp_path)[1].read_text()
     assert "base policy: 30.0 cm over the last 2 s" in text
@@ -58,7 +58,7 @@ def test_what_a_person_did_is_marked_where_it_was_done(tmp_path):
         Event(5.0, "guard", "hold: gone"),
     ]
     shown = flight(0.1, spec=FlightSpec(Scenario("large"), "full", 0), events=acts)
-    text = picture([shown], Setup.of(tiny_preset()), shown.spec.scenario, tmp_path)[1].read_text()
+    text = picture([shown], Setup.from_preset(tiny_preset()), shown.spec.scenario, tmp_path)[1].read_text()
     assert all(words in text for words in ("method lora $x_$", "push 1 0 0", "somebody acts"))
     assert "hold: gone" not in text
 
@@ -88,7 +88,7 @@ def test_bars_of_methods_have_colours_of_their_own(methods):
 
 @pytest.mark.parametrize("last", [np.nan, np.inf])
 def test_a_crash_into_nowhere_is_marked_where_the_vehicle_was_last_seen(tmp_path, last):
-    scenario, setup = Scenario("large"), Setup.of(tiny_preset())
+    scenario, setup = Scenario("large"), Setup.from_preset(tiny_preset())
     error = np.append(np.full(500, 0.5), last)
     shown = [flight(error, spec=FlightSpec(scenario, "base", 0), terminated=True)]
     assert "crashed" in picture(shown, setup, scenario, tmp_path)[1].read_text()

@@ -32,7 +32,7 @@ SCENARIOS = [Scenario("small", plant="simple"), Scenario("gusts", plant="simple"
 def fleet(as_a_user):
     """Eight flights, too short to crash, of two policies that were never trained."""
     preset = brief_preset()
-    setup = Setup.of(preset)
+    setup = Setup.from_preset(preset)
     policies = {seed: setup.new_policy(jax.random.key(seed)) for seed in (0, 5)}
     return Fleet(preset, policies, SCENARIOS, starts=1, seconds=1.2)
 
@@ -116,7 +116,7 @@ def test_no_flight_of_a_program_is_left_by_itself(monkeypatch, n, cores):
 
 def test_other_lots_of_a_program_wait_until_it_is_compiled_not_until_it_has_landed(monkeypatch):
     preset = brief_preset()
-    policy = Setup.of(preset).new_policy(jax.random.key(0))
+    policy = Setup.from_preset(preset).new_policy(jax.random.key(0))
     fleet = Fleet(preset, policy, SCENARIOS[:1], methods=("base",), starts=4, seconds=2.0)
     order, other = [], threading.Event()
 
@@ -301,7 +301,7 @@ def test_a_crash_says_why(fleet, off, why):
 def test_what_was_learnt_before_reaches_every_flight(monkeypatch):
     """Flown by itself, in a lot, or as a job elsewhere."""
     preset, told = brief_preset(), []
-    setup = Setup.of(preset)
+    setup = Setup.from_preset(preset)
     policy = setup.new_policy(jax.random.key(0))
     state = setup.learner.init(policy, jax.random.key(1))
     fleet = Fleet(preset, policy, SCENARIOS[:1], methods=("full",), starts=2, seconds=1.2, state=state)

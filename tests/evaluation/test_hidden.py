@@ -70,7 +70,7 @@ def test_the_plant_is_the_vehicle(population):
 
 def test_flights_of_vehicles_that_differ_in_numbers_are_one_program(population):
     preset = brief_preset()
-    policy = Setup.of(preset).new_policy(jax.random.key(0))
+    policy = Setup.from_preset(preset).new_policy(jax.random.key(0))
     scenarios = [vehicle.scenario("early-step") for vehicle in population[:4]]
     fleet = Fleet(preset, policy, scenarios, methods=("base",), starts=1, seconds=1.0)
     lots = fleet.lots(fleet.specs)

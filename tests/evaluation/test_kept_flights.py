@@ -21,7 +21,7 @@ CALM, PUSH = Scenario(plant="simple"), Scenario("large", plant="simple")
 @pytest.fixture(scope="module")
 def study():
     preset = brief_preset()
-    policies = {seed: Setup.of(preset).new_policy(jax.random.key(seed)) for seed in (0, 1)}
+    policies = {seed: Setup.from_preset(preset).new_policy(jax.random.key(seed)) for seed in (0, 1)}
     return Study(preset, policies, ())
 
 

@@ -21,7 +21,7 @@ SPECS = [FlightSpec(Scenario(), method, start, 4) for method in ("base", "full")
 
 @pytest.fixture(scope="module")
 def setup():
-    return Setup.of(brief_preset())
+    return Setup.from_preset(brief_preset())
 
 
 def learnt(setup, seed, low_rank=False):

@@ -139,7 +139,7 @@ def test_policies_and_flights_are_of_the_code_and_the_files_that_made_them(tmp_p
 def test_a_vehicle_file_is_looked_up_beside_that_of_the_sweep(tmp_path):
     studies = tmp_path / "studies"
     studies.mkdir()
-    text = (Path(__file__).parents[2] / "examples" / "seven_inch.toml").read_text()
+    text = (Path(__file__).parents[2] / "examples" / "extensions" / "vehicle.toml").read_text()
     (studies / "my.toml").write_text(text)
     (studies / "s.toml").write_text('vehicles = ["my.toml", "large"]\n[overlay]\nvehicle = "my.toml"\n')
     found = read_sweep(studies / "s.toml")
@@ -204,7 +204,7 @@ def test_a_report_has_a_row_for_each_combination_and_bars_for_each_flight(tmp_pa
 def test_what_failed_elsewhere_is_kept_and_flown_again(tmp_path, monkeypatch):
     """The others of a sweep land; the run's exit code says that some did not."""
     preset, said = brief_preset(), []
-    policies = {0: Setup.of(preset).new_policy(jax.random.key(0))}
+    policies = {0: Setup.from_preset(preset).new_policy(jax.random.key(0))}
     fleet = Fleet(preset, policies, [Scenario(plant="simple")], methods=("base",), starts=2, seconds=1.2)
     kept = sweep._Kept(tmp_path / "flights.jsonl")
     reporter, run = Silent(), Run("test", tmp_path)

@@ -41,7 +41,7 @@ LEVELS = ("none", "small", "large")
 
 def untrained(preset, seeds, run, reporter):
     """In place of training, where it does not matter how well a policy flies."""
-    policy = Setup.of(preset).new_policy(jax.random.key(0))
+    policy = Setup.from_preset(preset).new_policy(jax.random.key(0))
     return Study(preset, dict.fromkeys(seeds, policy), (0.1,) * len(seeds))
 
 
@@ -169,7 +169,7 @@ def test_a_vehicle_of_a_file_or_a_module_is_one_of_the_things(tmp_path, monkeypa
     preset = with_vehicle(load("hover/retrim"), "my_quad:make")
     assert set(files_behind(*named_in(preset))) == set(files_behind(*named_by(Scenario(vehicle="my_quad:make"))))
     assert set(files_behind(*named_in(preset))) == {"my_quad:make"}
-    text = (Path(__file__).parents[2] / "examples" / "seven_inch.toml").read_text()
+    text = (Path(__file__).parents[2] / "examples" / "extensions" / "vehicle.toml").read_text()
     Path("my.toml").write_text(text)
     before = dump(with_vehicle(preset, "my.toml"))
     Path("my.toml").write_text(text.replace("mass = 1.2", "mass = 1.3"))
@@ -178,7 +178,7 @@ def test_a_vehicle_of_a_file_or_a_module_is_one_of_the_things(tmp_path, monkeypa
 
 def test_progress_of_flights_goes_from_nothing_to_all(tmp_path):
     preset, watching = brief_preset(), Watching()
-    study = Study(preset, {0: Setup.of(preset).new_policy(jax.random.key(0))}, ())
+    study = Study(preset, {0: Setup.from_preset(preset).new_policy(jax.random.key(0))}, ())
     flown = fly_all(study, [Scenario(plant="simple")], Run("test", tmp_path), watching,
                     methods=("indi",), starts=2, seconds=1.0)  # fmt: skip
     assert len(flown.flown) == 2
@@ -302,7 +302,7 @@ def test_a_network_of_datt_is_of_its_vehicle_its_lag_its_steps_and_its_seed(tmp_
     train(steps=size)
     assert len(list(tmp_path.glob("datt_*_seed0.safetensors"))) == 5
     assert len(list(tmp_path.glob("datt_*_seed3.safetensors"))) == 1
-    np.testing.assert_array_equal(asked[2][0].high.c, Setup.of(others[0]).vehicle.command_max.c)
+    np.testing.assert_array_equal(asked[2][0].high.c, Setup.from_preset(others[0]).vehicle.command_max.c)
     assert asked[3][0].dt == 0.01
     before = len(asked)
     again = train(seeds=(0, 3))
@@ -332,7 +332,7 @@ def test_a_table_of_fast_flight_flies_a_file_too(tmp_path, monkeypatch):
     """The race line that comes with the examples uses what the kingfisher can do, and no more."""
     line = Path(__file__).parents[2] / "examples" / "race.csv"
     preset = brief_preset("track/fast", track={"reference": "circle=8", "felt_copies": 0})
-    setup = Setup.of(preset, str(line))
+    setup = Setup.from_preset(preset, str(line))
     assert setup.limits_exceeded() is None
     speeds = np.linalg.norm(at(setup.flown.reference, np.linspace(3.0, 10.0, 50)).v, axis=1)
     assert 8.0 < max(speeds) < 12.0

@@ -22,7 +22,7 @@ pytestmark = pytest.mark.usefixtures("as_a_user")
 
 @pytest.fixture(scope="module")
 def setup(as_a_user):
-    return Setup.of(brief_preset(pretrain={"num_updates": 30}))
+    return Setup.from_preset(brief_preset(pretrain={"num_updates": 30}))
 
 
 def test_progress_is_told_by_chunks_and_a_stop_keeps_what_was_reached(setup):

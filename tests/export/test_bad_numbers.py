@@ -46,7 +46,7 @@ int main(void) {
 
 @pytest.fixture(scope="module")
 def setup():
-    return Setup.of(tiny_preset(command_history=3))
+    return Setup.from_preset(tiny_preset(command_history=3))
 
 
 @pytest.fixture(scope="module")

@@ -35,7 +35,7 @@ NEEDS = {"npz": (), "onnx": ("onnx", "onnxruntime"), "c": ()}
 
 @pytest.fixture(scope="module")
 def setup():
-    return Setup.of(tiny_preset(command_history=2))
+    return Setup.from_preset(tiny_preset(command_history=2))
 
 
 @pytest.fixture(scope="module")

@@ -25,7 +25,7 @@ from retrim.transport import wire
 
 @pytest.fixture(scope="module")
 def setup():
-    return Setup.of(tiny_preset(pretrain={"hidden_sizes": (12, 12)}, adapt={"window": 30}))
+    return Setup.from_preset(tiny_preset(pretrain={"hidden_sizes": (12, 12)}, adapt={"window": 30}))
 
 
 @pytest.fixture(scope="module")
@@ -238,7 +238,7 @@ def test_a_delta_is_judged_by_what_it_makes_of_its_base(tmp_path, setup, states)
 
 
 def test_a_residual_that_makes_the_command_useless_is_refused(tmp_path):
-    setup = Setup.of(tiny_preset(adapt={"residual": "regression", "frame": "gravity"}))
+    setup = Setup.from_preset(tiny_preset(adapt={"residual": "regression", "frame": "gravity"}))
     state = setup.learner.init(setup.new_policy(random.key(0)), random.key(1))
     save_learnt(tmp_path / "l.safetensors", state, setup.preset)
     load_learnt(tmp_path / "l.safetensors")

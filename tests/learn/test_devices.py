@@ -31,7 +31,7 @@ assert jax.device_count() == {devices}
 soon = {{"window": 20, "fit_every": 0.2, "update_every": 0.3, "fit_latency": 0.1, "update_latency": 0.1}}
 small = {{"hidden_sizes": (16, 16), "num_updates": 4, "num_envs": 8, "horizon": 10}}
 preset = tiny_preset(pretrain=small, adapt={{"fit_steps": 3, **soon}})
-setup, losses = Setup.of(preset), []
+setup, losses = Setup.from_preset(preset), []
 for policy, some in setup.pretraining(0):
     losses += [float(loss) for loss in some]
 pushed = Scenario("small", plant="simple", sensors="mocap")

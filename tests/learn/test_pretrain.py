@@ -30,7 +30,7 @@ def losses(monkeypatch):
 
 
 def run(num_updates, chunk):
-    setup = Setup.of(tiny_preset())
+    setup = Setup.from_preset(tiny_preset())
     sizes = {"num_updates": num_updates, "num_envs": 2, "chunk": chunk}
     policy = setup.new_policy(random.key(0))
     return len(list(pretrain(policy, setup.env, random.key(1), optimiser=setup.optimiser, **sizes)))

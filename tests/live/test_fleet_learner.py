@@ -102,7 +102,7 @@ def test_nothing_is_published_for_a_vehicle_that_went_meanwhile(start, vehicles)
 def test_low_rank_vehicles_share_a_base_and_lose_it_with_a_policy_that_is_taken_back(start, tmp_path):  # noqa: F811
     path, controller, _ = start
     _, preset = load_learnt(path)
-    setup = Setup.of(preset)
+    setup = Setup.from_preset(preset)
     state = setup.learner.init(setup.low_rank(setup.new_policy(random.key(0)), random.key(1)), random.key(2))
     save_learnt(tmp_path / "start.safetensors", state, preset)
     vehicles = {name: Beside((tmp_path / "start.safetensors", controller, state)) for name in "ab"}

@@ -13,7 +13,6 @@ from jax import random
 from helpers import brief_preset
 from live_helpers import TOPICS, plan
 from live_processes import DT, level, moved
-from retrim.config import load
 from retrim.config.scenario import Scenario
 from retrim.config.setup import Setup
 from retrim.io.trained import save_learnt
@@ -44,7 +43,7 @@ AT = 1.4  # [s]
 def made():
     """A set-up on the circle, what it starts from, and the controller."""
     with jax.numpy_dtype_promotion("standard"):
-        setup = Setup.of(brief_preset("track/retrim"), "circle")
+        setup = Setup.from_preset(brief_preset("track/retrim"), "circle")
         state = setup.learner.init(setup.new_policy(random.key(0)), random.key(1))
         return setup, state, adaptive_source(setup, state)
 
@@ -254,9 +253,9 @@ def test_what_leaves_the_fence_or_is_not_taken_is_told(made, tmp_path, monkeypat
 def test_only_who_sees_its_reference_has_a_choice(made):
     assert choices(made[0], "circle") == ("circle", "figure8", "lissajous", "star")
     assert choices(made[0], "my.csv") == ("my.csv", "circle", "figure8", "lissajous", "star")
-    assert choices(Setup.of(load("track/blind")), "figure8") == ()
-    assert choices(Setup.of(load("track/paper")), "figure8") == ("figure8", "circle", "lissajous", "star")
-    assert choices(Setup.of(load("hover/retrim")), "") == ()
+    assert choices(Setup.from_preset("track/blind"), "figure8") == ()
+    assert choices(Setup.from_preset("track/paper"), "figure8") == ("figure8", "circle", "lissajous", "star")
+    assert choices(Setup.from_preset("hover/retrim"), "") == ()
     drawn = paths(("circle", "star"), 20.0)
     np.testing.assert_allclose(drawn["circle"][-1], circle()(jnp.array(19.95)).p, atol=1e-9)
     assert drawn["star"].shape == (400, 3)

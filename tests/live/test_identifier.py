@@ -28,7 +28,7 @@ AT_REST = np.concatenate([[0.0, 0.0, 1.0], np.eye(3).ravel(), np.zeros(3)])
 
 @pytest.fixture(scope="module")
 def setup(as_a_user):
-    return Setup.of(changed(load("hover/any"), pretrain=SHORT))
+    return Setup.from_preset(changed(load("hover/any"), pretrain=SHORT))
 
 
 @pytest.fixture(scope="module")
@@ -143,7 +143,7 @@ def test_a_preset_for_one_vehicle_is_refused():
 
 
 def test_a_live_flight_does_not_excite_its_vehicle(setup):
-    excited = Setup.of(changed(setup.preset, family={"excitation": True}))
+    excited = Setup.from_preset(changed(setup.preset, family={"excitation": True}))
     controller = excited.pilot(excited.new_policy(jax.random.key(0)), "base-id").controller
     with pytest.raises(ConfigError, match=r"family\.excitation: a live flight does not excite its vehicle"):
         plain_source(excited, controller)

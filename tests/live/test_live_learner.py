@@ -27,7 +27,7 @@ def start(tmp_path_factory):
     """A file with what was learnt before the flight, and the controller that flies."""
     with jax.numpy_dtype_promotion("standard"):
         preset = tiny_preset()
-        setup = Setup.of(preset)
+        setup = Setup.from_preset(preset)
         state = setup.learner.init(setup.new_policy(random.key(0)), random.key(1))
         path = tmp_path_factory.mktemp("learner") / "start.safetensors"
         save_learnt(path, state, preset)

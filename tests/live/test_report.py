@@ -23,7 +23,7 @@ pytestmark = pytest.mark.usefixtures("optax_promotion")
 @pytest.fixture
 def asked(tmp_path):
     with jax.numpy_dtype_promotion("standard"):
-        setup = Setup.of(tiny_preset())
+        setup = Setup.from_preset(tiny_preset())
         return LiveRequest(setup, setup.new_policy(random.key(0)), Scenario(), "full", 10.0, 0, 3.0, tmp_path)
 
 

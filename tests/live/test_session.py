@@ -27,7 +27,7 @@ class Lost(Hover):
 
 def request_for(task, folder, seconds):
     with jax.numpy_dtype_promotion("standard"):
-        setup = Setup.of(tiny_preset())
+        setup = Setup.from_preset(tiny_preset())
         fields = {each.name: getattr(setup.flown, each.name) for each in dataclasses.fields(setup.flown)}
         setup = dataclasses.replace(setup, flown=task(**fields))
         return LiveRequest(setup, setup.new_policy(random.key(0)), Scenario(), "full", seconds, 0, 3.0, folder)

@@ -51,7 +51,7 @@ class Told(Supervisor):
 @pytest.fixture
 def asked(tmp_path):
     with jax.numpy_dtype_promotion("standard"):
-        setup = Setup.of(tiny_preset())
+        setup = Setup.from_preset(tiny_preset())
         policy = setup.new_policy(random.key(0))
         request = LiveRequest(setup, policy, Scenario(), "full", 10.0, 0, 3.0, tmp_path)
         return Wishes(request, Told(live_spec(request)))

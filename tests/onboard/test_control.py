@@ -13,7 +13,7 @@ from helpers import CheapModel
 from live_helpers import TOPICS, Holds, holding, plan, setup
 from live_processes import DT, HOME, level, moved
 from retrim import PlantError
-from retrim.adapt.learner import LearnerState
+from retrim.adapt.learner_state import LearnerState
 from retrim.live.controllers import adaptive_source, plain_source
 from retrim.onboard.accounts import measured
 from retrim.onboard.control import ControlLoop

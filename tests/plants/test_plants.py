@@ -223,7 +223,7 @@ def test_flights_are_in_the_dtype_of_their_start(make):
     plant = make("wind")
     with jax.enable_x64(False):
         plant32 = make("wind")
-        x0 = Setup.of(PRESETS["hover/fast"]).flight_starts(1)[0]
+        x0 = Setup.from_preset(PRESETS["hover/fast"]).flight_starts(1)[0]
         assert plant32.reset(x0).x.p.dtype == jnp.float32
         assert plant32.step(Command.hover())[0].x.p.dtype == jnp.float32
     assert plant.reset(START).x.p.dtype == jnp.float64

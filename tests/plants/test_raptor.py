@@ -27,7 +27,7 @@ def net():
 
 @pytest.fixture(scope="module")
 def untrained():
-    return Setup.of(tiny_preset()).new_policy(random.key(0))
+    return Setup.from_preset(tiny_preset()).new_policy(random.key(0))
 
 
 def test_the_network_computes_what_its_package_computes(net, key):

@@ -24,9 +24,9 @@ def flown(as_a_user):
     """A flight of a vehicle of second order by a geometric controller, and a set-up that does not know the vehicle."""
     scenario = Scenario("kick", plant="second-order", vehicle=VEHICLE, delay=0.03)
     known = dataclasses.replace(load("hover/retrim"), vehicle=VEHICLE)
-    policy = Setup.of(known).new_policy(jax.random.key(0))
+    policy = Setup.from_preset(known).new_policy(jax.random.key(0))
     (flight,) = Fleet(known, policy, [scenario], methods=("geometric",), starts=1, seconds=12.0).run().flown
-    return flight, Setup.of(load("hover/retrim"))
+    return flight, Setup.from_preset("hover/retrim")
 
 
 def test_the_file_has_the_delay_the_lags_and_the_damping_of_the_vehicle(flown, tmp_path):

@@ -125,7 +125,9 @@ def test_a_slower_log_has_its_own_tick_and_no_policy_adapts_to_it(tmp_path):
     asked = Replay(map=str(write_map(tmp_path / "map.toml")), buffer=100 / 30, horizon=50 / 30)
     document = replay(path, asked, Run("replay", tmp_path), Silent())
     assert "a tick of 33.33 ms" in document.sections[1].about
-    save_policy(tmp_path / "p.safetensors", Setup.of(tiny_preset()).new_policy(jax.random.key(0)), tiny_preset())
+    save_policy(
+        tmp_path / "p.safetensors", Setup.from_preset(tiny_preset()).new_policy(jax.random.key(0)), tiny_preset()
+    )
     asked = dataclasses.replace(asked, adapt="full", policy=tmp_path / "p.safetensors")
     with pytest.raises(LogError, match=r"a sample every 33.3 ms, but the policy's tick is 20 ms"):
         replay(path, asked, Run("replay", tmp_path), Silent())
@@ -205,7 +207,7 @@ def test_a_report_begins_with_what_is_doubtful_and_shows_every_figure(tmp_path, 
 def test_a_policy_learns_the_push_of_a_log(files, tmp_path):
     """The gate lets through what is better in the model that the log corrected."""
     preset = tiny_preset(adapt={"residual": "linear", "window": 100, "fit_every": 1.0, "learning_rate": 1e-3})
-    setup = Setup.of(preset)
+    setup = Setup.from_preset(preset)
     policy = setup.new_policy(jax.random.key(0))
     log = read_flight_log(files[0], read_map(files[1]), dt=preset.dt)
     result = adapt_to(rows_of(log), setup, policy, low_rank=False, updates=4, seed=0, reporter=Silent())
@@ -219,7 +221,7 @@ def test_a_policy_is_adapted_with_its_own_residual_and_a_model_that_it_cannot_ho
     files, brief, tmp_path, monkeypatch
 ):
     preset = tiny_preset(adapt={"residual": "regression", "window": 100, "fit_every": 1.0, "fit_steps": 100})
-    policy = Setup.of(preset).new_policy(jax.random.key(0))
+    policy = Setup.from_preset(preset).new_policy(jax.random.key(0))
     save_policy(tmp_path / "p.safetensors", policy, preset)
     used = []
 

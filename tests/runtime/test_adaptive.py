@@ -30,7 +30,7 @@ TRACES = []
 def trained():
     """A set-up whose learner counts its traces, and a policy that was trained."""
     with jax.numpy_dtype_promotion("standard"):
-        setup = Setup.of(tiny_preset(adapt=BRISK))
+        setup = Setup.from_preset(tiny_preset(adapt=BRISK))
         learner = eqx.tree_at(lambda l: l.env.task, setup.learner, counted(setup.env.task))
         return dataclasses.replace(setup, learner=learner), setup.pretrained(1)
 
@@ -303,7 +303,9 @@ def learning_at(setup, rate):
 def test_adaptation_cuts_the_error_under_the_large_disturbance(trained):
     """The whole loop, at reduced size: its updates bring it at least three times closer than the base policy."""
     setup, _ = trained
-    policy = Setup.of(changed(setup.preset, pretrain={"num_updates": 300, "learning_rate": 0.01})).pretrained(0)
+    policy = Setup.from_preset(changed(setup.preset, pretrain={"num_updates": 300, "learning_rate": 0.01})).pretrained(
+        0
+    )
     often = rescheduled(learning_at(setup, 3e-3), fit_every=0.4, update_every=0.4, update_latency=0.2)
     base = plain_flight(setup, policy, 8.0)
     adapted, _ = flight(often, policy, 8.0)

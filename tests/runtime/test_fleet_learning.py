@@ -26,7 +26,7 @@ def pushed(x, u):
 def fleet():
     """A learner, and what two vehicles with low-rank policies have learnt of the same push; their windows."""
     with jax.numpy_dtype_promotion("standard"):
-        setup = Setup.of(tiny_preset(adapt={"fit_steps": 100}))
+        setup = Setup.from_preset(tiny_preset(adapt={"fit_steps": 100}))
         learner, low_rank = setup.learner, setup.low_rank(setup.pretrained(), random.key(0))
         windows = [random_field_flight(pushed, random.key(i), n=setup.preset.adapt.window) for i in (1, 2)]
         workers = []

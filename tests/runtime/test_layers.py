@@ -20,7 +20,7 @@ pytestmark = pytest.mark.usefixtures("as_a_user")
 @pytest.fixture(scope="module")
 def trained(as_a_user):
     brief = {"hidden_sizes": (32, 32), "num_envs": 8, "num_updates": 200, "horizon": 100, "learning_rate": 0.01}
-    setup = Setup.of(changed(load("hover/retrim"), pretrain=brief, adapt={"num_envs": 4}))
+    setup = Setup.from_preset(changed(load("hover/retrim"), pretrain=brief, adapt={"num_envs": 4}))
     return setup, setup.pretrained(0)
 
 

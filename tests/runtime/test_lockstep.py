@@ -5,12 +5,12 @@ import types
 import jax.numpy as jnp
 import pytest
 
-from retrim.adapt import Rejection, RollingBuffer, Skip
+from retrim.adapt import Rejection, RollingBuffer, Skip, Worker
 from retrim.physics import Command, State
 from retrim.runtime import LockstepLearner, lockstep
 
 
-class Worker:
+class Refusing(Worker):
     """Refuses each window at once."""
 
     layer = "policy"
@@ -43,24 +43,24 @@ def appears(learner, tick):
 
 @pytest.mark.parametrize(("latency_s", "ticks"), [(0.001, 1), (0.02, 1), (0.021, 2), (0.1, 5), (0.3, 15), (1.0, 50)])
 def test_latencies_are_rounded_up_to_whole_ticks(latency_s, ticks):
-    assert appears(LockstepLearner(Worker(), latency_s, 0.02), 7) == 7 + ticks
+    assert appears(LockstepLearner(Refusing(), latency_s, 0.02), 7) == 7 + ticks
 
 
 def test_the_same_latency_is_twice_the_ticks_at_twice_the_rate():
-    assert appears(LockstepLearner(Worker(), 0.2, 0.01), 0) == 20
+    assert appears(LockstepLearner(Refusing(), 0.2, 0.01), 0) == 20
 
 
 def test_measured_latency_is_what_the_clock_shows(monkeypatch):
     """The worker takes 0.37 s by the clock."""
     readings = iter([100.0, 100.37, 200.0, 200.05])
     monkeypatch.setattr(lockstep, "time", types.SimpleNamespace(perf_counter=lambda: next(readings)))
-    learner = LockstepLearner(Worker(), None, 0.02)
+    learner = LockstepLearner(Refusing(), None, 0.02)
     assert appears(learner, 0) == 19
     assert appears(learner, 50) == 53
 
 
 def test_a_window_is_skipped_while_another_is_under_way():
-    worker = Worker()
+    worker = Refusing()
     learner = LockstepLearner(worker, 0.1, 0.02)
     learner.submit(window(1.0), 50)
     learner.submit(window(1.04), 52)
@@ -72,7 +72,7 @@ def test_a_window_is_skipped_while_another_is_under_way():
 
 
 def test_reset_drops_what_is_under_way():
-    worker = Worker()
+    worker = Refusing()
     learner = LockstepLearner(worker, 0.1, 0.02)
     learner.submit(window(1.0), 50)
     learner.submit(window(1.02), 51)
@@ -83,7 +83,7 @@ def test_reset_drops_what_is_under_way():
 
 
 def test_published_updates_reach_the_worker():
-    worker = Worker()
+    worker = Refusing()
     update = Skip(1.0, "residual")
     LockstepLearner(worker, 0.1, 0.02).receive(update)
     assert worker.received == [update]

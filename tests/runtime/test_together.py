@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from helpers import CheapModel, tiny_preset
 from retrim.adapt.updates import Rejection, Skip
+from retrim.adapt.worker import Worker
 from retrim.config import Setup, disturbance
 from retrim.learn import Window
 from retrim.physics import Command
@@ -21,7 +22,7 @@ from retrim.runtime.together import can_fly_together, fly_together
 TICKS = 70
 
 
-class Counting:
+class Counting(Worker):
     """A worker that learns nothing."""
 
     layer = "policy"
@@ -67,7 +68,7 @@ def flown(as_a_user):
     """
     soon = {"window": 20, "fit_every": 0.2, "update_every": 0.3, "fit_latency": 0.1, "update_latency": 0.38}
     preset = tiny_preset(adapt=soon)
-    setup = Setup.of(preset)
+    setup = Setup.from_preset(preset)
     policies = [setup.new_policy(jax.random.key(seed)) for seed in (0, 0, 5, 0, 0)]
     starts = setup.flight_starts(5)
     sensors = SensorModel.of(position=1e-3, velocity=3e-3, attitude=1e-3, latency=10)
@@ -141,7 +142,7 @@ def test_a_pilot_flies_on_with_what_it_learnt(flown):
 
 
 def test_what_cannot_be_one_program_is_told(as_a_user):
-    setup = Setup.of(tiny_preset())
+    setup = Setup.from_preset(tiny_preset())
     policy = setup.new_policy(jax.random.key(0))
     calm, windy = ([SimPlant(CheapModel(0.02), disturbance(name), seed=i) for i in (0, 1)] for name in ("none", "wind"))
     base = [setup.pilot(policy) for _ in range(2)]

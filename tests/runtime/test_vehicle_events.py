@@ -37,7 +37,7 @@ def notes(log):
 
 
 def test_a_batch_and_a_pilot_report_the_same_vehicle(preset, scenario):
-    setup = Setup.of(preset)
+    setup = Setup.from_preset(preset)
     policy = setup.new_policy(random.key(0))
     (flown,) = Fleet(preset, {0: policy}, [scenario], methods=["base-id"], starts=1, seconds=SECONDS).run().flown
     ((t, note),) = notes(flown.log)

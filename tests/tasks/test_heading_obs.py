@@ -76,7 +76,7 @@ def test_gradients_are_finite_upside_down(observation, key):
 
 
 def test_a_policy_of_such_a_preset_commands_the_same_at_every_heading(key):
-    setup = Setup.of(changed(load("hover/any"), pretrain={"hidden_sizes": (8,)}))
+    setup = Setup.from_preset(changed(load("hover/any"), pretrain={"hidden_sizes": (8,)}))
     policy = setup.new_policy(key)
     x, last = random_state(key), random_command(key)
     task = setup.env.task

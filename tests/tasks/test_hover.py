@@ -142,7 +142,7 @@ turned = jax.jit(so3.log)
 
 
 def test_flight_starts_are_the_same_for_every_preset():
-    starts = [Setup.of(preset).flight_starts(8) for preset in PRESETS.values()]
+    starts = [Setup.from_preset(preset).flight_starts(8) for preset in PRESETS.values()]
     for others in starts[1:]:
         jax.tree.map(np.testing.assert_array_equal, starts[0], others)
     for x in starts[0]:

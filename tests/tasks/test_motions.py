@@ -41,7 +41,7 @@ def test_an_encoder_sees_the_motions_of_its_preset():
     def with_motions(motions):
         small = {"num_updates": 1, "num_envs": 1, "horizon": 2, "hidden_sizes": [8, 8]}
         vision = {"encoder_steps": 3, "encoder_motions": motions, "whiten_pixels": False}
-        return Setup.of(changed(load("vision/paper"), pretrain=small, vision=vision))
+        return Setup.from_preset(changed(load("vision/paper"), pretrain=small, vision=vision))
 
     near, wild = with_motions("near"), with_motions("wild")
     once, again = (np.asarray(wild.pretrained(0).layers[0].weight) for _ in range(2))

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from ..control.policy import Policy
+from ..control.policy import AbstractPolicy
 from ..learn.bptt import policy_loss
 from ..learn.env import Env
 from ..tasks.task import Start
@@ -46,7 +46,7 @@ def all_finite(tree: Any) -> Bool[Array, ""]:
     return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(tree)]))
 
 
-def judge(candidate: Policy, incumbent: Policy, env: Env, x0: Start) -> Verdict:
+def judge(candidate: AbstractPolicy, incumbent: AbstractPolicy, env: Env, x0: Start) -> Verdict:
     """Compare two policies on the same roll-outs.
 
     Args:
@@ -60,6 +60,6 @@ def judge(candidate: Policy, incumbent: Policy, env: Env, x0: Start) -> Verdict:
     """
     both = jax.tree.map(lambda a, b: jnp.stack([a, b]), candidate, incumbent)
     new, old = lax.map(lambda policy: policy_loss(policy, env, x0), both)  # one after the other, as one program
-    sound = all_finite(candidate.layers)
+    sound = all_finite(candidate.params)
     better = (new <= old) | ~jnp.isfinite(old)
     return Verdict(sound & jnp.isfinite(new) & better, sound, new, old)

@@ -7,10 +7,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import random
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Key
 
 from ..control.lora import LoraPolicy
-from ..control.policy import Policy
+from ..control.policy import AbstractPolicy
 from ..learn.bptt import PolicyState, bptt
 from ..learn.env import Env
 from ..learn.residuals.model import FittedResidual, ResidualModel
@@ -18,38 +18,38 @@ from ..learn.residuals.targets import residual_targets
 from ..learn.screening import screen
 from ..learn.window import Window
 from ..physics.state import where
+from ..tasks.task import Start
 from .gate import Verdict, all_finite, judge
+from .learner_state import FitReport, LearnerState
 from .optimisers import AbstractPolicyOptimiser
 from .starts import AbstractStarts, TaskStarts, drawn
 from .trim import AbstractTrim, Untrimmed
+from .updates import Layer
 from .vehicles import AbstractVehicles, OwnVehicle
 from .views import AbstractView, WorldView
+from .worker import Worker
 
 HELD_OUT = 8  # number of starts for the roll-outs of the gate
+RETRAIN = 2**30 + 6  # folded into the key of an update for the random numbers of its training
 VEHICLES = 2**30 + 5  # folded into the keys of starts to draw the vehicles at these starts
 
 
-class LearnerState(eqx.Module):
-    """Learned policy and residual. They are separate, so that two processes can own one each."""
-
-    policy: PolicyState
-    residual: Any
-    """State of the residual model: a pytree of arrays."""
-
-
-class FitReport(eqx.Module):
-    """Result of a residual fit."""
-
-    rms_error: Float[Array, ""]
-    """Root mean square of the error over the window [m/s^2]."""
-    accepted: Bool[Array, ""]
-    """False if the fit is not finite or no tick of the window could be used; the old state is then kept."""
-    contradictions: Int[Array, "5"]
-    """Steps of the window that were left out, by reason; see :class:`~retrim.learn.screening.Screening`."""
-
-
 class OnlineLearner(eqx.Module):
-    """Learner from a window of flight (paper, Sec. IV-A.3). Every number that may change is an array."""
+    """Learner from a window of flight (paper, Sec. IV-A.3). Every number that may change is an array.
+
+    A custom learner is a subclass that overrides :meth:`retrain`, the training inside of the corrected model, or
+    :meth:`worker`, for a learner that JAX cannot trace. A function of a :class:`~retrim.LearnerRequest` builds it, and
+    ``adapt.learner`` of the preset names the function.
+
+    Example::
+
+        class Frozen(retrim.OnlineLearner):
+            def retrain(self, state, env, starts, key):
+                return state
+
+        def make(request):
+            return request.create(Frozen)
+    """
 
     env: Env
     """Task of the flight, nominal model and its delay; the model is independent of the plant."""
@@ -81,7 +81,7 @@ class OnlineLearner(eqx.Module):
         if self.plant_delay_ticks < 0:
             raise ValueError(f"OnlineLearner.plant_delay_ticks = {self.plant_delay_ticks} must not be negative")
 
-    def init(self, policy: Policy | LoraPolicy, key: Key[Array, ""]) -> LearnerState:
+    def init(self, policy: AbstractPolicy | LoraPolicy, key: Key[Array, ""]) -> LearnerState:
         """Return the state before the first fit, with a residual that predicts zero; the key is consumed."""
         fresh = PolicyState(policy, self.optimiser.transformation(self.num_updates).init(policy.params))
         return LearnerState(fresh, _fresh_residual(self.residual_model, key))
@@ -113,7 +113,7 @@ class OnlineLearner(eqx.Module):
         residual: Any,
         window: Window,
         key: Key[Array, ""],
-        flown: Policy | LoraPolicy | None = None,
+        flown: AbstractPolicy | LoraPolicy | None = None,
     ) -> tuple[PolicyState, Verdict]:
         """Re-train the policy by back-propagation in the corrected model, and judge the result.
 
@@ -140,9 +140,7 @@ class OnlineLearner(eqx.Module):
         x0 = self.starts(self.env.task, window, k_train, self.num_updates, self.num_envs)
         vehicle = self.vehicles.identify(window)
         x0 = self.vehicles.assign_vehicles(x0, vehicle, random.fold_in(k_train, VEHICLES))
-        optimiser = (isinstance(state.policy, LoraPolicy) and self.low_rank_optimiser) or self.optimiser
-        begun = optimiser.begin(state, self.num_updates)
-        stepped, _ = bptt(begun, corrected, x0, optimiser=optimiser.transformation(self.num_updates))
+        stepped = self.retrain(state, corrected, x0, random.fold_in(k_train, RETRAIN))
         trained = PolicyState(self.trim(stepped.policy, corrected, window), stepped.optimiser)
         held_out = jax.tree.map(
             lambda a, b: jnp.concatenate([a, b]),
@@ -153,6 +151,34 @@ class OnlineLearner(eqx.Module):
         held_out = self.vehicles.assign_vehicles(held_out, vehicle, random.fold_in(k_gate, VEHICLES))
         verdict = judge(trained.policy.merged(), incumbent.merged(), corrected, held_out)
         return trained, verdict.provided(screening.trusted)
+
+    def retrain(self, state: PolicyState, env: Env, starts: Start, key: Key[Array, ""]) -> PolicyState:
+        """Train the policy in the corrected model by back-propagation through time; JAX traces it.
+
+        Args:
+            state: Policy to start from, and the state of its optimiser.
+            env: Task and corrected model, in the coordinates of the policy.
+            starts: Starts, ``num_updates`` x ``num_envs``.
+            key: Random key, consumed.
+
+        Returns:
+            The trained policy, before trim and gate; structure and shapes are those of ``state``.
+        """
+        del key
+        optimiser = (isinstance(state.policy, LoraPolicy) and self.low_rank_optimiser) or self.optimiser
+        begun = optimiser.begin(state, self.num_updates)
+        return bptt(begun, env, starts, optimiser=optimiser.transformation(self.num_updates))[0]
+
+    def worker(self, layer: Layer, state: LearnerState, key: Key[Array, ""]) -> Worker | None:
+        """Return a custom worker of a layer of learning; by default None, for the built-in one.
+
+        Args:
+            layer: ``residual`` or ``policy``.
+            state: Learner state at the start of the flight.
+            key: Random key, consumed.
+        """
+        del layer, state, key
+        return None
 
 
 @eqx.filter_jit

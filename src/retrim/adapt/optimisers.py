@@ -13,7 +13,7 @@ from ..learn.bptt import PolicyState
 
 
 class AbstractPolicyOptimiser(eqx.Module):
-    """Gradient clipping, then Adam. Every number is an array, so that a new value does not cause a new compilation."""
+    """Optimiser of policy updates. Every number is an array, so that a new value does not cause a new compilation."""
 
     rate: eqx.AbstractVar[Float[Array, ""]]
     max_grad_norm: eqx.AbstractVar[Float[Array, ""]]

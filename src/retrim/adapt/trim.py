@@ -10,7 +10,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from ..control.lora import LoraPolicy
-from ..control.policy import Policy
+from ..control.policy import AbstractPolicy
 from ..learn.env import Env
 from ..learn.window import Window
 from ..physics import so3
@@ -21,7 +21,7 @@ class AbstractTrim(eqx.Module):
     """Correction of the command at rest after an update."""
 
     @abc.abstractmethod
-    def __call__(self, policy: Policy | LoraPolicy, env: Env, window: Window) -> Policy | LoraPolicy:
+    def __call__(self, policy: AbstractPolicy | LoraPolicy, env: Env, window: Window) -> AbstractPolicy | LoraPolicy:
         """Return the corrected policy.
 
         Args:
@@ -34,7 +34,7 @@ class AbstractTrim(eqx.Module):
 class Untrimmed(AbstractTrim):
     """No correction (the paper)."""
 
-    def __call__(self, policy: Policy | LoraPolicy, env: Env, window: Window) -> Policy | LoraPolicy:
+    def __call__(self, policy: AbstractPolicy | LoraPolicy, env: Env, window: Window) -> AbstractPolicy | LoraPolicy:
         """Return the policy unchanged."""
         return policy
 
@@ -46,7 +46,7 @@ class RestTrim(AbstractTrim):
     tasks that rest at home and leave the heading free: the vehicle keeps its present heading.
     """
 
-    def __call__(self, policy: Policy | LoraPolicy, env: Env, window: Window) -> Policy | LoraPolicy:
+    def __call__(self, policy: AbstractPolicy | LoraPolicy, env: Env, window: Window) -> AbstractPolicy | LoraPolicy:
         """Return the shifted policy."""
         home, newest = env.task.home(), jnp.max(jnp.where(window.valid, jnp.arange(window.valid.shape[0]), 0))
         R = window.x.R[newest]

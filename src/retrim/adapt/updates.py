@@ -9,7 +9,7 @@ from ..errors import MessageError
 from ..learn.bptt import PolicyState
 from ..learn.screening import REASONS, describe_counts
 from ..transport import wire
-from .learner import LearnerState
+from .learner_state import LearnerState
 
 Layer = Literal["residual", "policy"]
 """The two layers of learning."""

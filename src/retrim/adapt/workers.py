@@ -1,10 +1,6 @@
-"""Workers: the computation of one learner on one window, independent of clock and process.
+"""The two workers of an online learner: one fits the residual, one re-trains the policy."""
 
-The state of a worker advances only when it receives its own update as published. So a result that is dropped on the way
-(because of a new flight or a lost message) never becomes the base of the next one.
-"""
-
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import jax
 import numpy as np
@@ -12,29 +8,16 @@ from jax import random
 from jaxtyping import Array, Key
 
 from ..control.lora import LoraPolicy
-from ..control.policy import Policy
+from ..control.policy import AbstractPolicy
 from ..learn.bptt import PolicyState
 from ..learn.devices import suited
 from ..learn.screening import describe_counts
 from ..learn.window import Window
 from .gate import Verdict
-from .learner import FitReport, LearnerState, OnlineLearner
+from .learner import OnlineLearner
+from .learner_state import FitReport, LearnerState
 from .updates import Layer, PolicyUpdate, Rejection, ResidualUpdate, Update
-
-
-@runtime_checkable
-class Worker(Protocol):
-    """One layer of learning."""
-
-    layer: Layer
-
-    def learn(self, window: Window) -> Update:
-        """Learn from a window; block until the result is available."""
-        ...
-
-    def receive(self, update: Update) -> None:
-        """Receive a published update of this or another layer."""
-        ...
+from .worker import Worker
 
 
 def residual_update(computed_from: float, state: Any, report: FitReport) -> ResidualUpdate | Rejection:
@@ -56,7 +39,7 @@ def policy_update(computed_from: float, state: PolicyState, verdict: Verdict) ->
     return PolicyUpdate(computed_from, float(verdict.candidate), float(verdict.incumbent), state)
 
 
-class ResidualWorker:
+class ResidualWorker(Worker):
     """Fits the residual model, starting from its last published fit."""
 
     layer: Layer = "residual"
@@ -81,7 +64,7 @@ class ResidualWorker:
             self._residual = update.state
 
 
-class PolicyWorker:
+class PolicyWorker(Worker):
     """Re-trains the policy in the nominal model plus the last published residual."""
 
     layer: Layer = "policy"
@@ -97,7 +80,7 @@ class PolicyWorker:
         return LearnerState(self._policy, self._residual)
 
     @property
-    def policy(self) -> Policy | LoraPolicy:
+    def policy(self) -> AbstractPolicy | LoraPolicy:
         """Policy from which the next update starts."""
         return self._policy.policy
 
@@ -121,3 +104,18 @@ class PolicyWorker:
             self._policy = update.state
         elif isinstance(update, ResidualUpdate):
             self._residual = update.state
+
+
+def make_worker(learner: OnlineLearner, layer: Layer, state: LearnerState, key: Key[Array, ""]) -> Worker:
+    """Return the worker of a layer of learning.
+
+    Args:
+        learner: Learner of the flight; it may have a worker of its own.
+        layer: ``residual`` or ``policy``.
+        state: Learner state at the start of the flight.
+        key: Random key, consumed.
+    """
+    custom = learner.worker(layer, state, key)
+    if custom is not None:
+        return custom
+    return ResidualWorker(learner, state) if layer == "residual" else PolicyWorker(learner, state, key)

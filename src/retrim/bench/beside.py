@@ -58,7 +58,7 @@ def policies() -> dict[str, Any]:
 def _fly() -> None:
     """Fly in real time until the standard input is closed, and print the result."""
     on_core(0)
-    setup = Setup.of(load(PRESET))
+    setup = Setup.from_preset(load(PRESET))
     pilot = setup.pilot(setup.new_policy(random.key(0)), "base-do")
     plant, dt = Scenario().make(), setup.preset.dt
     measurement = plant.reset(setup.flight_starts(1)[0])

@@ -11,7 +11,6 @@ from jaxtyping import Array, Key
 from ..adapt.gate import Verdict
 from ..adapt.learner import OnlineLearner
 from ..config.disturbances import disturbance
-from ..config.loading import load
 from ..config.setup import Setup
 from ..control.controller import PolicyController
 from ..learn.bptt import PolicyState
@@ -31,7 +30,7 @@ Update = Callable[[Key[Array, ""]], tuple[PolicyState, Verdict]]
 
 def eight_flights() -> dict[str, Any]:
     """Time eight flights of 30 s on bem; plant and policy are one program; two threads run four flights each."""
-    setup = Setup.of(load("hover/fast"))
+    setup = Setup.from_preset("hover/fast")
     controller = PolicyController(setup.flown.observation_in_flight, setup.new_policy(random.key(0)))
     simulation = SimPlant(BemQuadrotor.of(small(), 0.02), disturbance("none")).simulation
     starts = setup.flight_starts(8)

@@ -15,7 +15,7 @@ from .timing import compiled, timed
 
 def pretrain(name: str, runs: int) -> dict[str, Any]:
     """Time pretraining without an encoder, with another seed for each run; the row includes the policies' errors."""
-    setup = Setup.of(load(name))
+    setup = Setup.from_preset(load(name))
     p, optimiser = setup.preset.pretrain, setup.optimiser
     policy = setup.new_policy(random.key(0))
     state = PolicyState(policy, optimiser.init(policy.params))
@@ -39,7 +39,7 @@ def pretrain(name: str, runs: int) -> dict[str, Any]:
 
 def encode_and_pretrain(name: str) -> dict[str, Any]:
     """Time the training of encoder and policy for a vision preset."""
-    setup, watch = Setup.of(load(name)), Stopwatch()
+    setup, watch = Setup.from_preset(load(name)), Stopwatch()
     policy, _ = train(setup, 0)
     row = {"compile_s": watch.compile_s, "run_s": watch.total_s - watch.compile_s}
     return row | {"remarks": f"error {1000 * nominal_error(setup, policy):.1f} mm"}

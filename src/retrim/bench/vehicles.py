@@ -61,7 +61,7 @@ class Air:
     """The vehicles: their simulations in one program, and a bus and a control loop for each vehicle."""
 
     def __init__(self, n: int, place: Path) -> None:
-        setup = Setup.of(load(PRESET))
+        setup = Setup.from_preset(load(PRESET))
         self.dt = setup.preset.dt
         scenario, starts = Scenario(PUSH, plant="simple"), setup.flight_starts(n)
         request = LiveRequest(setup, setup.pretrained(), scenario, "full", SECONDS, 0, 5.0, place)

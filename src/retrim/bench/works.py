@@ -33,12 +33,12 @@ def _update(name: str, *, lora: bool = False) -> dict[str, Any]:
     """Time a policy update; it has three products per step of training and one per tick of the gate."""
     learner, state, window = learner_in_flight(name)
     if lora:
-        policy = Setup.of(load(name)).low_rank(state.policy.policy, random.key(2))
+        policy = Setup.from_preset(load(name)).low_rank(state.policy.policy, random.key(2))
         state = learner.init(policy, random.key(1))
     fitted, _ = learner.fit_residual(state.residual, window)
     arguments = learner, state.policy, fitted, window, random.key(0)
     program, compile_s = compiled(OnlineLearner.update_policy, *arguments)
-    weights = sum(layer.weight.size for layer in state.policy.policy.merged().layers)
+    weights = sum(layer.weight.size for layer in state.policy.policy.merged().linear_layers())
     ticks = learner.env.task.horizon * (3 * learner.num_updates * learner.num_envs + 2 * HELD_OUT)
     return timed(compile_s, lambda: program(*arguments), 9) | {"flop": 2.0 * weights * ticks}
 
@@ -52,14 +52,14 @@ def _residual(name: str = "hover/paper") -> dict[str, Any]:
 def _programs() -> dict[str, Any]:
     """Trace and compile, or load, all programs of a flight: policy, plant, residual fit, policy update."""
     watch, preset = Stopwatch(), load("hover/fast")
-    policy = Setup.of(preset).new_policy(random.key(0))
+    policy = Setup.from_preset(preset).new_policy(random.key(0))
     Fleet(preset, policy, [Scenario("large")], starts=1, seconds=3.0).warm_up()
     return {"compile_s": watch.compile_s, "run_s": watch.total_s - watch.compile_s, "remarks": "preset hover/fast"}
 
 
 def _tick() -> dict[str, Any]:
     """Time a flight without adaptation: plant, observation, policy, checks."""
-    setup = Setup.of(load("hover/fast"))
+    setup = Setup.from_preset("hover/fast")
     policy, plant, x0 = setup.new_policy(random.key(0)), Scenario().make(), setup.flight_starts(1)[0]
     began = time.perf_counter()
     fly(plant, setup.pilot(policy), x0, ticks=2)

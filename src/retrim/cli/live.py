@@ -102,9 +102,9 @@ def live(
         wanted = page or (seconds is None and not no_page)
         address = page_address(page_host, page_port, demanded=page, say=RichReporter().say) if wanted else None
         ground = learners_at(learners, RichReporter().say, key)
-        setup, run = Setup.of(chosen, scenario.reference), started(Run("live", out, stop=stop))
+        setup, run = Setup.from_preset(chosen, scenario.reference), started(Run("live", out, stop=stop))
         if weights is None:
-            weights, losses = train(Setup.of(chosen), seed, reporter=RichReporter(), stop=stop)
+            weights, losses = train(Setup.from_preset(chosen), seed, reporter=RichReporter(), stop=stop)
             if run.interrupted:
                 console.print(f"interrupted while pretraining, after {len(losses)} steps; nothing has flown")
                 return INTERRUPTED

@@ -58,7 +58,7 @@ def pretrain(
 
 
 def _pretrain(preset: Preset, seed: int, out: Path | None, stop: threading.Event) -> int:
-    setup = Setup.of(preset)
+    setup = Setup.from_preset(preset)
     run, reporter = started(Run("pretrain", out, stop=stop)), RichReporter()
     policy, losses = train(setup, seed, reporter=reporter, stop=stop)
     if not losses:

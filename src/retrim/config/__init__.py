@@ -8,8 +8,14 @@ from .loading import load as load
 from .loading import overlaid as overlaid
 from .methods import MethodEntry as MethodEntry
 from .methods import MethodRequest as MethodRequest
+from .methods import learning_method as learning_method
 from .methods import register_method as register_method
 from .named_presets import PRESETS as PRESETS
+from .networks import NetworkRequest as NetworkRequest
+from .networks import register_network as register_network
+from .online_learners import LearnerRequest as LearnerRequest
+from .online_learners import register_learner as register_learner
+from .online_learners import register_optimiser as register_optimiser
 from .plants import PlantEntry as PlantEntry
 from .plants import PlantRequest as PlantRequest
 from .plants import register_plant as register_plant

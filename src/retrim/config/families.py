@@ -10,7 +10,7 @@ from ..control.controller import AbstractController, PolicyController
 from ..control.excitation import Excitation
 from ..control.identified import IdentifiedFlight
 from ..control.near_target import NearTarget
-from ..control.policy import Policy
+from ..control.policy import AbstractPolicy
 from ..control.resting import RestingController
 from ..errors import ConfigError
 from ..estimation.command_path import PathEstimator, ringing_of
@@ -71,7 +71,7 @@ def prior_belief(preset: Preset, family: PathFamily) -> PathBelief:
     return PathBelief.between(*ends)
 
 
-def policy_controller(preset: Preset, task: AbstractTask, policy: Policy) -> AbstractController[Any]:
+def policy_controller(preset: Preset, task: AbstractTask, policy: AbstractPolicy) -> AbstractController[Any]:
     """Return a policy with the observation used in flight.
 
     Args:

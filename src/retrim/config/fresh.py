@@ -9,11 +9,12 @@ from jax import random
 from jaxtyping import Array, Float, Key
 
 from ..control.lora import LoraPolicy
-from ..control.policy import Policy
+from ..control.policy import AbstractPolicy, Policy
 from ..physics.state import State
 from ..physics.vehicle import Vehicle
-from ..tasks.hover import TILT, Hover
+from ..tasks.hover import Hover
 from ..tasks.observation import StateObs
+from ..tasks.task import TILT
 
 START_TAG = 2**30 + 1  # folded into the seed of flight starts, so that their keys differ from those of training
 LOW_RANK_TAG = 2**30 + 4  # folded into the key of a learner, for its initial delta
@@ -44,7 +45,7 @@ def flight_starts(home: Float[Array, "3"], n: int, seed: int) -> list[State]:
     return [jax.tree.map(lambda leaf, i=i: jax.device_put(np.asarray(leaf)[i]), batch) for i in range(n)]
 
 
-def low_rank(policy: Policy | LoraPolicy, key: Key[Array, ""]) -> LoraPolicy:
+def low_rank(policy: AbstractPolicy | LoraPolicy, key: Key[Array, ""]) -> LoraPolicy:
     """Return ``policy`` with a new low-rank delta, unless it already has one.
 
     Args:
@@ -52,10 +53,12 @@ def low_rank(policy: Policy | LoraPolicy, key: Key[Array, ""]) -> LoraPolicy:
         key: Key of the learner.
 
     Raises:
-        ValueError: The policy does not have three layers, or a layer is too narrow for its rank.
+        ValueError: The policy is not a perceptron with three layers, or a layer is too narrow for its rank.
     """
     if isinstance(policy, LoraPolicy):
         return policy
+    if not isinstance(policy, Policy):
+        raise ValueError("low-rank adaptation needs a perceptron, pretrain.network = 'mlp'")
     fresh: LoraPolicy = _low_rank(policy, random.fold_in(key, LOW_RANK_TAG))
     return fresh
 

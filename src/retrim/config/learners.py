@@ -1,15 +1,16 @@
-"""Nominal model, optimiser, in-flight learner and control frame of a preset."""
+"""Nominal model, optimiser, settings of the online learner and control frame of a preset."""
 
 import functools
 import math
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import optax
+from jaxtyping import Array
 
-from ..adapt.learner import OnlineLearner
-from ..adapt.optimisers import CarriedAdam, FreshAdam
+from ..adapt.optimisers import AbstractPolicyOptimiser
 from ..adapt.starts import FlownStarts, TaskStarts
 from ..adapt.trim import RestTrim, Untrimmed
 from ..adapt.vehicles import IdentifiedVehicle, OwnVehicle
@@ -20,7 +21,7 @@ from ..errors import ConfigError, FrameError
 from ..estimation.command_path import PathEstimator
 from ..estimation.disturbance_observer import DisturbanceObserver
 from ..learn.env import Env
-from ..learn.residuals.model import FittedResidual, ResidualModel
+from ..learn.residuals.model import FittedResidual
 from ..physics.actuators import Lagged
 from ..physics.dynamics import AbstractDynamics, PointMass
 from ..physics.felt_frame import FeltFrame
@@ -55,13 +56,15 @@ def pretraining_optimiser(table: Pretrain) -> optax.GradientTransformation:
     return optax.chain(optax.clip_by_global_norm(table.max_grad_norm or math.inf), optax.adam(rate, b2=table.adam_b2))
 
 
-def make_learner(preset: Preset, model: ResidualModel, env: Env) -> OnlineLearner:
-    """Return the learner of a preset.
+def learner_settings(
+    preset: Preset, env: Env, optimiser: Callable[[Array, Array], AbstractPolicyOptimiser]
+) -> dict[str, Any]:
+    """Return the settings of an online learner, by field.
 
     Args:
         preset: Preset, whose table [adapt] has the parameters.
-        model: Residual model.
         env: Environment of the flight.
+        optimiser: Builds the optimiser of policy updates from learning rate and largest norm of a gradient.
 
     Raises:
         ConfigError: The preset rotates the frame of a task that cannot be rotated, or trims a task that does not rest.
@@ -71,22 +74,19 @@ def make_learner(preset: Preset, model: ResidualModel, env: Env) -> OnlineLearne
         check_frame(preset, env.task)
     if a.trim == "rest" and find_task(preset.task).has_reference:
         raise ConfigError(f"adapt.trim = 'rest' is for a task that rests at home, not for {preset.task!r}")
-    adam = CarriedAdam if a.optimiser == "carried" else FreshAdam
     rates = (a.learning_rate, a.low_rank_learning_rate or a.learning_rate)
-    optimiser, low_rank = (adam(jnp.array(rate), jnp.array(a.max_grad_norm or math.inf)) for rate in rates)
-    return OnlineLearner(
-        env,
-        model,
-        optimiser,
-        plant_delay_ticks=preset.plant_delay_ticks if family is None else 0,  # the identified path contains the delay
-        num_updates=a.num_updates,
-        num_envs=a.num_envs,
-        starts=TaskStarts() if a.task_starts is None else FlownStarts(jnp.array(a.start_noise), a.task_starts),
-        view=_view(preset, env.task),
-        trim=RestTrim() if a.trim == "rest" else Untrimmed(),
-        vehicles=OwnVehicle() if family is None else IdentifiedVehicle(PathEstimator.of(preset.dt), family),
-        low_rank_optimiser=low_rank,
-    )
+    all_weights, low_rank = (optimiser(jnp.array(rate), jnp.array(a.max_grad_norm or math.inf)) for rate in rates)
+    return {
+        "optimiser": all_weights,
+        "low_rank_optimiser": low_rank,
+        "plant_delay_ticks": preset.plant_delay_ticks if family is None else 0,  # the identified path has the delay
+        "num_updates": a.num_updates,
+        "num_envs": a.num_envs,
+        "starts": TaskStarts() if a.task_starts is None else FlownStarts(jnp.array(a.start_noise), a.task_starts),
+        "view": _view(preset, env.task),
+        "trim": RestTrim() if a.trim == "rest" and env.task.rests else Untrimmed(),
+        "vehicles": OwnVehicle() if family is None else IdentifiedVehicle(PathEstimator.of(preset.dt), family),
+    }
 
 
 def _view(preset: Preset, task: AbstractTask) -> AbstractView:

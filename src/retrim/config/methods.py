@@ -9,11 +9,13 @@ import jax.numpy as jnp
 from jax import random
 from jaxtyping import Array, Key
 
-from ..adapt.learner import LearnerState
+from ..adapt.learner_state import LearnerState
 from ..control.controller import AbstractController
 from ..control.datt import DattNet
 from ..control.integral import IntegralAction
+from ..control.lora import LoraPolicy
 from ..control.passive import Passive
+from ..control.policy import AbstractPolicy
 from ..control.seen_pose import SeenPose
 from ..errors import ConfigError
 from ..plants.plant import Plant
@@ -88,15 +90,21 @@ class MethodRequest:
         return self.key
 
 
+Prepare = Callable[["Setup", AbstractPolicy, Key[Array, ""]], AbstractPolicy | LoraPolicy]
+"""Returns the policy that the learners train, from set-up, policy and random key: the policy, or one with a delta."""
+
+
 @dataclass(frozen=True)
 class MethodEntry:
-    """A flight method."""
+    """A flight method. :func:`learning_method` makes the entry of a method that learns in flight."""
 
     make: Callable[[MethodRequest], Pilot]
     label: str
     """Name in tables."""
     on_board: Callable[["Setup", Plant], Plant] | None = None
     """Adds an on-board motor controller to a plant; None for a method that commands thrust and body rates."""
+    learns: Prepare | None = None
+    """Prepares the policy for the learners; None for a method that does not learn in flight."""
 
     def fitted(self, setup: "Setup", plant: Plant) -> Plant:
         """Return the plant, modified as the method requires.
@@ -122,6 +130,27 @@ def find_method(name: str) -> MethodEntry:
     if not isinstance(entry, MethodEntry):
         raise ConfigError(f"method {name!r} is a {type(entry).__name__}, not a retrim.config.MethodEntry")
     return entry
+
+
+def learning_method(label: str, learns: Prepare) -> MethodEntry:
+    """Return the entry of a method that learns in flight, in lockstep and live.
+
+    Args:
+        label: Name in tables.
+        learns: Prepares the policy for the learners.
+    """
+
+    def make(request: MethodRequest) -> Pilot:
+        k_policy, key = random.split(request.needed_key())
+        policy = learns(request.setup, request.policy, k_policy)
+        return request.setup.adaptive_pilot(policy, key, request.latency, request.state)
+
+    return MethodEntry(make, label, learns=learns)
+
+
+def learning_methods() -> tuple[str, ...]:
+    """Return the names of the registered methods that learn in flight."""
+    return tuple(name for name in METHODS if METHODS[name].learns is not None)
 
 
 def _base(request: MethodRequest) -> Pilot:
@@ -163,10 +192,13 @@ def _full(request: MethodRequest) -> Pilot:
     return request.setup.adaptive_pilot(request.policy, request.needed_key(), request.latency, request.state)
 
 
-def _lora(request: MethodRequest) -> Pilot:
-    k_delta, key = random.split(request.needed_key())
-    policy = request.setup.low_rank(request.policy, k_delta)
-    return request.setup.adaptive_pilot(policy, key, request.latency, request.state)
+def _all_weights(setup: "Setup", policy: AbstractPolicy, key: Key[Array, ""]) -> AbstractPolicy:
+    del setup, key
+    return policy
+
+
+def _low_rank(setup: "Setup", policy: AbstractPolicy, key: Key[Array, ""]) -> LoraPolicy:
+    return setup.low_rank(policy, key)
 
 
 register_method("base", MethodEntry(_base, "base policy"))
@@ -177,5 +209,5 @@ for _name, _baseline in BASELINES.items():
     register_method(_name, MethodEntry(partial(_without_policy, _name, _baseline), _baseline.label))
 register_method("datt", MethodEntry(_datt, "DATT"))
 register_method("raptor", MethodEntry(_raptor, "RAPTOR", on_board=raptor))
-register_method("full", MethodEntry(_full, "**adapted, all weights**"))
-register_method("lora", MethodEntry(_lora, "**adapted, LoRA**"))
+register_method("full", MethodEntry(_full, "**adapted, all weights**", learns=_all_weights))
+register_method("lora", learning_method("**adapted, LoRA**", _low_rank))

@@ -2,7 +2,7 @@
 
 import dataclasses
 
-from ..tasks.hover import TILT
+from ..tasks.task import TILT
 from .presets import Adapt, Family, Preset, Pretrain, Track, Vision
 
 TRACK = Preset(

@@ -41,6 +41,8 @@ class Pretrain:
     """Largest gradient norm; no clipping by default."""
     hidden_sizes: tuple[Count, ...] = Field(default=(512, 512), min_length=1, max_length=8)
     """Widths of the hidden layers of the policy."""
+    network: Printable = "mlp"
+    """Network of the policy: mlp, a perceptron with ReLU, or module:name of a function that returns a network."""
     max_start_yaw: float = Field(default=math.pi, ge=0, le=math.pi, strict=True)
     """Largest yaw angle of starts, in both directions [rad]."""
 
@@ -78,9 +80,12 @@ class Adapt:
     """Learning rate for LoRA; by default that of all weights. A few directions must have the effect of all weights."""
     max_grad_norm: Positive | None = None
     """Largest gradient norm; no clipping by default."""
-    optimiser: Literal["fresh", "carried"] = "fresh"
+    learner: Printable = "bptt"
+    """Online learner: bptt, back-propagation through time in the corrected model, or module:name of a function of a
+    LearnerRequest."""
+    optimiser: Printable = "fresh"
     """Optimiser of updates. fresh: a new Adam for each update, whose rate falls to zero; carried: one Adam with a
-    constant rate."""
+    constant rate; or module:name of an AbstractPolicyOptimiser."""
     task_starts: int | None = Field(default=None, ge=0, le=100_000, strict=True)
     """Number of starts per step drawn from the task, by default all. The others are recent states of the vehicle."""
     start_noise: float = Field(default=0.1, ge=0, le=10.0, strict=True)
@@ -207,9 +212,9 @@ class Preset:
             if getattr(self, name) is not None and self.task != name:
                 raise ValueError(f"a table [{name}] needs task = {name!r}, not {self.task!r}")
         for reward, task in (("stiff", "hover"), ("sharp", "track"), ("view", "vision")):
-            if self.reward == reward and self.task != task:
+            if self.reward == reward and self.task != task and self.task in BUILT_IN_TASKS:
                 raise ValueError(f"reward = {reward!r} is for task = {task!r}, not for {self.task!r}")
-        if self.axes == "heading" and self.task != "hover":
+        if self.axes == "heading" and self.task in ("track", "vision"):
             raise ValueError(f"axes = 'heading' is for task = 'hover', not for {self.task!r}")
         if self.family is not None:
             if self.task == "vision":

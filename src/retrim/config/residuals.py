@@ -39,7 +39,7 @@ def make_residual(request: ResidualRequest) -> ResidualModel:
     found = RESIDUALS.find(name)
     model = found if isinstance(found, ResidualModel) and not isinstance(found, type) else found(request)
     if not isinstance(model, ResidualModel):
-        raise ConfigError(f"residual {name!r} gives a {type(model).__name__} without init, fit, predict and spread")
+        raise ConfigError(f"residual {name!r} gives a {type(model).__name__} without init, fit and predict")
     return model
 
 

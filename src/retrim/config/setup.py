@@ -5,7 +5,7 @@ import math
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -13,13 +13,15 @@ import optax
 from jax import random
 from jaxtyping import Array, Float, Key
 
-from ..adapt.learner import LearnerState, OnlineLearner
-from ..adapt.workers import PolicyWorker, ResidualWorker
+from ..adapt.learner import OnlineLearner
+from ..adapt.learner_state import LearnerState
+from ..adapt.updates import Layer
+from ..adapt.workers import make_worker
 from ..control.controller import AbstractController
 from ..control.gravity_frame import GravityFrame
 from ..control.lora import LoraPolicy
 from ..control.monitor import Monitor
-from ..control.policy import Policy
+from ..control.policy import AbstractPolicy, Policy
 from ..errors import ConfigError
 from ..learn.encoder import pretrain_encoder
 from ..learn.env import Env
@@ -37,8 +39,11 @@ from ..tasks.reference import Reference
 from ..tasks.task import AbstractTask
 from .command_paths import delayed, longest_delay, model_path
 from .families import identify_vehicle, make_family, policy_controller, track_actuators
-from .fresh import flight_starts, low_rank, untrained
-from .learners import felt_frame, make_learner, nominal_model, pretraining_optimiser
+from .fresh import flight_starts, low_rank
+from .learners import felt_frame, nominal_model, pretraining_optimiser
+from .loading import load
+from .networks import NetworkRequest, find_network, make_policy
+from .online_learners import LearnerRequest, make_learner
 from .presets import Preset
 from .presets import Track as TrackTable
 from .references import make_reference, make_training_reference
@@ -52,7 +57,7 @@ Latency = Literal["fixed", "measured"]
 
 @dataclass(frozen=True)
 class Setup:
-    """All objects that a preset describes. Build it with :meth:`of`."""
+    """All objects that a preset describes. Build it with :meth:`from_preset`."""
 
     preset: Preset
     vehicle: Vehicle
@@ -67,9 +72,9 @@ class Setup:
     """Pretraining optimiser: gradient clipping, then Adam with a cosine schedule."""
 
     @classmethod
-    def of(
+    def from_preset(
         cls,
-        preset: Preset,
+        preset: str | Preset,
         reference: str | Reference | None = None,
         *,
         residual_model: ResidualModel | None = None,
@@ -77,16 +82,23 @@ class Setup:
         """Build a set-up.
 
         Args:
-            preset: Preset of the experiment.
+            preset: Preset of the experiment, or its name.
             reference: Reference of a tracking flight, by name or as an object; by default that of training.
             residual_model: Residual model of the learner; by default the model that the preset names.
 
         Raises:
             ConfigError: A name does not exist, the task does not track a reference, or values are inconsistent.
+
+        Example::
+
+            setup = retrim.Setup.from_preset("hover/retrim")
+            policy = setup.pretrained(seed=0)
         """
+        preset = load(preset) if isinstance(preset, str) else preset
         preset, entry = delayed(preset), find_task(preset.task)
         if reference is not None and not entry.has_reference:
             raise ConfigError(f"reference {reference!r}: a {preset.task} policy follows none")
+        find_network(preset.pretrain.network)
         vehicle = make_vehicle(preset.vehicle)
         table = preset.track or TrackTable()
         trained_on = make_training_reference(table) if entry.has_reference else None
@@ -110,7 +122,7 @@ class Setup:
                 longest_delay=longest_delay(preset),
             )
             model = residual_model or make_residual(ResidualRequest(preset, vehicle))
-            learner = make_learner(preset, model, dataclasses.replace(env, task=flown))
+            learner = make_learner(LearnerRequest(preset, model, dataclasses.replace(env, task=flown)))
         except (TypeError, ValueError) as error:
             raise (
                 error if isinstance(error, ConfigError) else ConfigError(f"preset {preset.name!r}: {error}")
@@ -139,13 +151,11 @@ class Setup:
         followed = getattr(self.flown, "reference", None)
         return followed if isinstance(followed, Reference) else None
 
-    def new_policy(self, key: Key[Array, ""]) -> Policy:
+    def new_policy(self, key: Key[Array, ""]) -> AbstractPolicy:
         """Return an untrained policy; the key is consumed."""
-        size, hidden = self.env.task.observation.size, self.preset.pretrain.hidden_sizes
-        fresh: Policy = untrained(size, self.vehicle, key, tuple(hidden))
-        return fresh
+        return make_policy(NetworkRequest(self.preset, self.env.task.observation.size, self.vehicle, key))
 
-    def pretraining(self, seed: int = 0) -> Iterator[tuple[Policy, Float[Array, " updates"]]]:
+    def pretraining(self, seed: int = 0) -> Iterator[tuple[AbstractPolicy, Float[Array, " updates"]]]:
         """Train a policy from scratch.
 
         Args:
@@ -160,6 +170,8 @@ class Setup:
         vision, observation = self.preset.vision, self.env.task.observation
         if vision is not None and vision.encoder_steps and isinstance(observation, Keypoints):
             steps, motions = vision.encoder_steps, MOTIONS[vision.encoder_motions]
+            if not isinstance(fresh, Policy):
+                raise ConfigError("vision.encoder_steps needs a perceptron, pretrain.network = 'mlp'")
             fresh, _ = pretrain_encoder(fresh, observation, random.split(k_init)[1], motions=motions, steps=steps)
         chunks = pretrain(
             fresh,
@@ -172,7 +184,7 @@ class Setup:
         )
         return ((state.policy.merged(), losses) for state, losses in chunks)
 
-    def pretrained(self, seed: int = 0) -> Policy:
+    def pretrained(self, seed: int = 0) -> AbstractPolicy:
         """Return a policy trained from scratch, without progress reports; :meth:`pretraining` shows progress."""
         ((last, _),) = deque(self.pretraining(seed), maxlen=1)
         return last
@@ -222,11 +234,11 @@ class Setup:
         monitor = track_actuators(Monitor(frame, self.flown), self.preset)
         return monitor if self.preset.family is None else identify_vehicle(monitor, self.preset)
 
-    def low_rank(self, policy: Policy | LoraPolicy, key: Key[Array, ""]) -> LoraPolicy:
+    def low_rank(self, policy: AbstractPolicy | LoraPolicy, key: Key[Array, ""]) -> LoraPolicy:
         """Return ``policy`` with a fresh low-rank delta (ranks 4, 10, 1 and scale 4, as in the paper).
 
         Raises:
-            ConfigError: The policy does not have three layers, or a layer is too narrow for its rank.
+            ConfigError: The policy is not a perceptron with three layers, or a layer is too narrow for its rank.
         """
         try:
             return low_rank(policy, key)
@@ -235,7 +247,7 @@ class Setup:
 
     def adaptive_pilot(
         self,
-        policy: Policy | LoraPolicy,
+        policy: AbstractPolicy | LoraPolicy,
         key: Key[Array, ""],
         latency: Latency = "fixed",
         state: LearnerState | None = None,
@@ -244,8 +256,9 @@ class Setup:
         k_residual, k_learn = random.split(key)
         state = state or self.learner.init(policy, k_residual)
         a, dt, fixed = self.preset.adapt, self.preset.dt, latency == "fixed"
-        fit = LockstepLearner(ResidualWorker(self.learner, state), a.fit_latency if fixed else None, dt)
-        update = LockstepLearner(PolicyWorker(self.learner, state, k_learn), a.update_latency if fixed else None, dt)
+        fitter, trainer = (make_worker(self.learner, layer, state, k_learn) for layer in get_args(Layer))
+        fit = LockstepLearner(fitter, a.fit_latency if fixed else None, dt)
+        update = LockstepLearner(trainer, a.update_latency if fixed else None, dt)
         learners = Scheduled(fit, a.fit_every), Scheduled(update, a.update_every)
         return AdaptivePilot(self.controller, state, learners, dt=dt, window=a.window)
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import jax.numpy as jnp
@@ -11,8 +12,9 @@ from ..errors import ConfigError
 from ..physics.path_family import PathBelief
 from ..physics.vehicle import Vehicle
 from ..tasks.heading_obs import HeadingObs
-from ..tasks.hover import AbstractHover, Hover, L2Hover, StiffHover
+from ..tasks.hover import AbstractHover, CustomHover, Hover, L2Hover, RewardRule, StiffHover
 from ..tasks.keypoints import Keypoints
+from ..tasks.moving_goal import GoalPath, MovingGoal
 from ..tasks.observation import AbstractObservation, StateObs
 from ..tasks.occluded import OccludedKeypoints
 from ..tasks.preview import Preview
@@ -60,17 +62,39 @@ class TaskRequest:
         """Return the observation of the paper, o = [p, R, v], with the past commands of the preset."""
         return StateObs(jnp.array(self.preset.goal), *self.observed_commands())
 
-    def in_axes(self, observation: AbstractObservation[Any]) -> AbstractObservation[Any]:
-        """Return an observation in the axes of the preset."""
-        if self.preset.axes == "world":
-            return observation
-        return HeadingObs(observation, jnp.array(self.preset.goal))
-
     def of_vehicle(self, observation: AbstractObservation[Any]) -> AbstractObservation[Any]:
         """Return an observation that also includes the vehicle, if the preset is for a family of vehicles."""
         if self.preset.family is None:
             return observation
         return VehicleObs.of(observation, self.vehicle.omega_max, PathBelief.unknown())
+
+    def hover(self, *, reward: RewardRule | None = None, goal: GoalPath | None = None) -> AbstractTask:
+        """Return a hover task with the settings of the preset.
+
+        Args:
+            reward: Reward from goal [m], state and command; by default that of the preset.
+            goal: Position of a goal that moves [m], world, by time [s]; by default the goal of the preset.
+
+        Example::
+
+            def task(request: retrim.TaskRequest) -> retrim.AbstractTask:
+                return request.hover(goal=lambda t: jnp.stack([jnp.cos(t), jnp.sin(t), 1.5 + 0.0 * t]))
+        """
+        p = self.preset
+        centre = jnp.array(p.goal) if goal is None else jnp.zeros(3)
+        observation = StateObs(centre, *self.observed_commands())
+        seen = observation if p.axes == "world" else HeadingObs(observation, centre)
+        fields = (
+            centre,
+            self.of_vehicle(seen),
+            jnp.array(p.termination_box),
+            jnp.array(p.pretrain.max_start_yaw),
+            p.dt,
+            p.pretrain.horizon,
+        )
+        kind = HOVER_REWARDS.get(p.reward, Hover) if reward is None else partial(CustomHover, rule=reward)
+        hover = kind(*fields)
+        return hover if goal is None else MovingGoal(hover, goal)
 
     def observed_commands(self) -> tuple[Float[Array, "3"], int]:
         """Return the scale of observed body rates [rad/s], and the number of observed past commands."""
@@ -120,16 +144,7 @@ def make_task(request: TaskRequest) -> AbstractTask:
 
 
 def _hover(request: TaskRequest) -> AbstractTask:
-    p = request.preset
-    kind = HOVER_REWARDS.get(p.reward, Hover)
-    return kind(
-        jnp.array(p.goal),
-        request.of_vehicle(request.in_axes(request.state_observation())),
-        jnp.array(p.termination_box),
-        jnp.array(p.pretrain.max_start_yaw),
-        p.dt,
-        p.pretrain.horizon,
-    )
+    return request.hover()
 
 
 def _vision(request: TaskRequest) -> AbstractTask:

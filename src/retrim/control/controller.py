@@ -15,7 +15,7 @@ from ..physics.path_family import Member
 from ..physics.state import Command, State
 from ..tasks.observation import AbstractObservation
 from .condition import Condition
-from .policy import Policy
+from .policy import AbstractPolicy
 from .vehicle_report import VehicleEstimate, VehicleReport
 
 M = TypeVar("M")
@@ -116,7 +116,7 @@ class PolicyController(AbstractController[tuple[Any, Command]]):
     """A policy with its observation. The memory consists of that of the observation and the last command."""
 
     observation: AbstractObservation[Any]
-    policy: Policy
+    policy: AbstractPolicy
 
     def init(self, x: State) -> tuple[Any, Command]:
         """Return the memory of a vehicle that has hovered until now."""

@@ -33,7 +33,7 @@ from .condition import Cause, Condition, Stage
 from .controller import AbstractController, PolicyController
 from .gravity_frame import GravityFrame, GravityFrameState
 from .near_target import NearTarget
-from .policy import Policy
+from .policy import AbstractPolicy
 from .swings import Swings
 
 INTERVAL = 1.0  # [s] over which errors are averaged
@@ -66,7 +66,7 @@ class MonitorState(eqx.Module):
     """Memory of the monitor."""
 
     flight: GravityFrameState
-    base: Policy
+    base: AbstractPolicy
     """Policy at take-off."""
     stage: Int[Array, ""]
     cause: Int[Array, ""]

@@ -1,4 +1,7 @@
-"""The policy network: observation -> command, centred at hover and bounded."""
+"""Policies: networks from an observation to a command, centred at hover and bounded."""
+
+import abc
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -17,12 +20,69 @@ Inputs = tuple[Float[Array, "... _"], ...]
 """Inputs of each layer."""
 
 
-class Policy(eqx.Module):
-    """A ReLU network with a smooth, bounded output. ``layers`` are trained; the commands are constant.
+class AbstractPolicy(eqx.Module):
+    """A network whose output is mapped to a command; the parameters are trained, the limits are constant.
 
     u = u_min + (u_max - u_min) sigmoid(y + y_0), where y is the network's output and y_0 makes y = 0 the hover
     command. A hard limit would not have a gradient once it is reached; the sigmoid always has one.
     """
+
+    if TYPE_CHECKING:  # to a type checker an abstract variable would be a dataclass field
+
+        @property
+        def u_hover(self) -> Command:
+            """Command of a zero output."""
+
+        @property
+        def u_min(self) -> Command:
+            """Lower limit of commands."""
+
+        @property
+        def u_max(self) -> Command:
+            """Upper limit of commands."""
+    else:
+        u_hover: eqx.AbstractVar[Command]
+        u_min: eqx.AbstractVar[Command]
+        u_max: eqx.AbstractVar[Command]
+
+    @property
+    @abc.abstractmethod
+    def params(self) -> Any:
+        """Return the parameters that an optimiser updates: a pytree of arrays."""
+
+    @abc.abstractmethod
+    def with_params(self, params: Any) -> "AbstractPolicy":
+        """Return the same policy with other parameters."""
+
+    @abc.abstractmethod
+    def output(self, observation: Float[Array, " o"]) -> Float[Array, "4"]:
+        """Return the network's output y for one observation."""
+
+    @abc.abstractmethod
+    def shifted(self, by: Float[Array, "4"]) -> "AbstractPolicy":
+        """Return the policy whose output is ``by`` larger, for every observation."""
+
+    def merged(self) -> "AbstractPolicy":
+        """Return itself; a low-rank policy merges its delta here."""
+        return self
+
+    def linear_layers(self) -> Layers:
+        """Return the layers of a perceptron, which low-rank adaptation and export need; empty for other networks."""
+        return ()
+
+    def __call__(self, observation: Float[Array, " o"]) -> Command:
+        """Return the command for one observation."""
+        return self.bounded(self.output(observation))
+
+    def bounded(self, y: Float[Array, "4"]) -> Command:
+        """Map the network's output to a command within the limits; zero maps to hover."""
+        low, high, hover = (lax.stop_gradient(u.vector()) for u in (self.u_min, self.u_max, self.u_hover))
+        y_0 = jnp.log((hover - low) / (high - hover))
+        return Command.of(low + (high - low) * jax.nn.sigmoid(y + y_0))
+
+
+class Policy(AbstractPolicy):
+    """A perceptron with ReLU. ``layers`` are trained."""
 
     layers: tuple[eqx.nn.Linear, ...]
     u_hover: Command
@@ -53,10 +113,7 @@ class Policy(eqx.Module):
                     (std * random.normal(k, (fan_out, fan_in)), jnp.zeros(fan_out)),
                 )
             )
-        bounds = (Command.hover(), vehicle.command_min, vehicle.command_max)
-        # Strong types, as in a loaded policy, so that programs for one are not compiled again for the other.
-        bounds = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=leaf.dtype), bounds)
-        return cls(tuple(layers), *bounds)
+        return cls(tuple(layers), *command_bounds(vehicle))
 
     @property
     def params(self) -> Layers:
@@ -67,18 +124,14 @@ class Policy(eqx.Module):
         """Return the same policy with other layers."""
         return Policy(layers, self.u_hover, self.u_min, self.u_max)
 
-    def merged(self) -> "Policy":
-        """Return itself; a low-rank policy merges its delta here."""
-        return self
+    def linear_layers(self) -> Layers:
+        """Return the layers."""
+        return self.layers
 
     def shifted(self, by: Float[Array, "4"]) -> "Policy":
         """Return the policy whose output is ``by`` larger, for every observation."""
         *layers, last = self.layers
         return self.with_params((*layers, eqx.tree_at(lambda l: l.bias, last, replace_fn=lambda bias: bias + by)))
-
-    def __call__(self, observation: Float[Array, " o"]) -> Command:
-        """Return the command for one observation."""
-        return self.bounded(self.output(observation))
 
     def output(self, observation: Float[Array, " o"]) -> Float[Array, "4"]:
         """Return the network's output y for one observation."""
@@ -99,8 +152,10 @@ class Policy(eqx.Module):
             h = jax.nn.relu(y) if i < len(self.layers) - 1 else y
         return self.bounded(h), tuple(inputs)
 
-    def bounded(self, y: Float[Array, "4"]) -> Command:
-        """Map the network's output to a command within the limits; zero maps to hover."""
-        low, high, hover = (lax.stop_gradient(u.vector()) for u in (self.u_min, self.u_max, self.u_hover))
-        y_0 = jnp.log((hover - low) / (high - hover))
-        return Command.of(low + (high - low) * jax.nn.sigmoid(y + y_0))
+
+def command_bounds(vehicle: Vehicle) -> tuple[Command, Command, Command]:
+    """Return hover and the lower and upper limits of the commands of a vehicle."""
+    bounds = (Command.hover(), vehicle.command_min, vehicle.command_max)
+    # Strong types, as in a loaded policy, so that programs for one are not compiled again for the other.
+    strong: tuple[Command, Command, Command] = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=leaf.dtype), bounds)
+    return strong

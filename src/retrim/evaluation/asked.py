@@ -5,14 +5,14 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
-from ..adapt.learner import LearnerState
+from ..adapt.learner_state import LearnerState
 from ..config.faults import NO_FAULT
 from ..config.loading import changed, load_for, overlaid, with_vehicle
 from ..config.plants import DELAY, is_vehicle
 from ..config.presets import Family, Preset
 from ..config.scenario import THRUST_ERROR, Scenario
 from ..config.tasks import find_task
-from ..control.policy import Policy
+from ..control.policy import AbstractPolicy
 from ..errors import ConfigError
 from ..io.checkpoint import load_delta
 from ..io.trained import load_learnt, load_policy
@@ -20,7 +20,7 @@ from ..io.trained import load_learnt, load_policy
 
 def loaded(
     policy: Path | None, resume: Path | None, delta: Path | None = None, *, trust: Collection[str] = ()
-) -> tuple[Policy, Preset, LearnerState | None]:
+) -> tuple[AbstractPolicy, Preset, LearnerState | None]:
     """Return weights, preset, and the learner state of an earlier flight.
 
     Args:

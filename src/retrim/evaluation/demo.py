@@ -66,7 +66,7 @@ def demonstrate(
     check_seeds([seed])
     check_flights(starts, seconds)
     preset = load_for("hover", name)
-    scenario, setup = Scenario("large", plant=plant), Setup.of(preset)
+    scenario, setup = Scenario("large", plant=plant), Setup.from_preset(preset)
     count = len(LEVELS) * 2 * starts
     reporter.say(f"{count} flights of {seconds:g} s; about a minute on two cores with those of a second quadrotor")
     reporter.say(f"preset {preset.name}: {WHY.get(preset.name, 'your choice')}")

@@ -16,7 +16,7 @@ from jaxtyping import Array, Key
 from ..config.scenario import Scenario
 from ..config.setup import Setup
 from ..control.controller import PolicyController
-from ..control.policy import Policy
+from ..control.policy import AbstractPolicy
 from ..learn.bptt import PolicyState
 from ..learn.env import Env
 from ..learn.pretrain import train_chunk
@@ -62,7 +62,7 @@ CHOICES = {
 class Trained(NamedTuple):
     """Result of one choice."""
 
-    policy: Policy
+    policy: AbstractPolicy
     compile_s: float
     epoch_s: list[float]
     """Mean time of an epoch in each program that was run [s]."""
@@ -70,7 +70,7 @@ class Trained(NamedTuple):
     """Root mean square error of the residual fit [m/s^2]."""
 
 
-def flown(setup: Setup, policy: Policy, n: int, seconds: float, seed: int) -> list[Log]:
+def flown(setup: Setup, policy: AbstractPolicy, n: int, seconds: float, seed: int) -> list[Log]:
     """Fly a policy without learning from random starts, on the study's plant, as one batch."""
     plants = [Scenario(PUSH, PLANT).make(setup.preset.vehicle, dt=setup.preset.dt) for _ in range(n)]
     controller = PolicyController(setup.flown.observation_in_flight, policy)
@@ -97,7 +97,7 @@ def design_dynamics(setup: Setup, residual: Any, choice: Choice) -> AbstractDyna
     return StraightThrough(forward, Hybrid(simple, residual, backprop=True) if choice.backprop else simple)
 
 
-def retrained(setup: Setup, policy: Policy, logs: Sequence[Log], key: Key[Array, ""], choice: Choice, *,
+def retrained(setup: Setup, policy: AbstractPolicy, logs: Sequence[Log], key: Key[Array, ""], choice: Choice, *,
               fit_epochs: int = FIT_EPOCHS, epochs: int = POLICY_EPOCHS, envs: int = ENVS) -> Trained:  # fmt: skip
     """Fit one residual network to flights, and re-train the policy with it.
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from jax import random
 
-from ..adapt.learner import LearnerState
+from ..adapt.learner_state import LearnerState
 from ..config.loading import dump
 from ..config.methods import find_method
 from ..config.presets import Preset
@@ -66,7 +66,7 @@ class Fleet:
         self.preset = preset
         self.policies: dict[int, Any] = dict(policies) if isinstance(policies, Mapping) else {0: policies}
         check_seeds(tuple(self.policies))
-        self.setups = {name: Setup.of(preset, name) for name in {s.reference for s in scenarios}}
+        self.setups = {name: Setup.from_preset(preset, name) for name in {s.reference for s in scenarios}}
         for method in methods:  # some methods do not support every task, network or plant
             for setup in self.setups.values():
                 setup.pilot(next(iter(self.policies.values())), method, random.key(0))

@@ -4,7 +4,7 @@ import functools
 from dataclasses import dataclass, replace
 from typing import Any
 
-from ..adapt.learner import LearnerState
+from ..adapt.learner_state import LearnerState
 from ..config.loading import parse
 from ..config.setup import Latency, Setup
 from ..physics.state import State
@@ -53,4 +53,4 @@ def setup_for(preset: str, reference: str | None = None, fleet: str = "") -> Set
         fleet: Identifier of the fleet; the file of a reference may have changed since another fleet.
     """
     del fleet
-    return Setup.of(parse(preset, source="preset"), reference)
+    return Setup.from_preset(parse(preset, source="preset"), reference)

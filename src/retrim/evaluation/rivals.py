@@ -73,7 +73,7 @@ def trained_datt(
         reporter: Receives progress.
         steps: Number of training steps.
     """
-    setup, nets = Setup.of(preset), dict[int, DattNet]()
+    setup, nets = Setup.from_preset(preset), dict[int, DattNet]()
     tau = prediction_of(setup).path.response.rate_lag[0]
     about = {"steps": str(steps), "dt": str(preset.dt), "tau": f"{float(tau):.4f}", "vehicle": str(preset.vehicle)}
     name = section_key(datt=about, precision=str(setup.vehicle.mass.dtype))

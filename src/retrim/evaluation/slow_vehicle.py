@@ -85,7 +85,7 @@ def fly_slow_vehicle(
     """
     scenario = Scenario(PUSH, plant="second-order", vehicle=slow_quadrotor(), delay=DELAY)
     reporter.say(f"a second quadrotor: body rates lag by 100 ms, commands by {1000 * DELAY:.0f} ms; no method knows it")
-    setup = Setup.of(family)
+    setup = Setup.from_preset(family)
     policy, _ = train(setup, seed, reporter=reporter, stop=run.stop)
     if run.interrupted:
         return None

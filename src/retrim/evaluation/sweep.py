@@ -17,7 +17,7 @@ from ..config.setup import Setup
 from ..config.trust import check_trust
 from ..config.validation import read_toml, validated
 from ..config.vehicle_file import VehicleSpec
-from ..control.policy import Policy
+from ..control.policy import AbstractPolicy
 from ..io.files import write_whole
 from ..runkit.document import Document, TableSection
 from ..runkit.flights import Flight, FlightSpec
@@ -126,13 +126,13 @@ def run_sweep(sweep: Sweep, run: Run, reporter: Reporter) -> Rows:
     return _report(sweep, [kept.rows[key] for key in every if key in kept.rows], run, reporter)
 
 
-def _fleet(preset: Preset, policies: Mapping[int, Policy], sweep: Sweep) -> Fleet:
+def _fleet(preset: Preset, policies: Mapping[int, AbstractPolicy], sweep: Sweep) -> Fleet:
     return Fleet(preset, policies, sweep.scenarios(), methods=sweep.methods, starts=sweep.starts, seconds=sweep.seconds)
 
 
-def _untrained(preset: Preset, sweep: Sweep) -> dict[int, Policy]:
+def _untrained(preset: Preset, sweep: Sweep) -> dict[int, AbstractPolicy]:
     """Return untrained policies, to plan the flights before training."""
-    return dict.fromkeys(sweep.seeds, Setup.of(preset).new_policy(random.key(0)))
+    return dict.fromkeys(sweep.seeds, Setup.from_preset(preset).new_policy(random.key(0)))
 
 
 def _fly(fleet: Fleet, keys: Mapping[FlightSpec, str], kept: "_Kept", run: Run, reporter: Reporter) -> None:

@@ -71,7 +71,7 @@ def export(
         return write_delta(path, load_delta(delta, weights))
     if delta is not None:
         weights = load_delta(delta, weights).merged()
-    portable = portable_of(weights, Setup.of(preset))
+    portable = portable_of(weights, Setup.from_preset(preset))
     written = FORMATS[to].write(path, portable)
     rows = SPREAD * observations(portable.sizes[0], ROWS, seed=1)
     found = FORMATS[to].check(path, portable, rows, commands(weights, rows))

@@ -11,7 +11,8 @@ from jax import random
 from jaxtyping import Array, Float
 
 from ..config.setup import Setup
-from ..control.policy import Policy
+from ..control.policy import AbstractPolicy
+from ..errors import ConfigError
 from ..io.checkpoint import fingerprint
 from ..physics.state import STANDARD_GRAVITY
 from ..tasks.observation import POSITION_SCALE, VELOCITY_SCALE, StateObs
@@ -43,14 +44,20 @@ class Portable:
         return (self.layers[0][0].shape[0], *(w.shape[1] for w, _ in self.layers))
 
 
-def portable_of(policy: Policy, setup: Setup) -> Portable:
+def portable_of(policy: AbstractPolicy, setup: Setup) -> Portable:
     """Return the portable form of a policy.
 
     Args:
         policy: Policy to export; a low-rank one must be merged.
         setup: Set-up with its preset, vehicle and task.
+
+    Raises:
+        ConfigError: The policy is not a perceptron.
     """
-    single = [(_single(l.weight.T), _single(l.bias)) for l in policy.layers]
+    if not policy.linear_layers():
+        network = setup.preset.pretrain.network
+        raise ConfigError(f"export needs a perceptron (pretrain.network = 'mlp'), and this policy has {network!r}")
+    single = [(_single(l.weight.T), _single(l.bias)) for l in policy.linear_layers()]
     low, high, hover = (_single(u.vector()) for u in (policy.u_min, policy.u_max, policy.u_hover))
     preset, seen = setup.preset, setup.env.task.observation
     observation = None
@@ -72,14 +79,14 @@ def observations(size: int, n: int, seed: int) -> np.ndarray:
     return np.asarray(random.normal(random.key(seed), (n, size), dtype=jnp.float32))
 
 
-def commands(policy: Policy, rows: np.ndarray) -> np.ndarray:
+def commands(policy: AbstractPolicy, rows: np.ndarray) -> np.ndarray:
     """Return the commands of JAX for rows of observations, in single precision."""
-    single: Policy = jax.tree.map(lambda leaf: leaf.astype(jnp.float32) if eqx.is_array(leaf) else leaf, policy)
+    single: AbstractPolicy = jax.tree.map(lambda leaf: leaf.astype(jnp.float32) if eqx.is_array(leaf) else leaf, policy)
     return np.asarray(_commands(single, jnp.asarray(rows)))
 
 
 @eqx.filter_jit
-def _commands(policy: Policy, rows: Float[Array, "n o"]) -> Float[Array, "n 4"]:
+def _commands(policy: AbstractPolicy, rows: Float[Array, "n o"]) -> Float[Array, "n 4"]:
     return jax.vmap(lambda o: policy(o).vector())(rows)
 
 

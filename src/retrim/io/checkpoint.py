@@ -1,7 +1,7 @@
 """Policies as files: weights, limits, a description and a checksum. They can be read without a configuration."""
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import jax
@@ -10,7 +10,7 @@ import numpy as np
 from jax import random
 
 from ..control.lora import LoraPolicy
-from ..control.policy import Policy
+from ..control.policy import AbstractPolicy, Policy
 from ..errors import CheckpointError, MessageError
 from ..physics.vehicle import small
 from ..transport import wire
@@ -19,9 +19,11 @@ from .releases import this_release
 from .sanity import check_policy
 
 MAX_WIDTH, MAX_LAYERS = 16_384, 16
+NETWORK = "network"
+"""Architecture of a policy that is not a perceptron; the function that its preset names builds it."""
 
 
-def write_policy(path: str | Path, policy: Policy, about: Mapping[str, str]) -> None:
+def write_policy(path: str | Path, policy: AbstractPolicy, about: Mapping[str, str]) -> None:
     """Write a policy; its folder is created if necessary.
 
     Args:
@@ -33,8 +35,15 @@ def write_policy(path: str | Path, policy: Policy, about: Mapping[str, str]) -> 
     write_whole(Path(path), wire.pack(policy, kind="policy", about=header))
 
 
-def read_policy(path: str | Path) -> tuple[Policy, dict[str, str]]:
+def read_policy(
+    path: str | Path, network: Callable[[dict[str, str]], AbstractPolicy] | None = None
+) -> tuple[AbstractPolicy, dict[str, str]]:
     """Read a policy from a file, or from a folder that holds ``policy.safetensors``.
+
+    Args:
+        path: The file.
+        network: Returns the shapes of a policy that is not a perceptron, from the header of its file. By default only
+            perceptrons are read.
 
     Returns:
         The policy, and the header of its file.
@@ -50,8 +59,10 @@ def read_policy(path: str | Path) -> tuple[Policy, dict[str, str]]:
         if wire.kind_of(data, source=str(file)) == "learnt":
             raise CheckpointError(f"{file}: holds what a flight has learnt; go on from it with `retrim fly --resume`")
         header = wire.describe(data, kind="policy", source=str(file))
-        like = policy_like(header.get("architecture", ""), source=str(file))
-        policy = wire.unpack(data, like, kind="policy", source=str(file))
+        sizes, like = header.get("architecture", ""), None
+        if sizes == NETWORK and network is not None:
+            like = network(header)
+        policy = wire.unpack(data, like or policy_like(sizes, source=str(file)), kind="policy", source=str(file))
     except MessageError as error:
         raise CheckpointError(str(error)) from error
     check_policy(policy, source=str(file))
@@ -68,21 +79,26 @@ def policy_like(sizes: str, *, source: str) -> Policy:
         widths = [int(word) for word in sizes.split("-")]
     except ValueError:
         widths = []
+    if sizes == NETWORK:
+        raise CheckpointError(f"{source}: the network is not a perceptron; retrim.load_policy reads it with its preset")
     if not (3 <= len(widths) <= MAX_LAYERS and all(0 < n <= MAX_WIDTH for n in widths) and widths[-1] == 4):
         raise CheckpointError(f"{source}: architecture {sizes!r}, expected sizes as 15-512-512-4")
     like: Policy = jax.eval_shape(lambda: Policy.of(widths[0], small(), key=random.key(0), hidden=tuple(widths[1:-1])))
     return like
 
 
-def architecture(policy: Policy) -> str:
-    """Return the sizes of a policy's layers, for example ``15-512-512-4``."""
-    return "-".join(str(n) for n in (policy.layers[0].weight.shape[1], *(l.weight.shape[0] for l in policy.layers)))
+def architecture(policy: AbstractPolicy) -> str:
+    """Return the sizes of a perceptron's layers, for example ``15-512-512-4``; ``network`` for another network."""
+    layers = policy.linear_layers()
+    if not layers:
+        return NETWORK
+    return "-".join(str(n) for n in (layers[0].weight.shape[1], *(layer.weight.shape[0] for layer in layers)))
 
 
-def fingerprint(policy: Policy) -> str:
+def fingerprint(policy: AbstractPolicy) -> str:
     """Return a hash of a policy's weights in single precision, because a low-rank delta belongs to one base."""
     digest = hashlib.sha256()
-    for layer in policy.layers:
+    for layer in policy.linear_layers():
         for leaf in (layer.weight, layer.bias):
             digest.update(np.asarray(leaf, dtype=np.float32, order="C").tobytes())
     return digest.hexdigest()
@@ -102,7 +118,7 @@ def save_delta(path: str | Path, policy: LoraPolicy) -> None:
     write_whole(Path(path), wire.pack((policy.delta, policy.shift), kind="delta", about=about))
 
 
-def load_delta(path: str | Path, base: Policy) -> LoraPolicy:
+def load_delta(path: str | Path, base: AbstractPolicy) -> LoraPolicy:
     """Read a delta and add it to its base; use ``.merged()`` of the result to fly.
 
     Args:
@@ -114,6 +130,8 @@ def load_delta(path: str | Path, base: Policy) -> LoraPolicy:
             cannot be flown.
     """
     path = Path(path)
+    if not isinstance(base, Policy):
+        raise CheckpointError(f"{path}: a low-rank delta needs a perceptron as its base")
     data = read_bounded(path, "`retrim fly --adapt lora --out DIR` makes a delta.safetensors")
     try:
         header = wire.describe(data, kind="delta", source=str(path))

@@ -2,10 +2,12 @@
 
 from typing import Any
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from ..control.policy import Policy
+from ..control.policy import AbstractPolicy
 from ..errors import CheckpointError, excerpt
 
 LARGEST = 1e5
@@ -15,7 +17,7 @@ THRUST, RATES = 1000.0, 1000.0
 TRIALS = 8
 
 
-def check_policy(policy: Policy, *, source: str, observation: np.ndarray | None = None) -> None:
+def check_policy(policy: AbstractPolicy, *, source: str, observation: np.ndarray | None = None) -> None:
     """Check weights, limits, and the commands at hover and near it.
 
     Args:
@@ -38,19 +40,30 @@ def check_policy(policy: Policy, *, source: str, observation: np.ndarray | None 
         raise CheckpointError(
             f"{source}: command limits {_shown(low)} to {_shown(high)} do not enclose hover, {_shown(hover)}"
         )
-    check_size(policy.layers, source=source)
-    size = policy.layers[0].weight.shape[1]
+    check_size(policy.params, source=source)
+    layers = policy.linear_layers()
+    if not layers and observation is None:
+        return
+    size = layers[0].weight.shape[1] if observation is None else len(observation)
     rows = np.random.default_rng(0).normal(size=(TRIALS, size))
     rows[0] = 0.0 if observation is None else observation
     with np.errstate(all="ignore"):
-        h = rows.astype(np.float32)
-        for i, layer in enumerate(policy.layers):
-            h = h @ np.asarray(layer.weight, np.float32).T + np.asarray(layer.bias, np.float32)
-            h = h if i == len(policy.layers) - 1 else np.maximum(h, 0.0)
+        h = _outputs(policy, rows.astype(np.float32))
         y0 = np.log((hover - low) / (high - hover))
         commands = low + (high - low) / (1.0 + np.exp(-(h + y0)))
     if not (np.isfinite(h).all() and np.isfinite(commands).all()):
         raise CheckpointError(f"{source}: its command at hover is not finite; the weights cannot be flown")
+
+
+def _outputs(policy: AbstractPolicy, rows: np.ndarray) -> np.ndarray:
+    """Return the outputs of the network for rows of observations; in NumPy for a perceptron, to compile nothing."""
+    layers, h = policy.linear_layers(), rows
+    if not layers:
+        return np.stack([np.asarray(eqx.filter_jit(policy.output)(jnp.asarray(row))) for row in rows])
+    for i, layer in enumerate(layers):
+        h = h @ np.asarray(layer.weight, np.float32).T + np.asarray(layer.bias, np.float32)
+        h = h if i == len(layers) - 1 else np.maximum(h, 0.0)
+    return h
 
 
 def check_size(tree: Any, *, source: str, largest: float = LARGEST) -> None:

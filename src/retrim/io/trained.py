@@ -12,19 +12,19 @@ import numpy as np
 from jax import random
 from jaxtyping import Array, Float
 
-from ..adapt.learner import LearnerState
+from ..adapt.learner_state import LearnerState
 from ..config.loading import defaults_taken, dump, parse
 from ..config.presets import Preset
 from ..config.setup import Setup
 from ..config.trust import check_trust
 from ..control.controller import AbstractController
 from ..control.lora import LoraPolicy
-from ..control.policy import Policy
+from ..control.policy import AbstractPolicy
 from ..errors import CheckpointError, ConfigError, MessageError, one_line
 from ..physics.state import State
 from ..tasks.observation import AbstractObservation
 from ..transport import wire
-from .checkpoint import architecture, lora_header, lora_like, policy_like, read_policy, write_policy
+from .checkpoint import NETWORK, architecture, lora_header, lora_like, policy_like, read_policy, write_policy
 from .files import read_bounded, write_whole
 from .releases import newer_release, this_release
 from .sanity import check_policy, check_size
@@ -33,7 +33,7 @@ LOG = logging.getLogger(__name__)
 MOST = 1e12  # largest number in the state of a resumed learner
 
 
-def save_policy(path: str | Path, policy: Policy, preset: Preset) -> None:
+def save_policy(path: str | Path, policy: AbstractPolicy, preset: Preset) -> None:
     """Write a policy and the preset that it was trained with.
 
     Args:
@@ -47,7 +47,7 @@ def save_policy(path: str | Path, policy: Policy, preset: Preset) -> None:
     write_policy(path, policy, {"preset": dump(preset), "task": preset.task})
 
 
-def load_policy(path: str | Path, *, trust: Collection[str] = ()) -> tuple[Policy, Preset]:
+def load_policy(path: str | Path, *, trust: Collection[str] = ()) -> tuple[AbstractPolicy, Preset]:
     """Read a policy and its preset from a file, or from a folder that holds ``policy.safetensors``.
 
     Args:
@@ -58,7 +58,7 @@ def load_policy(path: str | Path, *, trust: Collection[str] = ()) -> tuple[Polic
         CheckpointError: The file is missing, truncated, damaged or of another kind, its weights are not finite, or
             its preset cannot be used, does not fit the weights, or names Python code that is not trusted.
     """
-    policy, header = read_policy(path)
+    policy, header = read_policy(path, lambda header: _network_like(header, str(path), trust))
     setup = _setup(header, architecture(policy), str(path), trust)
     check_policy(policy, source=str(path), observation=np.asarray(_seen_at_rest(setup)))
     return policy, setup.preset
@@ -98,8 +98,7 @@ def load_learnt(path: str | Path, *, trust: Collection[str] = ()) -> tuple[Learn
     try:
         header = wire.describe(data, kind="learnt", source=str(path))
         setup = _setup(header, header.get("architecture", ""), str(path), trust)
-        base = policy_like(header.get("architecture", ""), source=str(path))
-        policy: Policy | LoraPolicy = lora_like(base, header, source=str(path)) if "ranks" in header else base
+        policy = _policy_like(header, setup, str(path))
         like = jax.eval_shape(lambda policy: setup.learner.init(policy, random.key(0)), policy)
         state = wire.unpack(data, like, kind="learnt", source=str(path))
     except (MessageError, ConfigError) as error:
@@ -111,12 +110,30 @@ def load_learnt(path: str | Path, *, trust: Collection[str] = ()) -> tuple[Learn
     return state, setup.preset
 
 
+def _policy_like(header: dict[str, str], setup: Setup, source: str) -> AbstractPolicy | LoraPolicy:
+    """Return the shapes of the policy of a learner state."""
+    if header.get("architecture", "") == NETWORK:
+        return _shapes(setup)
+    base = policy_like(header.get("architecture", ""), source=source)
+    return lora_like(base, header, source=source) if "ranks" in header else base
+
+
+def _network_like(header: dict[str, str], source: str, trust: Collection[str]) -> AbstractPolicy:
+    """Return the shapes of a policy that is not a perceptron."""
+    return _shapes(_setup(header, NETWORK, source, trust))
+
+
+def _shapes(setup: Setup) -> AbstractPolicy:
+    shapes: AbstractPolicy = eqx.filter_eval_shape(setup.new_policy, random.key(0))
+    return shapes
+
+
 def _setup(header: dict[str, str], sizes: str, source: str, trust: Collection[str]) -> Setup:
     """Return the set-up of a header's preset, checked against the architecture of the weights."""
     try:
         preset = parse(header.get("preset", ""), source=f"{source}, header, preset")
         check_trust(preset, trust, source=source)
-        setup = Setup.of(preset)
+        setup = Setup.from_preset(preset)
     except ConfigError as error:
         if newer := newer_release(header):
             raise CheckpointError(
@@ -128,6 +145,8 @@ def _setup(header: dict[str, str], sizes: str, source: str, trust: Collection[st
         shown = ", ".join(f"{name} = {value!r}" for name, value in absent.items())
         LOG.warning(one_line(f"{source}: written by an earlier release; defaults are taken for what it lacks: {shown}"))
     expected = "-".join(map(str, (setup.env.task.observation.size, *preset.pretrain.hidden_sizes, 4)))
+    if preset.pretrain.network != "mlp":
+        expected = architecture(_shapes(setup))
     if sizes != expected:
         raise CheckpointError(f"{source}: architecture {sizes}, but its preset {preset.name!r} needs {expected}")
     return setup

@@ -9,7 +9,7 @@ import optax
 from jax import random
 from jaxtyping import Array, Float, Key
 
-from ..control.policy import Policy
+from ..control.policy import AbstractPolicy
 from ..errors import TrainingError
 from ..tasks.task import AbstractTask, Start
 from .bptt import PolicyState, bptt
@@ -43,7 +43,7 @@ def train_chunk(
 
 
 def pretrain(
-    policy: Policy,
+    policy: AbstractPolicy,
     env: Env,
     key: Key[Array, ""],
     *,

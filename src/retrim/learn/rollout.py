@@ -1,5 +1,6 @@
 """Roll-out of one drone as one scan."""
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -7,7 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from ..control.policy import Inputs, Perturbations, Policy
+from ..control.policy import AbstractPolicy, Inputs, Perturbations, Policy
 from ..physics.command_path import CommandQueue
 from ..physics.felt_frame import FeltFrame
 from ..physics.state import Command, State, where
@@ -28,7 +29,7 @@ class Trajectory(eqx.Module):
     """True after the tick in which the vehicle left the task's bounds; its state is then frozen."""
 
 
-def rollout(env: Env, policy: Policy, start: Start) -> Trajectory:
+def rollout(env: Env, policy: AbstractPolicy, start: Start) -> Trajectory:
     """Fly ``env.task.horizon`` ticks from ``start``.
 
     A command begins to act ``env.delay`` after it was issued; until the first one acts, the vehicle receives the hover
@@ -42,7 +43,7 @@ def rollout(env: Env, policy: Policy, start: Start) -> Trajectory:
     Returns:
         States, commands and rewards, with a leading time axis.
     """
-    return _scan(env, policy, start, None)[0]
+    return _scan(env, policy, start, lambda o, _: (policy(o), ()), None)[0]
 
 
 def perturbed_rollout(
@@ -59,10 +60,16 @@ def perturbed_rollout(
     Returns:
         The trajectory, and the inputs of each layer (per layer, horizon x fan-in).
     """
-    return _scan(env, policy, start, perturbations)
+    return _scan(env, policy, start, policy.perturbed, perturbations)
 
 
-def _scan(env: Env, policy: Policy, start: Start, perturbations: Perturbations | None) -> tuple[Trajectory, Inputs]:
+def _scan(
+    env: Env,
+    policy: AbstractPolicy,
+    start: Start,
+    act: Callable[[Array, Any], tuple[Command, Inputs]],
+    perturbations: Perturbations | None,
+) -> tuple[Trajectory, Inputs]:
     if start.member is not None:
         env = env.with_path(start.member.path)
     dynamics, task = env.dynamics, env.task
@@ -89,7 +96,7 @@ def _scan(env: Env, policy: Policy, start: Start, perturbations: Perturbations |
             observation = observation.with_belief(start.member.belief)
         o, memory = observation(memory, t, x_seen, last)
         before = last
-        last, inputs = (policy(o), ()) if perturbation is None else policy.perturbed(o, perturbation)
+        last, inputs = act(o, perturbation)
         issued = last if frame is None else frame.world_command(last)
         commands = commands.push(issued)
         acting = commands.combine(shares)

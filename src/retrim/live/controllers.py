@@ -8,14 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..adapt.learner import LearnerState
+from ..adapt.learner_state import LearnerState
 from ..compile.trace import numpy_program, plain
 from ..config.families import make_family
 from ..config.setup import Setup
 from ..control.condition import Condition
 from ..control.controller import AbstractController
 from ..control.identified import vehicle_estimate
-from ..control.policy import Policy
+from ..control.policy import AbstractPolicy
 from ..errors import ConfigError
 from ..estimation.command_path import PathEstimator
 from ..learn.bptt import PolicyState
@@ -27,7 +27,7 @@ from ..physics.state import Command, State
 from ..transport import wire
 
 
-def flown(policy: Policy, residual: Any) -> dict[str, Any]:
+def flown(policy: AbstractPolicy, residual: Any) -> dict[str, Any]:
     """Return the parameters of a learning controller, by group: ``policy`` and ``residual``."""
     return {"policy": eqx.filter(policy, eqx.is_array), "residual": eqx.filter(residual, eqx.is_array)}
 
@@ -49,8 +49,8 @@ def adaptive_source(setup: Setup, state: LearnerState) -> ControllerSource:
         given[REFERENCE] = setup.followed
     given |= vehicle_half(setup, setup.controller(state))
 
-    def whole(parameters: dict[str, Any]) -> tuple[Policy, Any]:
-        found: tuple[Policy, Any] = eqx.combine((parameters["policy"], parameters["residual"]), parts[1])
+    def whole(parameters: dict[str, Any]) -> tuple[AbstractPolicy, Any]:
+        found: tuple[AbstractPolicy, Any] = eqx.combine((parameters["policy"], parameters["residual"]), parts[1])
         return found
 
     def controller(parameters: dict[str, Any]) -> AbstractController[Any]:

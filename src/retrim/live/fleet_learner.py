@@ -11,12 +11,13 @@ import numpy as np
 from jax import random
 
 from ..adapt.updates import Update
-from ..adapt.workers import PolicyWorker, Worker
+from ..adapt.worker import Worker
+from ..adapt.workers import PolicyWorker
 from ..config.loading import dump
 from ..config.presets import Preset
 from ..config.setup import Setup
 from ..control.lora import LoraPolicy
-from ..control.policy import Policy
+from ..control.policy import AbstractPolicy
 from ..learn.bptt import PolicyState
 from ..learn.window import Window
 from ..runtime.fleet_learning import learn_base, learn_together, refused_by_all, room_for, shared_base
@@ -124,7 +125,7 @@ class FleetLearner:
         """
         key = dump(preset), reference
         if key not in self._setups:
-            self._setups[key] = Setup.of(preset, reference)
+            self._setups[key] = Setup.from_preset(preset, reference)
         return self._setups[key]
 
     def _kinds(self) -> dict[Any, dict[str, "_Member"]]:
@@ -154,7 +155,7 @@ def _low_rank(workers: Sequence[Worker]) -> list[PolicyWorker]:
     return [each for each in workers if isinstance(each, PolicyWorker) and isinstance(each.policy, LoraPolicy)]
 
 
-def fingerprint(policy: Policy) -> str:
+def fingerprint(policy: AbstractPolicy) -> str:
     """Return a hash that identifies the weights of a policy."""
     leaves = jax.tree.leaves(eqx.filter(policy, eqx.is_array))
     return hashlib.sha256(b"".join(np.ascontiguousarray(leaf).tobytes() for leaf in leaves)).hexdigest()[:16]

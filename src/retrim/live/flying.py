@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from ..adapt.learner import LearnerState
+from ..adapt.learner_state import LearnerState
+from ..config.methods import find_method
 from ..errors import PlantError
 from ..io.logs.recording import Recording, write_npz
 from ..io.logs.viewers import can_record, record
@@ -27,7 +28,7 @@ from ..tasks.transition import spliced
 from .events import LiveEvents
 from .page_access import page_url
 from .report import complaints, flight_of, histograms, learnt_in, missing, results
-from .session import LEARNING, LiveRequest, live_spec
+from .session import LiveRequest, live_spec
 from .status import Status
 from .supervisor import Supervisor
 from .watching import watched
@@ -91,7 +92,8 @@ def fly_live(
             if request.until_stopped and status.ended == "landed":
                 run.stop.clear()  # this is the intended end
             start, trust = supervisor.start, supervisor.spec.trust
-            learnt = learnt_in(supervisor.bus, status, start, trust) if request.method in LEARNING else None
+            learns = find_method(request.method).learns is not None
+            learnt = learnt_in(supervisor.bus, status, start, trust) if learns else None
         if len(pieces := wishes.following.pieces) > 1:  # errors and figures cover all references of the flight
             request = replace(request, setup=request.setup.on(spliced(pieces)))
         done = _written(request, run, outlet, status, events, learnt, supervisor.refused)

@@ -16,9 +16,10 @@ import numpy as np
 from jax import random
 
 from ..adapt.buffer import RollingBuffer
-from ..adapt.learner import LearnerState
+from ..adapt.learner_state import LearnerState
 from ..adapt.updates import NOTHING, Layer, PolicyUpdate, ResidualUpdate, Update, pack_update
-from ..adapt.workers import PolicyWorker, ResidualWorker
+from ..adapt.worker import Worker
+from ..adapt.workers import make_worker
 from ..config.presets import Preset
 from ..config.setup import Setup
 from ..errors import MessageError
@@ -75,7 +76,7 @@ class LearnerLoop:
         plan: LearnerPlan,
         bus: Bus,
         clock: Callable[[], float] = time.monotonic,
-        setup_of: Callable[[Preset, str | None], Setup] = Setup.of,
+        setup_of: Callable[[Preset, str | None], Setup] = Setup.from_preset,
     ) -> None:
         """Initialise the loop.
 
@@ -100,11 +101,9 @@ class LearnerLoop:
         self._pending: tuple[int, PolicyUpdate, float] | None = None
         self._flown: list[tuple[int, Update]] = []
 
-    def new_worker(self) -> ResidualWorker | PolicyWorker:
+    def new_worker(self) -> Worker:
         """Return a worker that starts from the learned state before the flight."""
-        if self.plan.layer == "residual":
-            return ResidualWorker(self.setup.learner, self.state)
-        return PolicyWorker(self.setup.learner, self.state, random.key(self.plan.seed))
+        return make_worker(self.setup.learner, self.plan.layer, self.state, random.key(self.plan.seed))
 
     def warm_up(self) -> None:
         """Compile the programs of the flight on a synthetic window and discard the result."""
@@ -185,7 +184,7 @@ class LearnerLoop:
             found = Parameters.unpack(message, wire.names(followed), half=REFERENCE, base=self.plan.base, after=0)
             leaves = jax.device_put(list(found.arrays.values()))
             self.setup = self.setup.on(jax.tree.unflatten(jax.tree.structure(followed), leaves))
-            self.worker.learner = self.setup.learner
+            self.worker.follow(self.setup.learner)
 
     def _publish(self, update: Update) -> None:
         layer = self.plan.layer

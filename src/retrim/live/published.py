@@ -8,7 +8,7 @@ import contextlib
 from collections.abc import Callable
 from typing import Any
 
-from ..adapt.learner import LearnerState
+from ..adapt.learner_state import LearnerState
 from ..adapt.updates import PolicyUpdate, ResidualUpdate, Update, pack_update, unpack_update
 from ..errors import MessageError
 from ..onboard.topics import LAYERS, SLOTS, slot

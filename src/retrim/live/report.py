@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..adapt.learner import LearnerState
+from ..adapt.learner_state import LearnerState
 from ..errors import PlantError
 from ..io.trained import load_learnt
 from ..onboard.accounts import EDGES_MS, accounted, measured, summary

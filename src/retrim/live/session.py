@@ -12,14 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax import random
 
-from ..adapt.learner import LearnerState
+from ..adapt.learner_state import LearnerState
 from ..adapt.updates import Layer
 from ..config.faults import measurement_fault
-from ..config.methods import find_method
+from ..config.methods import find_method, learning_methods
 from ..config.scenario import Scenario
 from ..config.setup import Setup
 from ..config.trust import python_names
-from ..control.policy import Policy
+from ..control.policy import AbstractPolicy
 from ..errors import ConfigError
 from ..io.trained import save_learnt
 from ..onboard.guard import Limits
@@ -37,7 +37,6 @@ from .spec import MAINS, VEHICLE, LiveSpec, PageSpec
 from .states import vector_of
 
 LAYERS: tuple[Layer, ...] = ("residual", "policy")
-LEARNING = ("full", "lora")
 PATH_S = 20.0  # [s], duration of the reference path on the page
 STEP = 0.05  # [s] between two positions on the path
 BELOW_GROUND = 0.3  # [m], depth of a fence below z = 0, since starts may be there and transients go lower
@@ -69,10 +68,10 @@ class LiveRequest:
 
     setup: Setup
     """Set-up of the policy's preset with the reference of the flight."""
-    policy: Policy
+    policy: AbstractPolicy
     scenario: Scenario
     method: str
-    """Method of the flight: ``full`` and ``lora`` learn; any method whose pilot is a controller can fly."""
+    """Method of the flight: one that learns, or one whose pilot is a controller."""
     seconds: float
     """Length of the flight [s]; the fence must enclose the reference over this time."""
     seed: int
@@ -123,25 +122,26 @@ def live_spec(request: LiveRequest) -> LiveSpec:
     if window > MOST_TICKS:
         raise ConfigError(f"adapt.window = {window} ticks: a live flight reports at most {MOST_TICKS}")
     start = request.folder / "start.safetensors"
+    learns = find_method(request.method).learns is not None
     if find_method(request.method).on_board is not None:
         raise ConfigError(
             f"method {request.method!r} commands the motors from on board; a live flight commands thrust and body rates"
         )
-    if request.method in LEARNING:
+    if learns:
         state = request.state or learner_state(request, request.policy, request.method)
         controller = adaptive_source(setup, state)
         save_learnt(start, state, preset)
     else:
         pilot = setup.pilot(request.policy, request.method, request.flight.key())
         if not isinstance(pilot, ControllerPilot):
-            raise ConfigError(f"method {request.method!r} is no controller, so it cannot fly live; full and lora learn")
+            raise ConfigError(f"method {request.method!r} must learn or return a ControllerPilot to fly live")
         controller = plain_source(setup, pilot.controller)
         save_learnt(start, learner_state(request, request.policy, "full"), preset)
     # Makes the hash unique: parameters and learners of another flight must not match, even for the same controller.
     controller = replace(controller, base=f"{controller.base}-{secrets.token_hex(4)}")
     return LiveSpec(
         controller=controller,
-        layers=LAYERS if request.method in LEARNING else (),
+        layers=LAYERS if learns else (),
         start=start,
         reference=request.scenario.reference,
         scenario=request.scenario,
@@ -158,7 +158,7 @@ def live_spec(request: LiveRequest) -> LiveSpec:
         seed=request.flight.plant_seed,
         folder=request.folder,
         page=_page(request) if request.page is not None else None,
-        learners=request.learners if request.method in LEARNING else None,
+        learners=request.learners if learns else None,
         trust=python_names(preset),
         mains=MAINS | {"plant": VEHICLE} if vehicle else MAINS,
     )
@@ -193,27 +193,35 @@ def learners_at(text: str | None, say: Callable[[str], None], key: Path | None =
 
 def _check_remote(request: LiveRequest) -> None:
     """Raise :class:`ConfigError` if learners on another machine cannot learn for this flight."""
-    if request.method not in LEARNING:
-        raise ConfigError(f"--learners: {request.method!r} does not learn; full and lora do")
+    if find_method(request.method).learns is None:
+        raise ConfigError(f"--learners: {request.method!r} does not learn; {' and '.join(learning_methods())} do")
     preset = request.setup.preset
     trained_on = preset.track.reference if preset.track is not None else ""
     flown_on = request.scenario.reference or ""
-    named = (preset.task, preset.adapt.residual, *trained_on.split("+"), *flown_on.split("+"))
+    named = (
+        preset.task,
+        preset.adapt.residual,
+        preset.adapt.learner,
+        preset.adapt.optimiser,
+        preset.pretrain.network,
+        *trained_on.split("+"),
+        *flown_on.split("+"),
+    )
     if local := sorted({name for name in named if ":" in name or ".csv" in name.lower()}):
         raise ConfigError(f"--learners: another machine does not have {', '.join(local)}; built-in ones only")
 
 
-def learner_state(request: LiveRequest, policy: Policy, method: str, residual: Any = None) -> LearnerState:
+def learner_state(request: LiveRequest, policy: AbstractPolicy, method: str, residual: Any = None) -> LearnerState:
     """Return the initial state of the learners.
 
     Args:
         request: Request of the flight.
         policy: Policy in flight.
-        method: ``full`` or ``lora``.
+        method: Method that learns.
         residual: State of the fitted residual, if there is one.
     """
-    key = request.flight.key()
-    chosen = request.setup.low_rank(policy, key) if method == "lora" else policy
+    key, prepare = request.flight.key(), find_method(method).learns
+    chosen = policy if prepare is None else prepare(request.setup, policy, key)
     state = request.setup.learner.init(chosen, random.split(key)[0])
     return state if residual is None else LearnerState(state.policy, residual)
 
@@ -222,8 +230,8 @@ def _page(request: LiveRequest) -> PageSpec:
     assert request.page is not None
     host, port = request.page
     vehicle = request.scenario.make_vehicle(request.setup.preset.vehicle)
-    others = tuple(method for method in LEARNING if method != request.method)
-    methods = (request.method, *others) if request.method in LEARNING else ()
+    learns = find_method(request.method).learns is not None
+    methods = tuple(dict.fromkeys((request.method, *learning_methods()))) if learns else ()
     arm = float(np.hypot(*np.asarray(vehicle.arm)))
     name, mass = request.setup.preset.name, float(vehicle.mass)
     offered = choices(request.setup, request.followed) if methods else ()

@@ -6,6 +6,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+from ..config.methods import learning_methods
 from ..errors import MessageError, RetrimError
 from ..io.trained import load_learnt, save_learnt
 from ..onboard.messages import unpack_note
@@ -14,7 +15,7 @@ from ..runtime.events import Event
 from .following import Following
 from .knobs import Knobs
 from .report import learnt_in
-from .session import LEARNING, LiveRequest, learner_state
+from .session import LiveRequest, learner_state
 from .status import Status
 from .supervisor import Supervisor
 
@@ -58,11 +59,12 @@ class Wishes:
         now = {"method": method, "paused": paused}
         if now == self._wish or not self._supervisor.spec.layers:
             return []
-        if method not in (*LEARNING, "none"):
-            return [Event(status.t, "refused", f"method {shown(method)}: there are {', '.join(LEARNING)}, none")]
+        known = tuple(dict.fromkeys((self._request.method, *learning_methods())))
+        if method not in (*known, "none"):
+            return [Event(status.t, "refused", f"method {shown(method)}: there are {', '.join(known)}, none")]
         self._wish = now
         self._supervisor.learn(paused=paused or method == "none", flown=method != "none")
-        if method in LEARNING and method != self._method:
+        if method != "none" and method != self._method:
             self._method = method
             self._coming = method, self._work.submit(self._start_of, method, status)
         return [Event(status.t, "asked", f"method {method}" + (", paused" if paused else ""))]

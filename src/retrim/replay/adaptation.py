@@ -9,9 +9,10 @@ from jax import random
 from jaxtyping import Array, Key
 
 from ..adapt.gate import all_finite
-from ..adapt.learner import LearnerState
+from ..adapt.learner_state import LearnerState
+from ..config.methods import find_method
 from ..config.setup import Setup
-from ..control.policy import Policy
+from ..control.policy import AbstractPolicy
 from ..errors import LogError
 from ..learn.residuals.model import FittedResidual
 from ..learn.residuals.targets import Targets
@@ -39,7 +40,7 @@ class Adapted(NamedTuple):
 
 
 def adapt_to(
-    rows: Targets, setup: Setup, policy: Policy, *, low_rank: bool, updates: int, seed: int, reporter: Reporter
+    rows: Targets, setup: Setup, policy: AbstractPolicy, *, method: str, updates: int, seed: int, reporter: Reporter
 ) -> Adapted:
     """Fit the residual to a log, window by window as in flight, and re-train the policy in the corrected model.
 
@@ -50,7 +51,7 @@ def adapt_to(
         rows: Rows of the log, with the tick of the preset.
         setup: Set-up of the policy.
         policy: Policy to re-train.
-        low_rank: Whether to train only a low-rank delta.
+        method: Method that learns: ``full``, ``lora``, or another registered one.
         updates: Maximum number of updates.
         seed: Seed of the learners.
         reporter: Receives the progress.
@@ -59,8 +60,8 @@ def adapt_to(
         LogError: No window of the log contains enough of a flight.
     """
     k_init, k_delta, k_starts, k_learn = random.split(random.key(seed), 4)
-    learner = setup.learner
-    state = learner.init(setup.low_rank(policy, k_delta) if low_rank else policy, k_init)
+    learner, prepare = setup.learner, find_method(method).learns
+    state = learner.init(policy if prepare is None else prepare(setup, policy, k_delta), k_init)
     residual, trained, window = _fitted(rows, setup, state.residual), state.policy, _starts(setup, k_starts)
     admitted = refused = tried = 0
     with reporter.progress("re-training") as advance:

@@ -9,8 +9,9 @@ import numpy as np
 from jax import tree
 
 from ..config.loading import changed, load, with_vehicle
+from ..config.methods import find_method, learning_methods
 from ..config.setup import Setup
-from ..control.policy import Policy
+from ..control.policy import AbstractPolicy
 from ..errors import ConfigError, LogError
 from ..io.logs import FlightLog, read_flight_log, read_map
 from ..io.trained import load_policy
@@ -65,7 +66,8 @@ class Replay:
     trust: tuple[str, ...] = ()
     """Python names that the policy may refer to, for example mine:task; they are imported."""
     adapt: str = "none"
-    """Re-train the policy in the model that is corrected by the log: full (all weights), lora (low-rank) or none."""
+    """Re-train the policy in the model that is corrected by the log: full (all weights), lora (low-rank), another
+    method that learns, or none."""
     updates: int = 60
     """Maximum number of updates."""
     seed: int = 0
@@ -76,8 +78,8 @@ class Replay:
         for name, (least, most) in SPANS.items():
             if not least <= getattr(self, name) <= most:
                 raise ConfigError(f"--{name} {getattr(self, name):g}: must be {least:g} to {most:g} s")
-        if self.adapt not in ("none", "full", "lora"):
-            raise ConfigError(f"--adapt {self.adapt}: must be full, lora or none")
+        if self.adapt != "none" and find_method(self.adapt).learns is None:
+            raise ConfigError(f"--adapt {self.adapt}: must be {', '.join(learning_methods())} or none")
         if (self.adapt == "none") != (self.policy is None):
             raise ConfigError("--adapt and --policy go together; `retrim pretrain hover --out h` makes a policy")
         if not 1 <= self.updates <= 10_000:
@@ -100,7 +102,7 @@ def replay(path: Path, asked: Replay, run: Run, reporter: Reporter) -> Document:
     policy, preset = load_policy(asked.policy, trust=asked.trust) if asked.policy else (None, load(DEFAULT))
     if asked.vehicle is not None:
         preset = with_vehicle(preset, asked.vehicle)
-    setup = Setup.of(preset if asked.residual is None else changed(preset, adapt={"residual": asked.residual}))
+    setup = Setup.from_preset(preset if asked.residual is None else changed(preset, adapt={"residual": asked.residual}))
     log = read_flight_log(path, None if asked.map is None else read_map(asked.map), dt=preset.dt)
     least, most = setup.preset.plant_delay_ticks + SAMPLES[0], SAMPLES[1]
     if not least <= round(asked.buffer / log.dt) <= most:
@@ -159,7 +161,7 @@ def _foretold(
 
 
 def _adapted(
-    asked: Replay, setup: Setup, policy: Policy, log: FlightLog, rows: Targets, run: Run, reporter: Reporter
+    asked: Replay, setup: Setup, policy: AbstractPolicy, log: FlightLog, rows: Targets, run: Run, reporter: Reporter
 ) -> TableSection:
     preset = setup.preset
     if abs(log.dt - preset.dt) > 0.02 * preset.dt:
@@ -167,8 +169,9 @@ def _adapted(
             f"the log has a sample every {1000 * log.dt:.3g} ms, but the policy's tick is {1000 * preset.dt:g} ms; "
             f"log states at least that often to adapt to them"
         )
-    low_rank = asked.adapt == "lora"
-    result = adapt_to(rows, setup, policy, low_rank=low_rank, updates=asked.updates, seed=asked.seed, reporter=reporter)
+    result = adapt_to(
+        rows, setup, policy, method=asked.adapt, updates=asked.updates, seed=asked.seed, reporter=reporter
+    )
     write_state(result.state, preset, run.folder)
     lines = (("as it was", f"{result.before:.3f}"), ("adapted", f"{result.after:.3f}"))
     about = (

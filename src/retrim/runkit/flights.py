@@ -7,7 +7,7 @@ import numpy as np
 from jax import random
 from jaxtyping import Array, Key
 
-from ..adapt.learner import LearnerState
+from ..adapt.learner_state import LearnerState
 from ..config.scenario import Scenario
 from ..runtime.events import Event
 from ..runtime.flight import Log

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from ..adapt.learner import LearnerState
+from ..adapt.learner_state import LearnerState
 from ..config.presets import Preset
 from ..config.setup import Setup
 from ..control.lora import LoraPolicy
-from ..control.policy import Policy
+from ..control.policy import AbstractPolicy
 from ..io.checkpoint import save_delta
 from ..io.files import write_whole
 from ..io.logs.recording import Recording, write_npz
@@ -23,7 +23,7 @@ from .run import Run
 
 
 def write_trained(
-    run: Run, setup: Setup, policy: Policy, losses: Sequence[float], *, seed: int, error_m: float | None = None
+    run: Run, setup: Setup, policy: AbstractPolicy, losses: Sequence[float], *, seed: int, error_m: float | None = None
 ) -> Path:
     """Write ``policy.safetensors`` with its ``results.json``; a Ctrl-C takes effect after both.
 

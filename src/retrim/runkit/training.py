@@ -14,7 +14,7 @@ from jaxtyping import Array, Key
 from ..config.loading import changed, dump, parse
 from ..config.presets import Preset
 from ..config.setup import Setup
-from ..control.policy import Policy
+from ..control.policy import AbstractPolicy
 from ..errors import JobError
 from ..learn.env import Env
 from ..learn.residuals.model import FittedResidual
@@ -25,7 +25,7 @@ from .reporter import Reporter, Silent
 class Trained(NamedTuple):
     """Result of pretraining; after an interruption its last state."""
 
-    policy: Policy
+    policy: AbstractPolicy
     losses: list[float]
     """Loss of each optimiser step."""
 
@@ -67,8 +67,8 @@ def trained_elsewhere(
     *,
     reporter: Reporter,
     stop: threading.Event,
-    landed: Callable[[int, Policy], None] = lambda seed, policy: None,
-) -> dict[int, Policy]:
+    landed: Callable[[int, AbstractPolicy], None] = lambda seed, policy: None,
+) -> dict[int, AbstractPolicy]:
     """Pretrain a policy for each seed, all at once, in other processes.
 
     Args:
@@ -86,7 +86,7 @@ def trained_elsewhere(
         JobError: A training failed; raised after the others are completed.
     """
     jobs = {executor.submit(train_job, dump(preset), seed): seed for seed in seeds}
-    found, failed, waiting = dict[int, Policy](), list[str](), set(jobs)
+    found, failed, waiting = dict[int, AbstractPolicy](), list[str](), set(jobs)
     try:
         with reporter.progress(f"pretraining {preset.name} elsewhere") as advance:
             while waiting and not stop.is_set():
@@ -109,12 +109,12 @@ def trained_elsewhere(
     return {seed: found[seed] for seed in seeds if seed in found}
 
 
-def train_job(preset: str, seed: int) -> Policy:
+def train_job(preset: str, seed: int) -> AbstractPolicy:
     """Pretrain a policy of a preset (JSON), in another process."""
-    return train(Setup.of(parse(preset, source="preset")), seed).policy
+    return train(Setup.from_preset(parse(preset, source="preset")), seed).policy
 
 
-def nominal_error(setup: Setup, policy: Policy, *, n: int = 64, seed: int = 1) -> float:
+def nominal_error(setup: Setup, policy: AbstractPolicy, *, n: int = 64, seed: int = 1) -> float:
     """Return the mean error in the policy's own model [m], over the last half second of 6 s.
 
     Args:
@@ -126,7 +126,7 @@ def nominal_error(setup: Setup, policy: Policy, *, n: int = 64, seed: int = 1) -
     return _mean_error(setup, _long(setup).env, policy, n, seed)
 
 
-def model_error(setup: Setup, policy: Policy, residual: FittedResidual, *, n: int = 64, seed: int = 1) -> float:
+def model_error(setup: Setup, policy: AbstractPolicy, residual: FittedResidual, *, n: int = 64, seed: int = 1) -> float:
     """Return the same error in the model with a residual, with the observation that the policy has in flight."""
     learner = _long(setup).learner
     return _mean_error(setup, learner.view(learner.env, residual), policy, n, seed)
@@ -134,15 +134,15 @@ def model_error(setup: Setup, policy: Policy, residual: FittedResidual, *, n: in
 
 def _long(setup: Setup) -> Setup:
     """Return the setup with roll-outs of 6 s."""
-    return Setup.of(changed(setup.preset, pretrain={"horizon": round(6.0 / setup.preset.dt)}))
+    return Setup.from_preset(changed(setup.preset, pretrain={"horizon": round(6.0 / setup.preset.dt)}))
 
 
-def _mean_error(setup: Setup, env: Env, policy: Policy, n: int, seed: int) -> float:
+def _mean_error(setup: Setup, env: Env, policy: AbstractPolicy, n: int, seed: int) -> float:
     return float(_settled(policy, env, random.key(seed), n, round(0.5 / setup.preset.dt)))
 
 
 @eqx.filter_jit
-def _settled(policy: Policy, env: Env, key: Key[Array, ""], n: int, ticks: int) -> Array:
+def _settled(policy: AbstractPolicy, env: Env, key: Key[Array, ""], n: int, ticks: int) -> Array:
     def error(k: Key[Array, ""]) -> Array:
         start = env.task.reset(k)
         flown = rollout(env, policy, start)

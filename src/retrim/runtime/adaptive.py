@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 from ..adapt.buffer import RollingBuffer
-from ..adapt.learner import LearnerState
+from ..adapt.learner_state import LearnerState
 from ..adapt.updates import PolicyUpdate, ResidualUpdate, Update
 from ..control.controller import AbstractController
 from ..physics.state import Command

@@ -16,7 +16,8 @@ from jax import lax, random
 from jaxtyping import Array, Key
 
 from ..adapt.gate import Verdict
-from ..adapt.learner import FitReport, LearnerState, OnlineLearner
+from ..adapt.learner import OnlineLearner
+from ..adapt.learner_state import FitReport, LearnerState
 from ..adapt.updates import Layer, Skip, Update
 from ..adapt.workers import PolicyWorker, ResidualWorker, policy_update, residual_update
 from ..control.controller import AbstractController
@@ -76,11 +77,14 @@ class Plan:
     @classmethod
     def of(cls, pilot: AdaptivePilot) -> "Plan | None":
         """Return the plan of a pilot; None if it has other learners, or if its latencies are measured by the clock."""
-        match [each.learner for each in pilot.learners]:
+        learners = [each.learner for each in pilot.learners]
+        if [type(getattr(each, "worker", None)) for each in learners] != [ResidualWorker, PolicyWorker]:
+            return None  # a worker of another class may compute something else
+        match learners:
             case [
                 LockstepLearner(worker=ResidualWorker(learner=other), latency_s=float(first)) as fit,
                 LockstepLearner(worker=PolicyWorker(learner=learner, key=key), latency_s=float(second)) as update,
-            ] if other is learner:
+            ] if other is learner and isinstance(learner, OnlineLearner):
                 latencies = fit.ticks(first), update.ticks(second)
                 periods = pilot.periods[RESIDUAL], pilot.periods[POLICY]
                 return cls(learner, pilot.controller_of, key, pilot.window, periods, latencies)

@@ -11,9 +11,11 @@ import optax
 from jax import random
 from jaxtyping import Array, Key
 
-from ..adapt.learner import LearnerState, OnlineLearner
+from ..adapt.learner import OnlineLearner
+from ..adapt.learner_state import LearnerState
 from ..adapt.updates import PolicyUpdate, Update
-from ..adapt.workers import PolicyWorker, ResidualWorker, Worker, policy_update, residual_update
+from ..adapt.worker import Worker
+from ..adapt.workers import PolicyWorker, ResidualWorker, policy_update, residual_update
 from ..control.lora import LoraPolicy
 from ..control.policy import Policy
 from ..learn.bptt import PolicyState, policy_gradient
@@ -29,9 +31,9 @@ def learn_together(
 ) -> list[Update]:
     """Learn from one window for each of several vehicles.
 
-    The result of each vehicle equals that of its worker alone, up to rounding. Programs are compiled for powers of two;
-    the batch is padded to the next one with copies whose results are dropped, so that any number of vehicles may be
-    due.
+    Custom workers learn one after the other. The result of each vehicle equals that of its worker alone, up to
+    rounding. Programs are compiled for powers of two; the batch is padded to the next one with copies whose results are
+    dropped, so that any number of vehicles may be due.
 
     Args:
         workers: One for each vehicle, of one layer and one learner, with states of one structure.
@@ -43,6 +45,8 @@ def learn_together(
         The update of each vehicle.
     """
     first, n = workers[0], len(workers)
+    if type(first) not in (ResidualWorker, PolicyWorker):
+        return [worker.learn(window) for worker, window in zip(workers, windows, strict=True)]
     filled = [*range(n), *[0] * (room_for(n) - n)]
     window = stacked([windows[i] for i in filled])
     if isinstance(first, ResidualWorker):

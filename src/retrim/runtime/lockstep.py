@@ -8,7 +8,7 @@ import math
 import time
 
 from ..adapt.updates import Skip, Update
-from ..adapt.workers import Worker
+from ..adapt.worker import Worker
 from ..learn.window import Window
 from .learner import Learner
 

@@ -3,9 +3,12 @@
 from .abstract_reference import AbstractReference as AbstractReference
 from .abstract_reference import TurnedReference as TurnedReference
 from .hover import AbstractHover as AbstractHover
+from .hover import CustomHover as CustomHover
 from .hover import Hover as Hover
 from .hover import L2Hover as L2Hover
 from .keypoints import Keypoints as Keypoints
+from .moving_goal import GoalObs as GoalObs
+from .moving_goal import MovingGoal as MovingGoal
 from .observation import AbstractObservation as AbstractObservation
 from .observation import StateObs as StateObs
 from .occluded import OccludedKeypoints as OccludedKeypoints

@@ -1,7 +1,7 @@
 """Stabilising hover at a goal (paper, Sec. IV-A.1)."""
 
 import dataclasses
-import math
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -14,9 +14,10 @@ from ..physics import so3
 from ..physics.felt_frame import FeltFrame
 from ..physics.state import Command, State
 from .observation import AbstractObservation
-from .task import AbstractTask, Start, huber, within
+from .task import TILT, AbstractTask, Start, huber, within
 
-TILT = 0.1 * math.pi  # [rad], 18 degrees
+RewardRule = Callable[[Float[Array, "3"], State, Command], Float[Array, ""]]
+"""Reward from goal [m], state and command, differentiable by JAX."""
 
 
 class AbstractHover(AbstractTask):
@@ -42,6 +43,11 @@ class AbstractHover(AbstractTask):
     def observation_in_flight(self) -> AbstractObservation[Any]:
         """Observation used in flight."""
         return self.observation if self.in_flight is None else self.in_flight
+
+    @property
+    def rests(self) -> bool:
+        """Whether the vehicle comes to rest at the goal."""
+        return type(self).target is AbstractHover.target
 
     def home(self) -> Float[Array, "3"]:
         """Return the goal, world [m]."""
@@ -71,10 +77,10 @@ class AbstractHover(AbstractTask):
         """Return hover at the same goal.
 
         Raises:
-            FrameError: A subclass moves the target, or the observation cannot be turned.
+            FrameError: A subclass overrides ``target``, or the observation does not support other frames.
         """
-        if type(self).target is not AbstractHover.target:
-            raise FrameError(f"{type(self).__name__} moves its target: it must say how that is turned")
+        if not self.rests:
+            raise FrameError(f"{type(self).__name__} overrides target; TaskRequest.hover(goal=...) makes a moving goal")
         return dataclasses.replace(
             self,
             goal=frame.vector(self.goal),
@@ -89,6 +95,17 @@ class Hover(AbstractHover):
     def reward(self, t: Float[Array, ""], x: State, u: Command) -> Float[Array, ""]:
         """Return r_pos + r_vel + r_act of the paper; the rate term acts on the commanded body rates."""
         return _printed(self.target(t), x, u)
+
+
+class CustomHover(AbstractHover):
+    """Hover with any reward."""
+
+    rule: RewardRule = eqx.field(static=True, kw_only=True)
+    """Reward, from goal [m], state and command, in the frame of the policy."""
+
+    def reward(self, t: Float[Array, ""], x: State, u: Command) -> Float[Array, ""]:
+        """Return the reward."""
+        return self.rule(self.target(t), x, u)
 
 
 class L2Hover(AbstractHover):

@@ -1,14 +1,16 @@
 """A task: its starts, reward, termination and error."""
 
 import abc
+import math
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import random
 from jaxtyping import Array, Bool, Float, Key
 
-from ..errors import FrameError
+from ..physics import so3
 from ..physics.felt_frame import FeltFrame
 from ..physics.path_family import Member
 from ..physics.state import STANDARD_GRAVITY, Command, State
@@ -26,8 +28,31 @@ class Start(eqx.Module):
     """Vehicle of the roll-out, and the belief of its policy about it; None for the vehicle of the model."""
 
 
+NEAR = 1.0  # [m]: largest distance of a start from the target along an axis
+BOX = 5.0  # [m]: largest distance of a flight from the target along an axis
+TILT = 0.1 * math.pi  # [rad], 18 degrees
+SPEED = 0.1  # [m/s]: standard deviation of the velocity of a start, relative to the target
+
+
 class AbstractTask(eqx.Module):
-    """One drone, one task. Times are seconds since the start; positions are world coordinates [m]."""
+    """One drone, one task. Times are seconds since the start; positions are world coordinates [m].
+
+    A custom task defines ``home``, ``reward``, ``observation``, ``dt`` and ``horizon``, and ``target`` if its target
+    moves; the other methods have defaults.
+
+    Example::
+
+        class Climb(retrim.AbstractTask):
+            observation: retrim.StateObs
+            dt: float = 0.02
+            horizon: int = 150
+
+            def home(self):
+                return jnp.array([0.0, 0.0, 2.0])
+
+            def reward(self, t, x, u):
+                return -jnp.sum((x.p - self.home()) ** 2) - 0.1 * jnp.sum(u.omega**2)
+    """
 
     if TYPE_CHECKING:  # to a type checker an abstract variable would be a dataclass field
 
@@ -51,6 +76,11 @@ class AbstractTask(eqx.Module):
     def observation_in_flight(self) -> AbstractObservation[Any]:
         """Observation used in flight; by default that of training."""
         return self.observation
+
+    @property
+    def rests(self) -> bool:
+        """Whether the vehicle comes to rest at home, so that ``adapt.trim`` applies; by default if no target moves."""
+        return type(self).target is AbstractTask.target
 
     @property
     def metric(self) -> str:
@@ -82,9 +112,18 @@ class AbstractTask(eqx.Module):
         hover = jnp.zeros(4, dtype=p.dtype).at[0].set(STANDARD_GRAVITY)
         return Point(p, rest, hover, none, rest, rest, none)
 
-    @abc.abstractmethod
     def reset(self, key: Key[Array, ""]) -> Start:
-        """Return a random start; the key is consumed."""
+        """Draw a start; by default at any time of a flight, within 1 m, 18 degrees and 0.1 m/s of the moving target.
+
+        Args:
+            key: Random key, consumed.
+        """
+        k_time, kp, ka, kv = random.split(key, 4)
+        t = self.flight_seconds * random.uniform(k_time)
+        p, v = jax.jvp(self.target, (t,), (jnp.ones_like(t),))
+        R = so3.exp(random.uniform(ka, (3,), p.dtype, minval=-TILT, maxval=TILT))
+        near = random.uniform(kp, (3,), p.dtype, minval=-NEAR, maxval=NEAR)
+        return Start(t, State(p + near, R, v + SPEED * random.normal(kv, (3,), p.dtype)))
 
     @abc.abstractmethod
     def reward(self, t: Float[Array, ""], x: State, u: Command) -> Float[Array, ""]:
@@ -96,25 +135,63 @@ class AbstractTask(eqx.Module):
             u: Command that acts from ``t`` on.
         """
 
-    @abc.abstractmethod
     def terminated(self, t: Float[Array, ""], x: State) -> Bool[Array, ""]:
-        """Return whether the vehicle has left the task's bounds; true also for a state that is not finite."""
+        """Return whether the vehicle has left the bounds, by default 5 m from the target along an axis.
 
-    @abc.abstractmethod
+        It must be true also for a state that is not finite.
+        """
+        return ~within(jnp.array(BOX), x, self.target(t))
+
     def error(self, t: Float[Array, ""], x: State) -> Float[Array, ""]:
-        """Return the distance from the target position [m]."""
+        """Return the error of a state, by default the distance from the target position [m]."""
+        return jnp.sqrt(jnp.sum((x.p - self.target(t)) ** 2))
 
     def in_frame(self, frame: FeltFrame) -> "AbstractTask":
         """Return the same task for states and commands of ``frame``.
 
+        By default, reward, bounds and error are those of the state in the world and of the command in the frame, in
+        which hover is the hover command.
+
         Raises:
-            FrameError: The task does not support other frames.
+            FrameError: The observation does not support other frames.
         """
-        raise FrameError(f"{type(self).__name__} cannot be turned into another frame")
+        return FramedTask(self, self.observation.in_frame(frame), frame, self.dt, self.horizon)
 
     def cross_track(self, x: State) -> Float[Array, ""] | None:
         """Return the distance from the nearest point of the reference [m]; None for a task without a reference."""
         return None
+
+
+class FramedTask(AbstractTask):
+    """A task for states and commands of a frame."""
+
+    task: AbstractTask
+    """Task in the world."""
+    observation: AbstractObservation[Any]
+    """Observation of states of the frame."""
+    frame: FeltFrame
+    dt: float = eqx.field(static=True)
+    horizon: int = eqx.field(static=True)
+
+    def home(self) -> Float[Array, "3"]:
+        """Return the position around which flights start, in the frame."""
+        return self.frame.vector(self.task.home())
+
+    def target(self, t: Float[Array, ""]) -> Float[Array, "3"]:
+        """Return the target position at time ``t`` [s], in the frame."""
+        return self.frame.vector(self.task.target(t))
+
+    def reward(self, t: Float[Array, ""], x: State, u: Command) -> Float[Array, ""]:
+        """Return the reward of the state in the world and of the command in the frame."""
+        return self.task.reward(t, self.frame.world_state(x), u)
+
+    def terminated(self, t: Float[Array, ""], x: State) -> Bool[Array, ""]:
+        """Return whether the vehicle has left the bounds."""
+        return self.task.terminated(t, self.frame.world_state(x))
+
+    def error(self, t: Float[Array, ""], x: State) -> Float[Array, ""]:
+        """Return the error of the state in the world."""
+        return self.task.error(t, self.frame.world_state(x))
 
 
 def within(box: Float[Array, ""], x: State, centre: Float[Array, "3"]) -> Bool[Array, ""]:

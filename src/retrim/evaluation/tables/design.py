@@ -68,7 +68,7 @@ def design(
     document = Document(run, "design", "Design study (Sec. IV-C of the paper)", intro, seeds, reporter)
     study = train_all(loaded, seeds, run, reporter)
     rows: list[dict[str, Any]] = []
-    setup = Setup.of(loaded)
+    setup = Setup.from_preset(loaded)
     with run.interruptible(), reporter.progress("re-training") as advance:
         for seed, policy in study.policies.items() if not run.interrupted else ():
             logs = fly_as_it_is(setup, policy, ROLLOUTS, ROLLOUT_S, 1000 + seed)

@@ -60,7 +60,7 @@ def efficiency(
     for preset in loaded:
         if run.interrupted:
             break
-        setup, watch = Setup.of(preset), Stopwatch()
+        setup, watch = Setup.from_preset(preset), Stopwatch()
         policy, losses = train(setup, 0, reporter=reporter, stop=run.stop)
         p, compiling = preset.pretrain, watch.compile_s
         trained = {
@@ -74,7 +74,7 @@ def efficiency(
             flies = setup.controller(setup.learner.init(policy, random.key(0)))
             rows.append({**trained, **updates(setup), "decision_s": decision_s(setup, flies)})
             rows.append({"method": f"{preset.name}, LoRA", **updates(setup, lora=True)})
-    setup = Setup.of(loaded[0])
+    setup = Setup.from_preset(loaded[0])
     for name, baseline in BASELINES.items():
         if run.interrupted:
             break

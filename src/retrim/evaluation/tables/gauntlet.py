@@ -112,7 +112,7 @@ def gauntlet(
     intro = (FAULTS_INTRO if faults else INTRO).format(sensors=sensors)
     document = Document(run, name, title, intro, seeds, reporter, data="results")
     study = train_all(loaded, seeds, run, reporter)
-    home, flown, found = Setup.of(loaded).flown.home(), dict[str, list[Flight]](), list[dict[str, Any]]()
+    home, flown, found = Setup.from_preset(loaded).flown.home(), dict[str, list[Flight]](), list[dict[str, Any]]()
     names, at_once = list(chosen), max(1, cores() // CORES)
     for together in (names[n : n + at_once] for n in range(0, len(names), at_once)):
         if run.interrupted:

@@ -7,7 +7,7 @@ from ...config.loading import dump
 from ...config.presets import Preset
 from ...config.setup import Setup
 from ...config.trust import python_names
-from ...control.policy import Policy
+from ...control.policy import AbstractPolicy
 from ...errors import CheckpointError
 from ...io.trained import load_policy, save_policy
 from ...runkit.provenance import section_key
@@ -21,7 +21,7 @@ UNSAFE = re.compile(r"[^\w.+=-]+")
 """Characters of a preset's name (which may be a path) that are unsafe in a file name."""
 
 
-def trained_policies(preset: Preset, seeds: Sequence[int], run: Run, reporter: Reporter) -> dict[int, Policy]:
+def trained_policies(preset: Preset, seeds: Sequence[int], run: Run, reporter: Reporter) -> dict[int, AbstractPolicy]:
     """Return a policy for each seed; those that ``run.trained`` has are not trained again.
 
     Args:
@@ -39,7 +39,7 @@ def trained_policies(preset: Preset, seeds: Sequence[int], run: Run, reporter: R
     made_of = section_key(preset=dump(preset), files=files_behind(*named_in(preset)))
     stem = f"{UNSAFE.sub('-', preset.name)}-{made_of[:8]}"
     paths = {seed: run.trained / POLICIES / f"{stem}-seed{seed}.safetensors" for seed in seeds}
-    found = dict[int, Policy]()
+    found = dict[int, AbstractPolicy]()
     for seed, path in paths.items():
         if path.is_file():
             try:
@@ -47,7 +47,7 @@ def trained_policies(preset: Preset, seeds: Sequence[int], run: Run, reporter: R
             except CheckpointError as error:
                 reporter.say(f"{error}; trained again")
 
-    def landed(seed: int, policy: Policy) -> None:
+    def landed(seed: int, policy: AbstractPolicy) -> None:
         save_policy(paths[seed], policy, preset)
         found[seed] = policy
 
@@ -55,7 +55,7 @@ def trained_policies(preset: Preset, seeds: Sequence[int], run: Run, reporter: R
     if missing and run.executor is not None and not run.interrupted:
         trained_elsewhere(preset, missing, run.executor, reporter=reporter, stop=run.stop, landed=landed)
         missing = []
-    setup = Setup.of(preset)  # one set-up, so that the seeds share its programs
+    setup = Setup.from_preset(preset)  # one set-up, so that the seeds share its programs
     for seed in missing:
         if run.interrupted:
             break

@@ -105,7 +105,7 @@ def fly_levels(
         if key not in studies and trains:
             studies[key] = train_all(section.preset, document.seeds, run, reporter)
         elif key not in studies:  # no method flies a policy, so that only the seeds of the study matter
-            untrained = Setup.of(section.preset).new_policy(random.key(0))
+            untrained = Setup.from_preset(section.preset).new_policy(random.key(0))
             studies[key] = Study(section.preset, dict.fromkeys(document.seeds, untrained), ())
         made = _level_section(
             studies[key], section, run, reporter, starts=starts, seconds=seconds, datt_steps=datt_steps
@@ -162,7 +162,7 @@ def _level_section(
         f"{study.about()} The gate admitted {kinds.count('policy')} policies and refused {kinds.count('rejected')}. "
         f"{crashed} of {len(flown)} flights crashed."
     )
-    setup = Setup.of(study.preset, section.scenario.reference)
+    setup = Setup.from_preset(study.preset, section.scenario.reference)
     first = [f for f in flown if f.spec.seed == flown[0].spec.seed and f.spec.method in section.drawn]
     drawn = picture(first, setup, section.scenarios[-1], run.folder, stem=section.stem)
     table = level_table(found, methods, section.paper, title, section.levels)

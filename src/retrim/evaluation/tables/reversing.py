@@ -80,7 +80,7 @@ def reversing(
     about = f"{study.about()} Median of the largest error after 5 s [m]: {peaks}. "
     about += f"{crashed} of {len(flown)} flights crashed."
     pictured = [f for f in flown if f.spec.method in ("base", "full")]
-    drawn = picture(pictured, Setup.of(loaded), scenario, run.folder)
+    drawn = picture(pictured, Setup.from_preset(loaded), scenario, run.folder)
     document.more = {"moments_s": moments.tolist(), "errors_m": {m: np.array(e).tolist() for m, e in errors.items()}}
     document.add(_section(errors, moments, updates, about, drawn[0] if drawn else None), found)
     if not run.interrupted:

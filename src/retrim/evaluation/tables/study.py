@@ -10,7 +10,7 @@ from ...config.loading import load_for
 from ...config.presets import Preset
 from ...config.scenario import Scenario
 from ...config.setup import Setup
-from ...control.policy import Policy
+from ...control.policy import AbstractPolicy
 from ...errors import JobError
 from ...runkit.reporter import Reporter
 from ...runkit.run import Run
@@ -52,7 +52,7 @@ def table_presets(
 
 def train_all(preset: Preset, seeds: Sequence[int], run: Run, reporter: Reporter) -> Study:
     """Train a policy for each seed, or read it from the run; after an interruption return the completed ones."""
-    setup, policies, errors = Setup.of(preset), dict[int, Policy](), list[float]()
+    setup, policies, errors = Setup.from_preset(preset), dict[int, AbstractPolicy](), list[float]()
     for seed, policy in trained_policies(preset, seeds, run, reporter).items():
         if run.interrupted:
             break
@@ -73,7 +73,7 @@ def refuse_misfits(
     """
     for scenario in scenarios:
         scenario.make(preset.vehicle, dt=preset.dt)
-    untrained = Setup.of(preset).new_policy(random.key(0))
+    untrained = Setup.from_preset(preset).new_policy(random.key(0))
     Fleet(preset, untrained, scenarios, methods=methods, starts=starts, seconds=seconds)
 
 

@@ -92,7 +92,7 @@ def tuning(
     )
     stem = "tuning" if shown == "state" else f"tuning_{shown}"
     document = Document(run, stem, "Settings of the baselines", intro, [], reporter)
-    setups = [Setup.of(load(preset), reference) for preset, *_, reference in conditions]
+    setups = [Setup.from_preset(load(preset), reference) for preset, *_, reference in conditions]
     for name in methods:
         if run.interrupted:
             break

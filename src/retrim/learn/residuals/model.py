@@ -17,7 +17,8 @@ class ResidualModel(Protocol):
 
     Every method is pure and traceable. The state is a pytree of arrays with fixed shapes. A model that also identifies
     bias and lag of the body rates has a method ``turning``, from its state to a
-    :class:`~retrim.learn.residuals.rates.RateFit`.
+    :class:`~retrim.learn.residuals.rates.RateFit`. A model that knows its uncertainty has a method ``spread``, with the
+    arguments of ``predict``, that returns one standard deviation per axis [m/s^2].
     """
 
     def init(self, key: Key[Array, ""]) -> Any:
@@ -34,10 +35,6 @@ class ResidualModel(Protocol):
 
     def predict(self, state: Any, x: State, u: Command) -> Float[Array, "3"]:
         """Return the predicted residual acceleration, world frame [m/s^2]."""
-        ...
-
-    def spread(self, state: Any, x: State, u: Command) -> Float[Array, "3"]:
-        """Return the uncertainty of the prediction, one standard deviation per axis [m/s^2]."""
         ...
 
 

@@ -20,7 +20,7 @@ def train(address: str, hosts: int, number: int, quick: bool = False) -> None:
 
     jax.distributed.initialize(address, hosts, number)  # before anything is computed
     small = {"num_updates": 20, "num_envs": 4, "horizon": 30, "hidden_sizes": (8,)} if quick else {"num_envs": 64}
-    setup, hosts = Setup.of(changed(load("hover/fast"), pretrain=small)), jax.process_count()
+    setup, hosts = Setup.from_preset(changed(load("hover/fast"), pretrain=small)), jax.process_count()
     for policy, losses in setup.pretraining(seed=0):  # noqa: B007
         if number == 0:
             print(f"{jax.device_count()} devices of {hosts} hosts: loss {float(losses[-1]):.6f}", flush=True)

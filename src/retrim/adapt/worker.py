@@ -1,0 +1,33 @@
+"""Interface of a worker: one layer of learning, independent of clock and process."""
+
+import abc
+from typing import Any
+
+from ..learn.window import Window
+from .updates import Layer, Update
+
+
+class Worker(abc.ABC):
+    """Computation of one layer of learning on one window.
+
+    The state of a worker advances only when it receives its own update as published. So a result that is dropped on the
+    way (because of a new flight or a lost message) never becomes the base of the next one.
+    """
+
+    layer: Layer
+
+    @abc.abstractmethod
+    def learn(self, window: Window) -> Update:
+        """Learn from a window; block until the result is available."""
+
+    @abc.abstractmethod
+    def receive(self, update: Update) -> None:
+        """Receive a published update of this or another layer."""
+
+    def follow(self, learner: Any) -> None:
+        """Continue on another reference.
+
+        Args:
+            learner: Online learner of the new reference.
+        """
+        self.learner = learner

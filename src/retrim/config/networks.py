@@ -1,0 +1,87 @@
+"""Registry of policy networks."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Key
+
+from ..control.network_policy import NetworkPolicy
+from ..control.policy import AbstractPolicy
+from ..errors import ConfigError
+from ..physics.vehicle import Vehicle
+from .fresh import untrained
+from .presets import Preset
+from .registry import Registry
+
+
+@dataclass(frozen=True)
+class NetworkRequest:
+    """Inputs from which an untrained network is built."""
+
+    preset: Preset
+    size: int
+    """Length of the observation."""
+    vehicle: Vehicle
+    """Vehicle with the limits of the commands."""
+    key: Key[Array, ""]
+    """Random key, consumed."""
+
+    @property
+    def hidden_sizes(self) -> tuple[int, ...]:
+        """Widths of the hidden layers in the preset."""
+        return tuple(self.preset.pretrain.hidden_sizes)
+
+
+NETWORKS: Registry[Callable[[NetworkRequest], Any]] = Registry("network", example="module:name of a function")
+register_network = NETWORKS.register
+
+
+def find_network(name: str) -> Callable[[NetworkRequest], Any]:
+    """Return the function that builds a network.
+
+    Raises:
+        ConfigError: There is no network of that name, or the registered object is not a function.
+    """
+    make = NETWORKS.find(name)
+    if not callable(make):
+        raise ConfigError(f"network {name!r} is a {type(make).__name__}, not a function of a NetworkRequest")
+    return make
+
+
+def make_policy(request: NetworkRequest) -> AbstractPolicy:
+    """Build the untrained policy of a preset.
+
+    A network that is not an :class:`~retrim.AbstractPolicy` becomes a :class:`~retrim.NetworkPolicy`.
+
+    Raises:
+        ConfigError: There is no such network, or it does not map an observation to four numbers.
+    """
+    name = request.preset.pretrain.network
+    network = find_network(name)(request)
+    if isinstance(network, AbstractPolicy):
+        return network
+    if not (isinstance(network, eqx.Module) and callable(network)):
+        raise ConfigError(f"network {name!r} gives a {type(network).__name__}, expected a callable equinox.Module")
+    observation = jax.ShapeDtypeStruct((request.size,), jnp.zeros(()).dtype)
+    try:
+        shape = jnp.shape(eqx.filter_eval_shape(network, observation))
+    except (TypeError, ValueError) as error:
+        raise ConfigError(
+            f"network {name!r} cannot be called with an observation of {request.size} numbers: "
+            f"{str(error).splitlines()[0]}"
+        ) from error
+    if shape != (4,):
+        raise ConfigError(f"network {name!r} returns an array of shape {shape}, expected (4,)")
+    return NetworkPolicy.create(network, request.vehicle)
+
+
+def _perceptron(request: NetworkRequest) -> AbstractPolicy:
+    policy: AbstractPolicy = untrained(request.size, request.vehicle, request.key, request.hidden_sizes)
+    return policy
+
+
+register_network("mlp", _perceptron)

@@ -1,0 +1,169 @@
+"""Hover relative to a goal that moves."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import random
+from jaxtyping import Array, Bool, Float, Key
+
+from ..errors import FrameError
+from ..physics.actuator_response import ActuatorState
+from ..physics.felt_frame import FeltFrame
+from ..physics.path_family import PathBelief
+from ..physics.state import STANDARD_GRAVITY, Command, State
+from .abstract_reference import Point
+from .flatness import flat_command
+from .hover import AbstractHover
+from .observation import AbstractObservation
+from .task import AbstractTask, Start
+
+M = TypeVar("M")
+GoalPath = Callable[[Float[Array, ""]], Float[Array, "3"]]
+"""Position of a goal [m], world, at a time [s]; three times differentiable by JAX."""
+
+
+class GoalObs(AbstractObservation[M]):
+    """Observation of the position and velocity relative to a goal that moves."""
+
+    inner: AbstractObservation[M]
+    """Observation of a hover task at the origin."""
+    path: GoalPath = eqx.field(static=True)
+    frame: FeltFrame | None = None
+    """Frame of the states; None for the world."""
+
+    @property
+    def size(self) -> int:
+        """Length of the observation inside."""
+        return self.inner.size
+
+    def init(self, x: State) -> M:
+        """Return the memory of the observation inside."""
+        return self.inner.init(x)
+
+    def __call__(self, memory: M, t: Float[Array, ""], x: State, last: Command) -> tuple[Float[Array, " o"], M]:
+        """Return the observation of the relative state."""
+        return self.inner(memory, t, relative_state(self.path, self.frame, t, x), last)
+
+    def with_belief(self, belief: PathBelief) -> "GoalObs[M]":
+        """Return the same observation with another belief about the vehicle."""
+        return dataclasses.replace(self, inner=self.inner.with_belief(belief))
+
+    def with_actuators(self, actuators: ActuatorState) -> "GoalObs[M]":
+        """Return the same observation with the present thrust and body rates."""
+        return dataclasses.replace(self, inner=self.inner.with_actuators(actuators))
+
+    def in_frame(self, frame: FeltFrame) -> "GoalObs[M]":
+        """Return the observation for states of ``frame``."""
+        return GoalObs(self.inner.in_frame(frame), self.path, _only(self.frame, frame))
+
+
+class MovingGoal(AbstractTask):
+    """A hover task around a goal that moves: its reward, bounds and error apply to the relative position and velocity.
+
+    The policy does not observe the acceleration of the goal. For accurate tracking of a fast trajectory, use a
+    reference (:class:`~retrim.tasks.track.AbstractTrack`).
+    """
+
+    inner: AbstractHover
+    """Hover task whose goal is the origin."""
+    path: GoalPath = eqx.field(static=True)
+    frame: FeltFrame | None = None
+    """Frame of the states; None for the world."""
+
+    @property
+    def dt(self) -> float:
+        """Control tick [s]."""
+        return self.inner.dt
+
+    @property
+    def horizon(self) -> int:
+        """Number of ticks of one training roll-out."""
+        return self.inner.horizon
+
+    @property
+    def observation(self) -> AbstractObservation[Any]:
+        """Observation of the relative state."""
+        return GoalObs(self.inner.observation, self.path, self.frame)
+
+    @property
+    def observation_in_flight(self) -> AbstractObservation[Any]:
+        """Observation of the relative state in flight."""
+        return GoalObs(self.inner.observation_in_flight, self.path, self.frame)
+
+    def home(self) -> Float[Array, "3"]:
+        """Return the first position of the goal [m]."""
+        return self.target(jnp.zeros_like(self.inner.goal[0]))
+
+    def target(self, t: Float[Array, ""]) -> Float[Array, "3"]:
+        """Return the position of the goal at time ``t`` [s]."""
+        p = self.path(t)
+        return p if self.frame is None else self.frame.vector(p)
+
+    def wanted(self, t: Float[Array, ""]) -> Point:
+        """Return position, derivatives and command of the goal at time ``t`` [s]; its heading is zero."""
+        one = jnp.ones_like(t)
+
+        def velocity(t: Float[Array, ""]) -> Float[Array, "3"]:
+            v: Array = jax.jvp(self.target, (t,), (one,))[1]
+            return v
+
+        def acceleration(t: Float[Array, ""]) -> Float[Array, "3"]:
+            a: Array = jax.jvp(velocity, (t,), (one,))[1]
+            return a
+
+        a, jerk = jax.jvp(acceleration, (t,), (one,))
+        none = jnp.zeros_like(t)
+        thrust = a + jnp.array([0.0, 0.0, STANDARD_GRAVITY], dtype=a.dtype)
+        return Point(self.target(t), velocity(t), flat_command(thrust, jerk, none, none), none, a, jerk, none)
+
+    def reset(self, key: Key[Array, ""]) -> Start:
+        """Draw a time and a start of the hover task relative to the goal at that time."""
+        k_time, k_start = random.split(key)
+        start = self.inner.reset(k_start)
+        t = self.flight_seconds * random.uniform(k_time, (), start.t.dtype)
+        p, v = jax.jvp(self.path, (t,), (jnp.ones_like(t),))
+        return Start(t, State(start.x.p + p, start.x.R, start.x.v + v))
+
+    def reward(self, t: Float[Array, ""], x: State, u: Command) -> Float[Array, ""]:
+        """Return the reward of the hover task for the relative state."""
+        return self.inner.reward(t, self._relative(t, x), u)
+
+    def terminated(self, t: Float[Array, ""], x: State) -> Bool[Array, ""]:
+        """Return whether the vehicle is outside the box around the goal, or its state is not finite."""
+        return self.inner.terminated(t, self._relative(t, x))
+
+    def error(self, t: Float[Array, ""], x: State) -> Float[Array, ""]:
+        """Return the distance from the goal [m]."""
+        return self.inner.error(t, self._relative(t, x))
+
+    def in_frame(self, frame: FeltFrame) -> "MovingGoal":
+        """Return the same task for states and commands of ``frame``."""
+        return MovingGoal(self.inner.in_frame(frame), self.path, _only(self.frame, frame))
+
+    def _relative(self, t: Float[Array, ""], x: State) -> State:
+        return relative_state(self.path, self.frame, t, x)
+
+
+def relative_state(path: GoalPath, frame: FeltFrame | None, t: Float[Array, ""], x: State) -> State:
+    """Return a state relative to a moving goal.
+
+    Args:
+        path: Path of the goal.
+        frame: Frame of the state; None for the world.
+        t: Time [s].
+        x: State.
+    """
+    p, v = jax.jvp(path, (t,), (jnp.ones_like(t),))
+    if frame is not None:
+        p, v = frame.vector(p), frame.vector(v)
+    return State(x.p - p, x.R, x.v - v)
+
+
+def _only(before: FeltFrame | None, frame: FeltFrame) -> FeltFrame:
+    if before is not None:
+        raise FrameError("a moving goal cannot be transformed into a frame twice")
+    return frame
