@@ -15,7 +15,7 @@ class Evolution(retrim.OnlineLearner):
 
         def update(w, given):
             x0, noise = given
-            cost = lambda w: retrim.policy_loss(state.policy.with_params(tree(w)).merged(), env, x0)  # noqa: E731
+            cost = lambda w: retrim.policy_loss(state.policy.with_params(tree(w)).merged(), env, x0)
             uphill = jax.vmap(lambda e: cost(w + e) - cost(w - e))(noise) @ noise
             return w - self.length * uphill / (1e-9 + jax.numpy.linalg.norm(uphill)), None
 
@@ -23,4 +23,4 @@ class Evolution(retrim.OnlineLearner):
         return retrim.PolicyState(state.policy.with_params(tree(w)), state.optimiser)
 
 
-make = lambda request: request.create(Evolution)  # noqa: E731
+make = lambda request: request.create(Evolution)
