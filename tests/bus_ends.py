@@ -8,12 +8,12 @@ from typing import NamedTuple
 
 import pytest
 
-from retrim.evaluation.latency import free_port, rosmaster
 from retrim.transport.bus import Bus
 from retrim.transport.in_process import InProcessBus
 from retrim.transport.remote import Address
 from retrim.transport.shared_key import SharedKey
 from retrim.transport.shared_memory import SharedMemoryBus
+from retrim_paper.latency import free_port, rosmaster
 
 LOCAL, NETWORK = ("in process", "shared memory"), ("zenoh", "zenoh, signed", "ros")
 

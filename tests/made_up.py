@@ -6,7 +6,7 @@ import numpy as np
 
 from retrim import Log, Scenario
 from retrim.evaluation.gathering import Flights
-from retrim.evaluation.tables.study import Study
+from retrim.evaluation.study import Study
 from retrim.runkit import Flight, FlightSpec
 from retrim.runkit.reporter import Silent
 from retrim.runtime.flight import States

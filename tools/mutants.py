@@ -33,11 +33,13 @@ from coverage import CoverageData
 
 ROOT = Path(__file__).parent.parent
 PLACE = ROOT / "build" / "mutants"
+PAPER = "retrim_paper"
 TESTS = {
     "adapt": ("tests/adapt", "tests/runtime", "tests/control", "tests/test_house"),
     "runtime": ("tests/runtime", "tests/plants", "tests/test_house"),
     "config": ("tests/config", "tests/runtime", "tests/io", "tests/plants", "tests/test_house"),
-    "evaluation": ("tests/evaluation", "tests/cli", "tests/test_house"),
+    "evaluation": ("tests/evaluation", "tests/paper", "tests/cli", "tests/test_house"),
+    PAPER: ("tests/paper", "tests/cli", "tests/test_house"),
 }
 REACH, BESIDE = 300.0, 60.0  # [s] of tests that run for one fault: of those that reach it, and of others of its room
 SWAPS: dict[type, type] = {
@@ -74,7 +76,8 @@ class Mutant(NamedTuple):
     @property
     def room(self) -> str:
         """Name of its package."""
-        return self.path.relative_to(ROOT / "src/retrim").parts[0]
+        package, room, *_ = self.path.relative_to(ROOT / "src").parts
+        return room if package == "retrim" else PAPER
 
 
 def main() -> None:
@@ -87,7 +90,7 @@ def main() -> None:
     parser.add_argument("--again", action="store_true", help="believe what the last run found of who reaches what")
     parser.add_argument("--out", type=Path, default=PLACE / "results.json", help="file for the results")
     chosen = parser.parse_args()
-    everything = [m for room in chosen.rooms for path in sorted((ROOT / "src/retrim" / room).rglob("*.py"))
+    everything = [m for room in chosen.rooms for path in sorted(folder_of(room).rglob("*.py"))
                   for m in mutants(path)]  # fmt: skip
     sample = random.Random(chosen.seed).sample(everything, min(chosen.count, len(everything)))
     if not chosen.again:
@@ -107,12 +110,17 @@ def main() -> None:
     sys.exit(share < 0.9)
 
 
+def folder_of(room: str) -> Path:
+    """Return the folder of a package."""
+    return ROOT / "src" / (PAPER if room == PAPER else f"retrim/{room}")
+
+
 def watch() -> None:
     """Run the suite once, and write down which test reaches which line, and how long each takes."""
     shutil.rmtree(PLACE, ignore_errors=True)
     PLACE.mkdir(parents=True)
     environment = {**os.environ, "COVERAGE_FILE": str(PLACE / "reached")}
-    command = [sys.executable, "-m", "pytest", "-m", "not slow", "--cov=retrim", "--cov-context=test", "--cov-report=",
+    command = [sys.executable, "-m", "pytest", "-m", "not slow", "--cov=retrim", "--cov=retrim_paper", "--cov-context=test", "--cov-report=",
                f"--junitxml={PLACE / 'times.xml'}"]  # fmt: skip
     if subprocess.run(command, cwd=ROOT, env=environment, check=False).returncode > 1:
         raise SystemExit("the suite could not be run")

@@ -175,7 +175,7 @@ def test_what_was_adapted_flies_as_it_is_and_the_default_folder_is_a_new_one_und
 def test_demo_at_reduced_size(folder, monkeypatch):
     from retrim.config import named_presets as presets
     from retrim.config.loading import changed, overlaid
-    from retrim.evaluation import demo
+    from retrim_paper import demo
 
     small = overlaid(presets.PRESETS["hover/retrim"], folder / "small.toml")
     monkeypatch.setitem(presets.PRESETS, "hover/retrim", small)

@@ -8,10 +8,10 @@ import pytest
 from jax import random
 
 from retrim.control import Policy
-from retrim.control.datt import DattNet
 from retrim.control.policy import Policy as PolicyType
 from retrim.learn.residuals import EnsembleResidual
 from retrim.physics import large, small
+from retrim_paper.datt.controller import DattNet
 
 
 def size(tree):

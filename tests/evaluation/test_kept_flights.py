@@ -7,9 +7,9 @@ import pytest
 from helpers import brief_preset
 from made_up import Watching
 from retrim import Scenario, Setup
+from retrim.evaluation.kept_flights import FLIGHTS, forget_flights
 from retrim.evaluation.packed_flights import packed, unpacked
-from retrim.evaluation.tables.kept_flights import FLIGHTS, forget_flights
-from retrim.evaluation.tables.study import Study, fly_all
+from retrim.evaluation.study import Study, fly_all
 from retrim.runkit import Run, provenance
 from retrim.runkit.reporter import Silent
 

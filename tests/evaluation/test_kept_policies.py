@@ -6,9 +6,9 @@ import pytest
 
 from helpers import tiny_preset
 from retrim import load_policy
-from retrim.evaluation.tables import kept_policies
-from retrim.evaluation.tables.kept_policies import trained_policies
-from retrim.evaluation.tables.study import train_all
+from retrim.evaluation import kept_policies
+from retrim.evaluation.kept_policies import trained_policies
+from retrim.evaluation.study import train_all
 from retrim.runkit import Run, provenance
 from retrim.runkit.reporter import Silent
 from retrim.runkit.training import Trained

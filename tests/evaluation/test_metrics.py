@@ -10,9 +10,9 @@ from made_up import DT, flight, log
 from retrim import Scenario
 from retrim.evaluation import rows
 from retrim.evaluation.metrics import cell, interval, mean_and_deviation, metres
-from retrim.evaluation.tables.beside import figures_table
 from retrim.runkit import FlightSpec
 from retrim.runtime.flight import States
+from retrim_paper.tables.beside import figures_table
 
 
 def test_the_error_is_over_the_last_seconds_and_no_others():

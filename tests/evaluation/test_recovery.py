@@ -9,9 +9,9 @@ import pytest
 from commands import retrim
 from helpers import brief_preset
 from retrim.config import named_presets as presets
-from retrim.config.conditions import conditions
-from retrim.evaluation.tables.gauntlet import METRICS
 from retrim.runkit.recovery import change_times, recoveries
+from retrim_paper.conditions import conditions
+from retrim_paper.tables.gauntlet import METRICS
 
 HOME = jnp.array([0.0, 0.0, 1.0])
 

@@ -12,11 +12,10 @@ from commands import OVERLAY, results, retrim, started
 from helpers import brief_preset
 from made_up import flight
 from retrim import ConfigError, Fleet, Scenario, Setup
-from retrim.evaluation import sweep
+from retrim.evaluation import kept_policies, sweep
 from retrim.evaluation.gathering import Flights
 from retrim.evaluation.metrics import record
 from retrim.evaluation.sweep import Sweep, read_sweep, run_sweep
-from retrim.evaluation.tables import kept_policies
 from retrim.runkit import FlightSpec, Run, provenance
 from retrim.runkit.reporter import Silent
 

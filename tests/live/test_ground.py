@@ -13,7 +13,6 @@ from live_processes import HOME, DrillPlan, level
 from retrim.config import PRESETS, changed
 from retrim.config.loading import dump
 from retrim.errors import ConfigError, MessageError, PlantError
-from retrim.evaluation.latency import free_port as unused_port
 from retrim.live import ground, remote_learners
 from retrim.live.events import LiveEvents
 from retrim.live.ground import Ground, learn_for
@@ -30,6 +29,7 @@ from retrim.transport.message import pack_arrays
 from retrim.transport.remote import Address
 from retrim.transport.session import FOREIGN, MISSING, UNSIGNED
 from retrim.transport.shared_key import SharedKey
+from retrim_paper.latency import free_port as unused_port
 
 SECONDS = 3.0
 KEY, OTHER = SharedKey(b"k" * 32), SharedKey(b"o" * 32)

@@ -9,12 +9,12 @@ import pytest
 
 from peers import peer
 from retrim import PlantError, Scenario, testing
-from retrim.evaluation.latency import rosmaster
 from retrim.onboard.guard import Mode
 from retrim.onboard.recorder import read_log
 from retrim.plants.bridges import ros
 from retrim.plants.bridges.ros_link import attitude_target
 from retrim.testing.vehicle import HEADING
+from retrim_paper.latency import rosmaster
 
 pytestmark = pytest.mark.slow
 RETRIM = [sys.executable, "-m", "retrim.cli"]

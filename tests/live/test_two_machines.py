@@ -7,7 +7,7 @@ from contextlib import ExitStack
 
 import pytest
 
-from retrim.evaluation.latency import free_port, rosmaster, two_machines
+from retrim_paper.latency import free_port, rosmaster, two_machines
 
 pytestmark = pytest.mark.slow
 RETRIM = [sys.executable, "-m", "retrim.cli"]

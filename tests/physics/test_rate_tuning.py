@@ -9,7 +9,6 @@ import pytest
 from jax import lax
 
 from retrim.config import PRESETS, VehicleSpec
-from retrim.config.conditions import conditions
 from retrim.config.vehicles import PUBLISHED, make_vehicle
 from retrim.physics import Command, State
 from retrim.physics.bem import BemQuadrotor
@@ -18,6 +17,7 @@ from retrim.physics.effects import ExternalEffects
 from retrim.physics.rate_tuning import Gains, is_damped, tuned
 from retrim.physics.rotors import LinearDragQuadrotor
 from retrim.physics.step_response import step_responses
+from retrim_paper.conditions import conditions
 
 SIZES = {
     "0.035 kg": (0.035, (1.7e-5, 1.7e-5, 2.9e-5), 0.0325, 0.6, 1.9),

@@ -13,11 +13,11 @@ import pytest
 from bus_ends import LOCAL, NETWORK, arrived, network, two_ends
 from live_processes import answer, write_for_ever
 from retrim.errors import ConfigError, MessageError
-from retrim.evaluation.latency import free_port
 from retrim.transport import ros
 from retrim.transport.network import NetworkBus
 from retrim.transport.remote import Address
 from retrim.transport.shared_memory import SharedMemoryBus
+from retrim_paper.latency import free_port
 
 TOPICS = {"a": 100, "b.c": 100, "there": 100, "back": 100, "nothing": 100, "again": 100, "big": 200_000}
 

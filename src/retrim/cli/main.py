@@ -6,7 +6,8 @@ Modules of commands are imported only when they are needed, so that --help is fa
 import os
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from importlib.metadata import entry_points
 
 from ..signals import stopped_by
 
@@ -14,31 +15,46 @@ PACKAGE = __name__.rpartition(".")[0]
 COMMANDS = {
     "pretrain": "Train a policy from scratch in the nominal model and save it.",
     "fly": "Fly a policy on a plant, as it is and adapting as it flies.",
-    "demo": "The whole loop: pretrain, fly, adapt; a table and pictures.",
     "sweep": "Presets x scenarios x seeds from a TOML file, to one table and one picture.",
-    "reproduce": "Make a table of the paper again: hover, track, fast, vision, reversing, ...",
     "live": "Fly against the clock and learn at the same time, in processes of their own.",
     "learn": "Learn for a live flight on another machine.",
     "replay": "Read a flight log: what the model missed, how well it is foretold; identify, adapt.",
     "export": "Write a policy as NPZ, ONNX or C, for a computer without JAX.",
-    "gauntlet": "A policy under everything that changes, at hover or on references: recovery, steady and worst error.",
     "bench": "How long each piece of work takes on this machine.",
     "doctor": "Versions, device and cache, and known faults of dependencies.",
 }
-WIDTH = max(map(len, COMMANDS)) + 2
-HELP = "\n".join(
-    [
-        "usage: retrim COMMAND [--help] [options]",
-        "",
-        "Re-train neural flight policies in seconds, in flight.",
-        "",
-        *(f"  {name:<{WIDTH}}{text}" for name, text in COMMANDS.items()),
-        "",
-        "  --version, --help",
-        "",
-        "Ctrl-C, SIGTERM or a closed terminal (SIGHUP) stops a command and keeps what is done.",
-    ]
-)
+GROUP = "retrim.commands"
+"""Entry points of other packages that add commands: dictionaries from a name to help and module."""
+
+
+def commands() -> dict[str, tuple[str, str]]:
+    """Return help and module of every command, by name."""
+    found = {name: (about, f"{PACKAGE}.{name}") for name, about in COMMANDS.items()}
+    for entry in entry_points(group=GROUP):
+        found |= entry.load()
+    return found
+
+
+def describe(known: Mapping[str, tuple[str, str]]) -> str:
+    """Return the help of the command line.
+
+    Args:
+        known: Help and module of every command, by name.
+    """
+    width = max(map(len, known)) + 2
+    return "\n".join(
+        [
+            "usage: retrim COMMAND [--help] [options]",
+            "",
+            "Re-train neural flight policies in seconds, in flight.",
+            "",
+            *(f"  {name:<{width}}{about}" for name, (about, _) in known.items()),
+            "",
+            "  --version, --help",
+            "",
+            "Ctrl-C, SIGTERM or a closed terminal (SIGHUP) stops a command and keeps what is done.",
+        ]
+    )
 
 
 def main(words: Sequence[str] | None = None) -> None:
@@ -57,24 +73,25 @@ def main(words: Sequence[str] | None = None) -> None:
 
 def _run(words: list[str]) -> int:
     if not words or words[0] in ("--help", "-h"):
-        print(HELP)
+        print(describe(commands()))
         return 0 if words else 2
     if words[0] == "--version":
         from importlib.metadata import version
 
         print(f"retrim {version('retrim')}")
         return 0
-    if words[0] not in COMMANDS:
+    known = commands()
+    if words[0] not in known:
         import difflib
 
-        near = difflib.get_close_matches(words[0], COMMANDS, n=1)
+        near = difflib.get_close_matches(words[0], known, n=1)
         hint = f"did you mean {near[0]!r}? " if near else ""
-        print(f"retrim: no command {words[0]!r}; {hint}there are {', '.join(COMMANDS)}", file=sys.stderr)
+        print(f"retrim: no command {words[0]!r}; {hint}there are {', '.join(known)}", file=sys.stderr)
         return 2
     stop = threading.Event()
     try:
         with stopped_by(stop):
-            return _command(words[0], words[1:], stop)
+            return _command(words[0], *known[words[0]], words[1:], stop)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130
@@ -83,7 +100,7 @@ def _run(words: list[str]) -> int:
         return 1
 
 
-def _command(name: str, words: list[str], stop: threading.Event) -> int:
+def _command(name: str, about: str, module: str, words: list[str], stop: threading.Event) -> int:
     import importlib
 
     import tyro
@@ -94,13 +111,13 @@ def _command(name: str, words: list[str], stop: threading.Event) -> int:
     from .console import console, refuse
 
     compile_for(name)
-    command = importlib.import_module(f".{name}", PACKAGE)
+    command = importlib.import_module(module)
     try:
         if hasattr(command, "COMMANDS"):
             call = tyro.extras.subcommand_cli_from_dict(
                 {n: tyro.conf.configure(tyro.conf.AvoidSubcommands)(f) for n, f in command.COMMANDS.items()},
                 prog=f"retrim {name}",
-                description=COMMANDS[name],
+                description=about,
                 args=words,
             )
         else:

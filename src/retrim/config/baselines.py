@@ -13,13 +13,11 @@ from jax import random
 from jaxtyping import Array, Key
 
 from ..control.controller import AbstractController
-from ..control.datt import Datt, DattNet
 from ..control.geometric import Gains, Geometric
 from ..control.indi import Incremental
 from ..control.mppi import Mppi
 from ..estimation.l1 import L1Estimator
 from ..estimation.prediction import Prediction
-from ..learn.datt import KNOWN
 from ..physics.actuator_response import ActuatorResponse
 from ..physics.command_path import CommandPath
 from ..tasks.occluded import OccludedKeypoints
@@ -31,8 +29,6 @@ if TYPE_CHECKING:
 INTEGRAL_LIMIT = 6.0  # [m/s^2]: same as the largest disturbance that the observer of the policies compensates
 HORIZON = 0.8  # [s]: horizon of MPPI
 L1_POLE = -0.2  # [1/s], as in the hardware flights of DATT; its size matters little if it is small compared to 1 / dt
-
-DATT_ESTIMATOR = 0.5  # [s]: time constant of the filter; the DATT authors use 2 s
 
 Settings = Mapping[str, float]
 
@@ -128,15 +124,6 @@ def _mppi(setup: "Setup", s: Settings, key: Key[Array, ""]) -> Mppi:
         jnp.array(s["velocity"]),
         jnp.array(s["attitude"]),
         horizon=round(HORIZON / dt),
-    )
-
-
-def datt_of(setup: "Setup", net: DattNet) -> Datt:
-    """Return the controller of a trained DATT network."""
-    dt, vehicle = setup.preset.dt, setup.vehicle
-    estimator = L1Estimator(jnp.array(L1_POLE), jnp.exp(jnp.array(-dt / DATT_ESTIMATOR)), dt)
-    return Datt(
-        net, setup.flown, prediction_of(setup), estimator, jnp.array(KNOWN), vehicle.command_min, vehicle.command_max
     )
 
 

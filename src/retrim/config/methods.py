@@ -11,10 +11,8 @@ from jaxtyping import Array, Key
 
 from ..adapt.learner_state import LearnerState
 from ..control.controller import AbstractController
-from ..control.datt import DattNet
 from ..control.integral import IntegralAction
 from ..control.lora import LoraPolicy
-from ..control.passive import Passive
 from ..control.policy import AbstractPolicy
 from ..control.seen_pose import SeenPose
 from ..errors import ConfigError
@@ -22,10 +20,9 @@ from ..plants.plant import Plant
 from ..runtime.pilot import ControllerPilot, Pilot
 from ..tasks.keypoints import Keypoints
 from ..tasks.occluded import OccludedKeypoints
-from .baselines import BASELINES, Baseline, datt_of
+from .baselines import BASELINES, Baseline
 from .families import identify_vehicle, policy_controller, track_actuators
 from .learners import check_frame, felt_frame
-from .on_board import raptor
 from .registry import Registry
 
 if TYPE_CHECKING:
@@ -176,18 +173,6 @@ def _without_policy(name: str, baseline: Baseline, request: MethodRequest) -> Pi
     return ControllerPilot(request.by_state(baseline.controller(request.setup, request.key), name))
 
 
-def _datt(request: MethodRequest) -> Pilot:
-    if not isinstance(request.policy, DattNet):
-        raise ConfigError("method 'datt' flies a network of its own: `retrim reproduce hover --methods datt` trains it")
-    return ControllerPilot(request.by_state(datt_of(request.setup, request.policy), "datt"))
-
-
-def _raptor(request: MethodRequest) -> Pilot:
-    if isinstance(request.setup.env.task.observation, Keypoints):
-        raise ConfigError("method 'raptor' needs the measured state; a policy that sees keypoints is shown none")
-    return ControllerPilot(Passive())
-
-
 def _full(request: MethodRequest) -> Pilot:
     return request.setup.adaptive_pilot(request.policy, request.needed_key(), request.latency, request.state)
 
@@ -207,7 +192,5 @@ register_method("base-do", MethodEntry(_gravity_frame, "base policy + disturbanc
 register_method("base-id", MethodEntry(_identified, "base policy + observer + identification"))
 for _name, _baseline in BASELINES.items():
     register_method(_name, MethodEntry(partial(_without_policy, _name, _baseline), _baseline.label))
-register_method("datt", MethodEntry(_datt, "DATT"))
-register_method("raptor", MethodEntry(_raptor, "RAPTOR", on_board=raptor))
 register_method("full", MethodEntry(_full, "**adapted, all weights**", learns=_all_weights))
 register_method("lora", learning_method("**adapted, LoRA**", _low_rank))

@@ -28,10 +28,10 @@ from ..viz.panels import bars
 from ..viz.plots import save
 from .fleet import Fleet
 from .gathering import told_by
+from .kept import files_behind, named_by, named_in
+from .kept_policies import trained_policies
 from .limits import check_seeds
 from .metrics import EFFORT, Rows, cell, failed_record, metres, record, summary
-from .tables.kept import files_behind, named_by, named_in
-from .tables.kept_policies import trained_policies
 
 STRICT = ConfigDict(extra="forbid")
 GROUP = ("preset", "plant", "vehicle", "sensors", "reference", "disturbance", "method")

@@ -19,6 +19,8 @@ EXTRAS = ("rotorpy", "mujoco", "crazyflow", "foundation-policy")
 """Optional packages that some flights use."""
 UNKNOWN = "unknown"
 """Substitute for the commit if the package is not in a checkout."""
+FOLDERS = ("retrim", "retrim_paper")
+"""Folders of the distribution."""
 PACKAGE = ("src", "pyproject.toml")
 """Paths of a checkout that belong to the package."""
 
@@ -47,9 +49,9 @@ def commit() -> str:
 
 @functools.cache
 def code() -> str:
-    """Return a digest of the files of this package; it depends on the code only, not on commits or installation."""
-    here, digest = Path(__file__).resolve().parents[1], hashlib.sha256()
-    for path in sorted(here.rglob("*")):
+    """Return a digest of the files of this distribution; it does not depend on commits or installation."""
+    here, digest = Path(__file__).resolve().parents[2], hashlib.sha256()
+    for path in sorted(path for folder in FOLDERS for path in (here / folder).rglob("*")):
         if path.is_file() and "__pycache__" not in path.parts:
             digest.update(f"{path.relative_to(here).as_posix()}\0{path.stat().st_size}\0".encode() + path.read_bytes())
     return digest.hexdigest()[:12]

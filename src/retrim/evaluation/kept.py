@@ -1,0 +1,76 @@
+"""Stores the finished sections of a run in its folder, so that the same command resumes after a kill."""
+
+import dataclasses
+import hashlib
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from ..config.presets import Preset
+from ..config.scenario import Scenario
+from ..runkit.document import TableSection
+from ..runkit.run import PARTS, Run
+
+
+def keep(run: Run, key: str, section: TableSection, rows: list[dict[str, Any]]) -> None:
+    """Write a section and the rows behind it to the folder of the run."""
+    drawn = None if section.picture is None else {section.picture.name: digest_of(section.picture)}
+    whole = dataclasses.asdict(section) | {"picture": drawn}
+    run.write_text(f"{PARTS}/{key}.json", json.dumps({"section": whole, "rows": rows}) + "\n")
+
+
+def kept(run: Run, key: str) -> tuple[TableSection, list[dict[str, Any]]] | None:
+    """Return a section that an earlier run has finished in this folder, with its rows; None if it is not there.
+
+    It is also None if another run has overwritten the picture of the section, which is then made again.
+    """
+    path = run.folder / PARTS / f"{key}.json"
+    if not path.is_file():
+        return None
+    try:
+        found = json.loads(path.read_text())
+        whole, rows = found["section"], found["rows"]
+        drawn = {run.folder / name: digest for name, digest in (whole["picture"] or {}).items()}
+        if any(digest_of(path) != digest for path, digest in drawn.items()):
+            return None
+        lines = tuple(tuple(row) for row in whole["rows"])
+        section = TableSection(tuple(whole["columns"]), lines, whole["title"], whole["about"], next(iter(drawn), None))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return None  # it is made again
+    run.taken_over += 1
+    return section, rows
+
+
+def files_behind(*names: str | None) -> dict[str, str]:
+    """Return digests of the files that names refer to: CSV files, and the modules of ``module:name``.
+
+    Args:
+        *names: Names of any kind, and sums of names. Their modules must have been imported.
+    """
+    found = dict[str, str]()
+    for part in (part for name in names if name for part in name.split("+")):
+        head = part.partition(":")[0].partition("=")[0]
+        path = Path(getattr(sys.modules.get(head) if ":" in part else None, "__file__", None) or head)
+        if path.is_file():
+            found[part] = digest_of(path)
+    return found
+
+
+def named_in(preset: Preset) -> list[str | None]:
+    """Return the names in a preset that may refer to a file."""
+    trained_on = None if preset.track is None else preset.track.reference
+    vehicle = preset.vehicle if isinstance(preset.vehicle, str) else None
+    learning = (preset.adapt.residual, preset.adapt.learner, preset.adapt.optimiser, preset.pretrain.network)
+    return [preset.task, *learning, trained_on, vehicle]
+
+
+def named_by(scenario: Scenario) -> list[str | None]:
+    """Return the names in a scenario that may refer to a file."""
+    vehicle = scenario.vehicle if isinstance(scenario.vehicle, str) else None
+    return [scenario.plant, scenario.sensors, scenario.disturbance, scenario.reference, vehicle]
+
+
+def digest_of(path: Path) -> str:
+    """Return a digest of a file."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:16]

@@ -1,0 +1,127 @@
+"""Common steps of all tables: check the options, train the policies, fly them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from jax import random
+
+from ..config.loading import load_for
+from ..config.presets import Preset
+from ..config.scenario import Scenario
+from ..config.setup import Setup
+from ..control.policy import AbstractPolicy
+from ..errors import JobError
+from ..runkit.reporter import Reporter
+from ..runkit.run import Run
+from ..runkit.training import nominal_error
+from .fleet import Fleet
+from .gathering import Flights, told_by
+from .kept_flights import KeptFlights
+from .kept_policies import trained_policies
+from .limits import check_flights, check_seeds
+
+
+@dataclass(frozen=True)
+class Study:
+    """Policies of one preset, one per seed."""
+
+    preset: Preset
+    policies: dict[int, Any]
+    errors: tuple[float, ...]
+    """Error of each policy in its own model [m]."""
+
+    def about(self) -> str:
+        """Return one sentence on the policies."""
+        own = ", ".join(f"{1000 * error:.1f}" for error in self.errors)
+        return f"Preset `{self.preset.name}`; error in its own model, by seed: {own} mm."
+
+
+def table_presets(
+    names: Sequence[str], task: str, *, seeds: Sequence[int], starts: int, seconds: float | None
+) -> list[Preset]:
+    """Load the presets of a table, and check its sizes before anything is trained.
+
+    Raises:
+        ConfigError: A preset does not exist or is for another task, or a size is out of range.
+    """
+    check_seeds(seeds)
+    check_flights(starts, seconds)
+    return [load_for(task, name) for name in names]
+
+
+def train_all(preset: Preset, seeds: Sequence[int], run: Run, reporter: Reporter) -> Study:
+    """Train a policy for each seed, or read it from the run; after an interruption return the completed ones."""
+    setup, policies, errors = Setup.from_preset(preset), dict[int, AbstractPolicy](), list[float]()
+    for seed, policy in trained_policies(preset, seeds, run, reporter).items():
+        if run.interrupted:
+            break
+        with run.interruptible():
+            errors.append(nominal_error(setup, policy))
+            policies[seed] = policy
+    return Study(preset, policies, tuple(errors))
+
+
+def refuse_misfits(
+    preset: Preset, scenarios: Sequence[Scenario], *, methods: Sequence[str], starts: int, seconds: float | None
+) -> None:
+    """Plan the flights of a table with a policy that has not been trained.
+
+    Raises:
+        ConfigError: A name does not exist, or two settings are incompatible.
+        PlantError: The package of a plant is not installed.
+    """
+    for scenario in scenarios:
+        scenario.make(preset.vehicle, dt=preset.dt)
+    untrained = Setup.from_preset(preset).new_policy(random.key(0))
+    Fleet(preset, untrained, scenarios, methods=methods, starts=starts, seconds=seconds)
+
+
+def fly_all(
+    study: Study,
+    scenarios: Sequence[Scenario],
+    run: Run,
+    reporter: Reporter,
+    *,
+    methods: Sequence[str] = ("base", "full"),
+    starts: int,
+    seconds: float | None,
+    keep: bool = True,
+) -> Flights:
+    """Fly every combination, with progress.
+
+    Args:
+        study: Policies to fly.
+        scenarios: Scenarios of the flights.
+        run: Its folder stores the flights; flights that an earlier run has stored there are not repeated.
+        reporter: Receives progress.
+        methods: Methods of the flights.
+        starts: Flights per scenario, method and seed.
+        seconds: Length of a flight [s]; the task's own by default.
+        keep: Store the flights until the table removes them; their learner states are not stored.
+
+    Raises:
+        PlantError: The package of a plant is not installed.
+        JobError: Flights failed in another process; an incomplete table is not written.
+    """
+    if not study.policies or run.interrupted:
+        return Flights([], interrupted=True)
+    fleet = Fleet(study.preset, study.policies, scenarios, methods=methods, starts=starts, seconds=seconds)
+    kept = KeptFlights(run, fleet) if keep else None
+    earlier = {} if kept is None else kept.earlier
+    left = [spec for spec in fleet.specs if spec not in earlier]
+    if earlier:
+        reporter.say(f"{len(earlier)} of {len(fleet.specs)} flights: as an earlier run of this folder has flown them")
+    flights = Flights([], interrupted=bool(left))
+    if left:
+        with run.interruptible(), reporter.progress("flying") as advance:
+            advance(0.0, "compiling the programs of a flight (kept in a cache for the next time)")
+            landed = None if kept is None else kept.landed
+            flights = fleet.run(
+                run.executor, stop=run.stop, progress=told_by(advance), landed=landed, only=left, by_lot=True
+            )
+    if flights.failed:
+        why = next(iter(flights.failed.values()))
+        raise JobError(f"{len(flights.failed)} of {len(fleet.specs)} flights failed elsewhere, the first by {why}")
+    flown = earlier | {flight.spec: flight for flight in flights.flown}
+    return replace(flights, flown=[flown[spec] for spec in fleet.specs if spec in flown])

@@ -1,0 +1,17 @@
+"""The paper "Learning on the Fly" with retrim: its tables, ablations, learned baselines and the demonstration.
+
+retrim never imports this package. It finds the commands and the methods ``datt`` and ``raptor`` by entry points.
+"""
+
+COMMANDS = {
+    "demo": ("The whole loop: pretrain, fly, adapt; a table and pictures.", "retrim_paper.cli.demo"),
+    "reproduce": (
+        "Make a table of the paper again: hover, track, fast, vision, reversing, ...",
+        "retrim_paper.cli.reproduce",
+    ),
+    "gauntlet": (
+        "A policy under everything that changes, at hover or on references: recovery, steady and worst error.",
+        "retrim_paper.cli.gauntlet",
+    ),
+}
+"""Commands of the command line: help and module, by name."""

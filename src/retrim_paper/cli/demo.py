@@ -1,0 +1,49 @@
+"""``retrim demo``: pretraining, flight and adaptation in a minute."""
+
+import sys
+import threading
+import webbrowser
+from collections.abc import Callable
+from pathlib import Path
+
+from retrim.cli.console import RichReporter, console, show_paths, show_table, started
+from retrim.runkit.run import INTERRUPTED, Run
+
+from ..demo import demonstrate
+
+
+def demo(
+    preset: str = "hover/retrim",
+    plant: str = "simple",
+    seconds: float = 20.0,
+    starts: int = 8,
+    seed: int = 0,
+    slow: bool = True,
+    out: Path | None = None,
+) -> Callable[[threading.Event], int]:
+    """Pretrain a hover policy, push it, re-train it in flight, and fly a second quadrotor that is not known.
+
+    Args:
+        preset: hover/retrim and hover/fast train in seconds; hover/paper and hover/released take about a minute.
+        plant: simple: rotors with linear drag, the fastest; bem: blade-element rotors; the others are extras.
+        seconds: Length of a flight.
+        starts: Flights per disturbance and method, each from another start.
+        seed: Seed of training and flights.
+        slow: Whether the second quadrotor, with a slow rate loop, is flown.
+        out: Folder for the policy, results.json and the pictures; a new one under runs/ by default.
+    """
+
+    def ordered(stop: threading.Event) -> int:
+        run = started(Run("demo", out, stop=stop))
+        shown = demonstrate(preset, plant, run, RichReporter(), seconds=seconds, starts=starts, seed=seed, slow=slow)
+        if shown is None:
+            return INTERRUPTED
+        for table in shown.tables:
+            show_table(table)
+        console.print(run.watch.sentence())
+        show_paths(shown.pictures)
+        if shown.best in shown.pictures and sys.stdout.isatty():
+            webbrowser.open(shown.best.resolve().as_uri())
+        return run.exit_code
+
+    return ordered

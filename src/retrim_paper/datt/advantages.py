@@ -1,0 +1,43 @@
+"""Samples of PPO, and their generalised advantage estimates."""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from retrim.learn.problem import Outcome
+
+
+class Seen(NamedTuple):
+    """Samples, with leading axes of steps and environments."""
+
+    o: Float[Array, "... o"]
+    action: Float[Array, "... a"]
+    log_prob: Float[Array, "..."]
+    value: Float[Array, "..."]
+    outcome: Outcome
+    """Outcomes. The reward is scaled by 1 - gamma and includes the expected future reward of a truncated episode."""
+
+
+def advantages(seen: Seen, last: Float[Array, " envs"], discount: float, trace: float) -> Float[Array, "steps envs"]:
+    """Return the generalised advantage estimates (Schulman et al. 2016, Eq. 16).
+
+    Args:
+        seen: Samples; an episode that ends in one step does not continue in the next.
+        last: Value of the states after the last step.
+        discount: gamma.
+        trace: lambda.
+    """
+    over = seen.outcome.terminated | seen.outcome.truncated
+
+    def back(carry: Any, row: Any) -> tuple[Any, Array]:
+        later, value_later = carry
+        reward, over, value = row
+        goes_on = jnp.where(over, 0.0, discount)
+        advantage = reward + goes_on * value_later - value + goes_on * trace * later
+        return (advantage, value), advantage
+
+    rows = (seen.outcome.reward, over, seen.value)
+    found: Array = lax.scan(back, (jnp.zeros_like(last), last), rows, reverse=True)[1]
+    return found

@@ -1,0 +1,141 @@
+"""DATT (Huang et al. 2023): a policy that looks ahead along its reference and receives the disturbance.
+
+The implementation follows the description in the paper, with changes that improve it here: positions are relative to
+the reference, vectors are in the body frame, and the observation contains the state in which the command begins to act
+and the command that acts until then.
+"""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import random
+from jaxtyping import Array, Float, Key
+
+from retrim.control.controller import AbstractController
+from retrim.estimation.l1 import L1Estimator, L1State
+from retrim.estimation.prediction import Prediction, Underway
+from retrim.physics.state import STANDARD_GRAVITY, Command, State
+from retrim.tasks.task import AbstractTask
+
+AHEAD, APART = 10, 0.06  # number of reference points in the observation, and the time between them [s]
+OWN = 22  # numbers of the state: error, velocity, attitude, disturbance, acting command
+SIZE = OWN + 3 * AHEAD
+SCALE = (5.0, 3.0, 3.0, 1.0)  # scale of actions: [m/s^2], [rad/s]
+
+
+class DattNet(eqx.Module):
+    """Actor and critic with a shared encoder of the look-ahead: two convolutions along it, then three layers each."""
+
+    first: Float[Array, "3 3 8"]
+    """Kernel: three points, three coordinates, eight channels."""
+    first_bias: Float[Array, "8"]
+    second: Float[Array, "3 8 8"]
+    second_bias: Float[Array, "8"]
+    actor: eqx.nn.MLP
+    critic: eqx.nn.MLP
+    log_std: Float[Array, "4"]
+
+    @classmethod
+    def of(cls, *, key: Key[Array, ""], width: int = 64) -> "DattNet":
+        """Return a fresh network; its mean action is nearly zero, which is hover."""
+        k_first, k_second, k_actor, k_critic = random.split(key, 4)
+        seen = OWN + 8 * (AHEAD - 4)
+        actor = eqx.nn.MLP(seen, 4, width, 3, key=k_actor)
+        actor = eqx.tree_at(lambda m: m.layers[-1].weight, actor, 0.01 * actor.layers[-1].weight)
+        actor = eqx.tree_at(lambda m: m.layers[-1].bias, actor, jnp.zeros(4))
+        return cls(
+            random.normal(k_first, (3, 3, 8)) / 3.0,
+            jnp.zeros(8),
+            random.normal(k_second, (3, 8, 8)) / 24.0**0.5,
+            jnp.zeros(8),
+            actor,
+            eqx.nn.MLP(seen, "scalar", width, 3, key=k_critic),
+            jnp.full(4, -0.5, dtype=actor.layers[-1].bias.dtype),  # a weak type would compile the first update twice
+        )
+
+    def __call__(self, o: Float[Array, " o"]) -> tuple[Float[Array, "4"], Float[Array, ""]]:
+        """Return the mean action and the value of an observation of :func:`datt_observation`."""
+        ahead = jax.nn.relu(_along(o[OWN:].reshape(AHEAD, 3), self.first, self.first_bias))
+        seen = jnp.concatenate([o[:OWN], _along(ahead, self.second, self.second_bias).reshape(-1)])
+        return self.actor(seen), self.critic(seen)
+
+
+def _along(points: Float[Array, "n i"], kernel: Float[Array, "k i c"], bias: Float[Array, " c"]) -> Float[Array, "m c"]:
+    """Return a convolution along the points, as one product with a banded matrix, which is large for many samples."""
+    n, i = points.shape
+    k, _, c = kernel.shape
+    m = n - k + 1
+    banded = jnp.zeros((n, i, m, c), dtype=kernel.dtype)
+    for at in range(m):
+        banded = banded.at[at : at + k, :, at].set(kernel)
+    return (points.reshape(-1) @ banded.reshape(n * i, m * c)).reshape(m, c) + bias[None]
+
+
+def datt_observation(x: State, acting: Command, d: Float[Array, "3"], ahead: Float[Array, "n 3"]) -> Float[Array, " o"]:
+    """Return the observation of the policy.
+
+    Args:
+        x: State.
+        acting: Command at the actuators.
+        d: Disturbance, world [m/s^2].
+        ahead: Reference now and at the times ahead, world [m].
+    """
+    seen = (x.p[None] - ahead) @ x.R
+    acts = (acting.vector() - Command.hover().vector().astype(x.p.dtype)) / jnp.array(SCALE, dtype=x.p.dtype)
+    return jnp.concatenate([seen[0], x.v @ x.R, x.R.reshape(9), d @ x.R, acts, seen.reshape(-1)])
+
+
+def datt_command(action: Float[Array, "4"], low: Command, high: Command) -> Command:
+    """Return the command of an action, within the limits; an action of zero is hover."""
+    hover = jnp.array([STANDARD_GRAVITY, 0.0, 0.0, 0.0], dtype=action.dtype)
+    wanted = hover + jnp.array(SCALE, dtype=action.dtype) * action
+    return Command.of(wanted).within(low, high)
+
+
+class DattState(eqx.Module):
+    """Memory of the controller."""
+
+    underway: Underway
+    estimate: L1State
+    last: State
+    """State measured one tick ago."""
+
+
+class Datt(AbstractController[DattState]):
+    """The trained policy in flight, with the disturbance from an L1 estimator."""
+
+    net: DattNet
+    task: AbstractTask
+    """Task, which provides the reference."""
+    prediction: Prediction
+    estimator: L1Estimator
+    known: Float[Array, ""]
+    """Largest disturbance per axis in training [m/s^2]; the estimate is clipped to it."""
+    low: Command
+    high: Command
+
+    def with_age(self, age: float | Float[Array, ""]) -> "Datt":
+        """Return the same for measurements that are ``age`` old [s]."""
+        return dataclasses.replace(self, prediction=self.prediction.with_age(age))
+
+    def init(self, x: State) -> DattState:
+        """Return the memory at the start of a flight."""
+        return DattState(self.prediction.init(x), L1State.start(x), x)
+
+    def __call__(self, memory: DattState, t: Float[Array, ""], x: State) -> tuple[Command, DattState]:
+        """Evaluate the network once, for the state in which the command begins to act."""
+        thrust = self.prediction.thrust(memory.underway, memory.last.R, x.R)
+        estimate = self.estimator(memory.estimate, t, x, thrust)
+        d = jnp.clip(estimate.d_hat, -self.known, self.known)
+        soon, acting = self.prediction(memory.underway, x, estimate.d_hat)
+        times = t + self.prediction.path.delay.astype(t.dtype) + APART * jnp.arange(AHEAD, dtype=t.dtype)
+        ahead = jax.vmap(self.task.target)(times)
+        mean, _ = self.net(datt_observation(soon, acting, d, ahead))
+        u = datt_command(mean, self.low, self.high)
+        return u, DattState(self.prediction.issued(memory.underway, u), estimate, x)
+
+    def accepted(self, memory: DattState, u: Command) -> DattState:
+        """Remember the accepted command."""
+        return dataclasses.replace(memory, underway=self.prediction.accepted(memory.underway, u))

@@ -1,0 +1,132 @@
+"""Baselines that need training before a flight: DATT, by reinforcement learning."""
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import random
+
+from retrim.config.baselines import prediction_of
+from retrim.config.presets import Preset
+from retrim.config.setup import Setup
+from retrim.errors import ConfigError
+from retrim.evaluation.kept_trees import keep_tree, kept_tree
+from retrim.runkit.provenance import section_key
+from retrim.runkit.reporter import Reporter
+from retrim.runkit.run import Run
+
+from .controller import APART, DattNet
+from .ppo import PpoSettings, PpoState, ppo
+from .problem import DattProblem, discount, reference_bank
+
+DATT_STEPS = 20_000_000  # as in the paper
+DATT_PPO: dict[str, Any] = {"envs": 64, "steps": 256, "minibatches": 8, "epochs": 6, "learning_rate": 2e-3}
+DATT_TAG = 2**30 + 5  # folded into a seed: DATT shares no key with the policies
+PARTLY = ".partly"
+"""File name suffix of the state of an interrupted training."""
+KEEP_EVERY = 30.0
+"""Time between two saved states of a training [s]."""
+
+
+def check_steps(steps: int) -> None:
+    """Check the number of training steps.
+
+    Raises:
+        ConfigError: It is below one, or more than a computer can do in a day.
+    """
+    if not 1 <= steps <= 10**10:
+        raise ConfigError(f"--datt-steps {steps} must be between 1 and 10,000,000,000")
+
+
+def check_rival(preset: Preset) -> None:
+    """Check that the control period of a preset divides DATT's look-ahead step and is at most 20 ms.
+
+    Raises:
+        ConfigError: It does not, or is longer; the message names the preset.
+    """
+    apart = APART / preset.dt
+    if abs(apart - round(apart)) > 1e-6 or preset.dt > 0.02:
+        raise ConfigError(
+            f"preset {preset.name!r}: DATT looks ahead in steps of {APART} s, which must be whole control periods of "
+            f"20 ms or less, not of {1000 * preset.dt:g} ms"
+        )
+
+
+def steps_made(steps: int) -> int:
+    """Return the number of training steps for a request of ``steps``, rounded up to whole updates."""
+    settings = PpoSettings(**DATT_PPO)
+    return settings.updates(steps) * settings.envs * settings.steps
+
+
+def trained_datt(
+    preset: Preset, seeds: Sequence[int], run: Run, reporter: Reporter, *, steps: int = DATT_STEPS
+) -> dict[int, DattNet]:
+    """Return a network for each seed; those that ``run.trained`` has are not trained again.
+
+    Args:
+        preset: Vehicle, control period and declared lag.
+        seeds: Seeds of networks, references and episodes.
+        run: Its ``trained`` stores the networks, and the state of an interrupted training, which resumes from there.
+            After an interruption the incomplete seeds are missing in the result.
+        reporter: Receives progress.
+        steps: Number of training steps.
+    """
+    setup, nets = Setup.from_preset(preset), dict[int, DattNet]()
+    tau = prediction_of(setup).path.response.rate_lag[0]
+    about = {"steps": str(steps), "dt": str(preset.dt), "tau": f"{float(tau):.4f}", "vehicle": str(preset.vehicle)}
+    name = section_key(datt=about, precision=str(setup.vehicle.mass.dtype))
+    for seed in seeds:
+        if run.interrupted:
+            break
+        path = run.trained / f"datt_{name}_seed{seed}.safetensors"
+        key = random.fold_in(random.key(seed), DATT_TAG)
+        k_net, k_learn = random.split(key)
+        net: DattNet = eqx.filter_jit(DattNet.of)(key=k_net)
+        if (kept := kept_tree(path, net, kind="datt", reporter=reporter)) is not None:
+            nets[seed] = kept
+            continue
+        low, high = setup.vehicle.command_min, setup.vehicle.command_max
+        problem = DattProblem(jnp.asarray(reference_bank(seed, dt=preset.dt), low.c.dtype), tau, low, high, preset.dt)
+        settings = PpoSettings(discount=discount(preset.dt), **DATT_PPO)
+        state = _trained(problem, PpoState.of(problem, net, k_learn, settings), settings, steps, path, run, reporter)
+        if state is None:
+            break
+        keep_tree(path, state.net, kind="datt", about=about)
+        path.with_suffix(PARTLY).unlink(missing_ok=True)
+        nets[seed] = state.net
+    return nets
+
+
+def _trained(
+    problem: DattProblem, state: PpoState, settings: PpoSettings, steps: int, path: Path, run: Run, reporter: Reporter
+) -> PpoState | None:
+    """Train, from the saved state of an earlier run if there is one.
+
+    Return None if this run is interrupted, too; its state is then saved next to ``path``.
+    """
+    partly, updates = path.with_suffix(PARTLY), settings.updates(steps)
+    title = f"DATT, seed {path.stem.rpartition('_seed')[2]}"
+    if (kept := kept_tree(partly, state, kind="ppo", reporter=reporter)) is not None:
+        state = kept
+        reporter.say(f"{title}: goes on after {int(state.made)} of {updates} updates")
+    with run.interruptible(), reporter.progress(f"{title}, {steps:,} steps") as advance:
+        written = time.monotonic()
+        for after, told in ppo(problem, state, settings, steps=steps):
+            state = after
+            advance(int(state.made) / updates, f"reward {told['reward']:.3f}")
+            if run.interrupted:
+                break
+            if time.monotonic() - written > KEEP_EVERY:
+                keep_tree(partly, state, kind="ppo")
+                written = time.monotonic()
+    if run.interrupted:
+        keep_tree(partly, state, kind="ppo")
+        return None
+    return state
+
+
+RIVALS = {"datt": trained_datt}
+"""Training functions by method: they return the networks for a preset and seeds, which replace the policies."""

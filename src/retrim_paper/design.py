@@ -1,0 +1,168 @@
+"""The paper's design study (Sec. IV-C): which model is simulated, and which model the gradient flows through."""
+
+import functools
+import math
+import time
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+import optax
+from jax import random
+from jaxtyping import Array, Key
+
+from retrim.config.scenario import Scenario
+from retrim.config.setup import Setup
+from retrim.control.controller import PolicyController
+from retrim.control.policy import AbstractPolicy
+from retrim.learn.bptt import PolicyState
+from retrim.learn.env import Env
+from retrim.learn.pretrain import train_chunk
+from retrim.learn.residuals.ensemble import EnsembleResidual, EnsembleState, fit_ensemble
+from retrim.learn.residuals.targets import Targets, residual_targets
+from retrim.learn.window import Window
+from retrim.physics.dynamics import AbstractDynamics, Hybrid, PointMass, StraightThrough
+from retrim.physics.rotors import LinearDragQuadrotor
+from retrim.plants.sim import SimPlant
+from retrim.runtime.batched import stacked
+from retrim.runtime.flight import Log
+from retrim.runtime.pilot import ControllerPilot
+from retrim.runtime.together import fly_together
+
+PUSH, PLANT = "push-x=2", "bem"  # the paper's push: 2 m/s^2 along +x
+ROLLOUTS, ROLLOUT_S = 50, 3.0
+FIT_EPOCHS, POLICY_EPOCHS, ENVS = 200, 100, 100
+CHUNK = 10  # epochs of one program
+SCORED_S = 10.0  # [s]
+
+
+class Choice(NamedTuple):
+    """A way to simulate and to differentiate."""
+
+    rotors: bool
+    """Whether the model has rotors, thrust map, drag and rate controller, at 1 kHz; otherwise it is a point mass."""
+    own_gradient: bool
+    """Whether the gradient is that of the simulated model; otherwise it is the point mass's."""
+    backprop: bool
+    """Whether gradients flow through the residual, too."""
+
+
+CHOICES = {
+    "low fidelity, res-fwd": Choice(False, True, False),
+    "low fidelity, res-fwd + res-back": Choice(False, True, True),
+    "high fidelity, its own gradient, res-fwd": Choice(True, True, False),
+    "high fidelity, its own gradient, res-fwd + res-back": Choice(True, True, True),
+    "high fidelity, the gradient of low fidelity, res-fwd": Choice(True, False, False),
+    "high fidelity, the gradient of low fidelity, res-fwd + res-back": Choice(True, False, True),
+}
+
+
+class Trained(NamedTuple):
+    """Result of one choice."""
+
+    policy: AbstractPolicy
+    compile_s: float
+    epoch_s: list[float]
+    """Mean time of an epoch in each program that was run [s]."""
+    residual_rms: float
+    """Root mean square error of the residual fit [m/s^2]."""
+
+
+def flown(setup: Setup, policy: AbstractPolicy, n: int, seconds: float, seed: int) -> list[Log]:
+    """Fly a policy without learning from random starts, on the study's plant, as one batch."""
+    plants = [Scenario(PUSH, PLANT).make(setup.preset.vehicle, dt=setup.preset.dt) for _ in range(n)]
+    controller = PolicyController(setup.flown.observation_in_flight, policy)
+    return fly_together(
+        [plant for plant in plants if isinstance(plant, SimPlant)],
+        [ControllerPilot(controller) for _ in plants],
+        setup.flight_starts(n, seed),
+        ticks=round(seconds / setup.preset.dt),
+    )
+
+
+def design_dynamics(setup: Setup, residual: Any, choice: Choice) -> AbstractDynamics[Any]:
+    """Return the model of a choice, for simulation and for the gradient.
+
+    Args:
+        setup: Vehicle and control period.
+        residual: Residual that was fitted to the simulated model.
+        choice: Way to simulate and to differentiate.
+    """
+    simple = PointMass(setup.preset.dt)
+    forward = Hybrid(_nominal(setup, choice), residual, backprop=choice.backprop)
+    if choice.own_gradient:
+        return forward
+    return StraightThrough(forward, Hybrid(simple, residual, backprop=True) if choice.backprop else simple)
+
+
+def retrained(setup: Setup, policy: AbstractPolicy, logs: Sequence[Log], key: Key[Array, ""], choice: Choice, *,
+              fit_epochs: int = FIT_EPOCHS, epochs: int = POLICY_EPOCHS, envs: int = ENVS) -> Trained:  # fmt: skip
+    """Fit one residual network to flights, and re-train the policy with it.
+
+    Args:
+        setup: Preset of the policy.
+        policy: Policy that training starts from.
+        logs: Logs of the flights.
+        key: Random key; consumed.
+        choice: Way to simulate and to differentiate.
+        fit_epochs: Epochs of the residual network.
+        epochs: Epochs of the policy; a multiple of ten.
+        envs: Roll-outs per epoch.
+    """
+    k_fit, k_train = random.split(key)
+    nominal = _nominal(setup, choice)
+    windows = stacked([log.window(len(log.t) - 1) for log in logs])
+    rows = _rows(windows, nominal, setup.preset.plant_delay_ticks)
+    adapt = setup.preset.adapt
+    adam = _adam(adapt.fit_learning_rate)
+    residual = EnsembleResidual.of(setup.flown.home(), setup.vehicle.omega_max, key=k_fit, members=1)
+    fitted, errors = _fitted(EnsembleState.of(residual, adam), rows, adam, fit_epochs)
+    dynamics = design_dynamics(setup, fitted.residual, choice)
+    env = Env(dynamics, setup.env.task, setup.env.delay, longest_delay=setup.env.longest_delay)
+    optimiser = _of_policy(adapt.learning_rate, adapt.max_grad_norm or math.inf, epochs)
+    state = PolicyState(policy, optimiser.init(policy.params))
+    times = list[float]()
+    for k in random.split(k_train, 1 + epochs // CHUNK):  # the first one compiles, and is not kept
+        began = time.perf_counter()
+        after, _ = jax.block_until_ready(train_chunk(state, env, k, optimiser, CHUNK, envs))
+        times.append(time.perf_counter() - began)
+        state = after if len(times) > 1 else state
+    run = float(np.median(times[1:]))
+    return Trained(state.policy.merged(), times[0] - run, [t / CHUNK for t in times[1:]], float(errors[-1]) ** 0.5)
+
+
+def _nominal(setup: Setup, choice: Choice) -> AbstractDynamics[Any]:
+    dt = setup.preset.dt
+    return LinearDragQuadrotor.of(setup.vehicle, dt, thrust_error=0.0) if choice.rotors else PointMass(dt)
+
+
+@functools.cache
+def _adam(learning_rate: float) -> optax.GradientTransformation:
+    """Return Adam, the same object for the same rate, so that programs with it are compiled once."""
+    return optax.adam(learning_rate)
+
+
+@functools.cache
+def _of_policy(learning_rate: float, max_grad_norm: float, epochs: int) -> optax.GradientTransformation:
+    """Return the optimiser of the policy, cached so that its programs are compiled once.
+
+    The preset's gradient clipping, then Adam with a rate that falls to zero, as in updates in flight.
+    """
+    rate = optax.cosine_decay_schedule(learning_rate, epochs)
+    return optax.chain(optax.clip_by_global_norm(max_grad_norm), optax.adam(rate))
+
+
+@eqx.filter_jit
+def _rows(windows: Window, nominal: AbstractDynamics[Any], delay_ticks: int) -> Targets:
+    """Return the targets of many windows (leading axis), concatenated."""
+    many = jax.vmap(lambda window: residual_targets(window, nominal, delay_ticks=delay_ticks))(windows)
+    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), many)  # type: ignore[no-any-return]
+
+
+@eqx.filter_jit
+def _fitted(
+    state: EnsembleState, rows: Targets, optimiser: optax.GradientTransformation, steps: int
+) -> tuple[EnsembleState, Array]:
+    return fit_ensemble(state, rows, optimiser=optimiser, steps=steps, spectral_weight=1e-3)

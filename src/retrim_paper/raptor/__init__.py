@@ -1,0 +1,1 @@
+"""RAPTOR, a learned baseline: a published recurrent policy that commands the motors."""

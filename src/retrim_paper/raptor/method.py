@@ -1,0 +1,42 @@
+"""RAPTOR as a flight method: it commands the motors of the plant ``bem``, instead of its rate controller."""
+
+import dataclasses
+
+from retrim.config.methods import MethodEntry, MethodRequest
+from retrim.config.setup import Setup
+from retrim.errors import ConfigError
+from retrim.physics.bem import BemQuadrotor
+from retrim.plants.plant import Plant
+from retrim.plants.sim import SimPlant
+from retrim.runtime.pilot import ControllerPilot, Pilot
+from retrim.tasks.keypoints import Keypoints
+
+from .passive import Passive
+from .plant import RaptorNet, RaptorQuadrotor
+
+
+def add_raptor(setup: Setup, plant: Plant) -> SimPlant:
+    """Return a plant whose vehicle is controlled by RAPTOR, along the reference of a set-up.
+
+    Raises:
+        ConfigError: The plant does not support motor commands, or has sensors, which RAPTOR does not use.
+        PlantError: The package with the RAPTOR network is not installed.
+    """
+    if not isinstance(plant, SimPlant) or not isinstance(plant.simulation.model, BemQuadrotor):
+        raise ConfigError("method 'raptor' commands motors, which plant 'bem' alone has: fly it there")
+    if plant.simulation.sensors is not None:
+        raise ConfigError(
+            "method 'raptor' reads the state on board, without noise or delay: fly it with sensors 'ideal'"
+        )
+    model = RaptorQuadrotor(plant.simulation.model, RaptorNet.load(), setup.flown.wanted)
+    plant.simulation = dataclasses.replace(plant.simulation, model=model)
+    return plant
+
+
+def _pilot(request: MethodRequest) -> Pilot:
+    if isinstance(request.setup.env.task.observation, Keypoints):
+        raise ConfigError("method 'raptor' needs the measured state; a policy that sees keypoints is shown none")
+    return ControllerPilot(Passive())
+
+
+entry = MethodEntry(_pilot, "RAPTOR", on_board=add_raptor)

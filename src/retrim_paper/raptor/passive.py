@@ -1,0 +1,23 @@
+"""The controller of a vehicle that flies itself."""
+
+from jaxtyping import Array, Float
+
+from retrim.control.controller import AbstractController
+from retrim.physics.felt_frame import FeltFrame
+from retrim.physics.state import Command, State
+
+
+class Passive(AbstractController[tuple[()]]):
+    """Commands hover for every state, since the vehicle has its own controller on board."""
+
+    def init(self, x: State) -> tuple[()]:
+        """Return an empty memory."""
+        return ()
+
+    def __call__(self, memory: tuple[()], t: Float[Array, ""], x: State) -> tuple[Command, tuple[()]]:
+        """Return u_hover."""
+        return Command.hover(x.p.dtype), memory
+
+    def in_frame(self, frame: FeltFrame) -> "Passive":
+        """Return itself, since hover is the same in every frame."""
+        return self

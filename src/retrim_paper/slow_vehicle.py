@@ -1,0 +1,128 @@
+"""Second part of the demonstration: a quadrotor with a rate loop of 100 ms, which no method knows."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from retrim.config.methods import find_method
+from retrim.config.presets import Preset
+from retrim.config.scenario import Scenario
+from retrim.config.setup import Setup
+from retrim.config.vehicle_file import VehicleSpec
+from retrim.evaluation.figures import picture
+from retrim.evaluation.metrics import metres, rows
+from retrim.evaluation.study import Study, fly_all
+from retrim.physics.vehicle import small
+from retrim.runkit.document import TableSection
+from retrim.runkit.flights import Flight
+from retrim.runkit.reporter import Reporter
+from retrim.runkit.run import Run
+from retrim.runkit.training import train
+
+from .tables.hidden import PUSHED
+
+UPDATES = 200  # a fifth of the preset's training: less agile, and trained in ten seconds
+SECONDS = 10.0
+PUSH = "early-step"  # 2 m/s^2 per axis from 4 s on
+DELAY = 0.03  # [s]
+FIGURE = "One quadrotor with a rate loop of 100 ms, which no method knows"
+LABELS = {"base": "policy for a faster vehicle", "indi": "INDI", "base-id": "policy for many vehicles"}
+
+
+def slow_quadrotor() -> VehicleSpec:
+    """Return a quadrotor like the small one, with body rates that lag by 100 ms (yaw: 200 ms)."""
+    like = small()
+    inertia, rates, drag = (tuple(np.asarray(each).tolist()) for each in (like.inertia, like.omega_max, like.drag_area))
+    return VehicleSpec(
+        name="slow rate loop",
+        mass=float(like.mass),
+        inertia=(inertia[0], inertia[1], inertia[2]),
+        arm=(float(like.arm[0]), float(like.arm[1])),
+        thrust_max=float(like.thrust_max),
+        rates_max=(rates[0], rates[1], rates[2]),
+        motor_tau=float(like.motor_tau),
+        drag_area=(drag[0], drag[1], drag[2]),
+        rate_lag=(0.1, 0.1, 0.2),
+        rate_damping=(0.8, 0.8, 0.8),
+        command_delay=DELAY,
+    )
+
+
+class Entrant(NamedTuple):
+    """A method of the comparison."""
+
+    study: Study
+    method: str
+    vehicle: str
+    """Knowledge of the method about the vehicle."""
+
+
+class SlowVehicle(NamedTuple):
+    """Results of the comparison."""
+
+    table: TableSection
+    rows: list[dict[str, Any]]
+    pictures: list[Path]
+
+
+def fly_slow_vehicle(
+    known: Study, family: Preset, run: Run, reporter: Reporter, *, starts: int, seed: int
+) -> SlowVehicle | None:
+    """Fly a quadrotor with a slow rate loop: a policy for another vehicle, INDI, and a policy for many vehicles.
+
+    Args:
+        known: Policy for one vehicle.
+        family: Preset of a policy for many vehicles; it is trained here.
+        run: Run whose folder receives the picture.
+        reporter: Receives lines and progress.
+        starts: Flights per method.
+        seed: Seed of training, starts and flights.
+
+    Returns:
+        Table, rows and pictures; None if the run was interrupted.
+    """
+    scenario = Scenario(PUSH, plant="second-order", vehicle=slow_quadrotor(), delay=DELAY)
+    reporter.say(f"a second quadrotor: body rates lag by 100 ms, commands by {1000 * DELAY:.0f} ms; no method knows it")
+    setup = Setup.from_preset(family)
+    policy, _ = train(setup, seed, reporter=reporter, stop=run.stop)
+    if run.interrupted:
+        return None
+    many = Study(family, {seed: policy}, ())
+    told = replace(known, preset=replace(known.preset, vehicle=slow_quadrotor()))
+    entrants = (
+        Entrant(known, "base", "not known"),
+        Entrant(known, "indi", "not known"),
+        Entrant(told, "indi", "known"),
+        Entrant(many, "base-id", "identified in flight"),
+    )
+    flights = [_fly(each, scenario, run, reporter, starts) for each in entrants]
+    if run.interrupted or not all(flights):
+        return None
+    lines = [_line(each, own) for each, own in zip(entrants, flights, strict=True)]
+    columns = ("method", "vehicle", "lost", "error, last 2 s [m]", "peak after the push [m]")
+    title = f"One quadrotor with a rate loop of 100 ms, a push of 2 m/s² per axis at 4 s, {starts} starts"
+    shown = [flight for each, own in zip(entrants, flights, strict=True) if each.vehicle != "known" for flight in own]
+    drawn = picture(shown, setup, scenario, run.folder, stem="slow_vehicle", title=FIGURE, labels=LABELS)
+    found = [
+        row | {"preset": each.study.preset.name, "vehicle_known": each.vehicle}
+        for each, own in zip(entrants, flights, strict=True)
+        for row in rows(own)
+    ]
+    return SlowVehicle(TableSection(columns, tuple(lines), title), found, drawn)
+
+
+def _fly(each: Entrant, scenario: Scenario, run: Run, reporter: Reporter, starts: int) -> list[Flight]:
+    return fly_all(
+        each.study, [scenario], run, reporter, methods=(each.method,), starts=starts, seconds=SECONDS, keep=False
+    ).flown
+
+
+def _line(each: Entrant, flights: Sequence[Flight]) -> tuple[str, ...]:
+    left = [flight for flight in flights if not flight.log.terminated]
+    peak = metres(max(float(np.max(flight.error[flight.log.t >= PUSHED])) for flight in left)) if left else "-"
+    error = metres(float(np.mean([flight.steady for flight in left]))) if left else "-"
+    label = find_method(each.method).label
+    return label, each.vehicle, f"{len(flights) - len(left)} of {len(flights)}", error, peak

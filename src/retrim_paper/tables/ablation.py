@@ -1,0 +1,144 @@
+"""Ablation: each component removed from our preset and added to the paper's, next to control without learning."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, Literal
+
+import numpy as np
+
+from retrim.config.loading import changed, dump, load
+from retrim.config.presets import Adapt, Preset
+from retrim.config.scenario import Scenario
+from retrim.evaluation.kept import keep, kept
+from retrim.evaluation.kept_flights import forget_flights
+from retrim.evaluation.limits import check_flights, check_seeds
+from retrim.evaluation.metrics import cell
+from retrim.evaluation.study import Study, fly_all, train_all
+from retrim.runkit.document import Document, TableSection
+from retrim.runkit.flights import Flight
+from retrim.runkit.provenance import section_key
+from retrim.runkit.reporter import Reporter
+from retrim.runkit.run import Run
+
+from ..levers import CONTROL, OFF, ON, Lever
+
+Task = Literal["hover", "track"]
+DISTURBANCES = {"hover": ("none", "large", "step", "gusts", "pickup"), "track": ("none", "large", "gusts")}
+REFERENCES: dict[str, tuple[str | None, ...]] = {"hover": (None,), "track": ("circle", "figure8")}
+INTRO = """\
+Made by `retrim reproduce ablation`. Mean error after 5 s of flight [m]: mean ± standard deviation over training seeds
+and starts; the error after a change of the world counts, and not only the error at the end. Small quadrotor on
+plant `bem`, ideal sensors. Learning is charged to flight time by fixed latencies. A setting of pretraining has its own
+policies."""
+
+
+def ablation(
+    run: Run,
+    reporter: Reporter,
+    *,
+    task: Task = "hover",
+    seeds: tuple[int, ...] = (0,),
+    seconds: float = 24.0,
+    starts: int = 8,
+) -> None:
+    """Effect of each component: removed from our preset, added to the paper's, next to control without learning.
+
+    Args:
+        run: Folder of ablation_hover.md or ablation_track.md, and of its JSON file. The same command resumes after a
+            kill.
+        reporter: Receives progress and the sections.
+        task: hover or track.
+        seeds: Training seeds; each also seeds the starts, the gusts and the learners of its flights.
+        seconds: Length of a flight [s].
+        starts: Flights per disturbance, component and seed.
+    """
+    check_seeds(seeds)
+    check_flights(starts, seconds)
+    document = Document(run, f"ablation_{task}", f"Ablation: {task}", INTRO, seeds, reporter)
+    studies = dict[str, Study]()
+    for name, levers in ((f"{task}/retrim", (*CONTROL, *OFF[task])), (f"{task}/paper", (*CONTROL, *ON[task]))):
+        lines, found = list[tuple[str, ...]](), list[dict[str, Any]]()
+        for lever in levers:
+            if run.interrupted:
+                break
+            preset = changed(load(name), **lever.changes)
+            key = section_key(
+                table="ablation", preset=dump(preset), lever=lever.label, method=lever.method, seeds=list(seeds),
+                seconds=seconds, starts=starts,
+            )  # fmt: skip
+            if (made := kept(run, key)) is not None:
+                reporter.say(f"{name}: {lever.label.strip('*')}, as an earlier run of this folder has made it")
+            else:
+                reporter.say(f"{name}: {lever.label.strip('*')}")
+                made = _flown(preset, lever, task, studies, document, starts=starts, seconds=seconds)
+                if not run.interrupted:
+                    keep(run, key, *made)
+                    forget_flights(run)
+            if not run.interrupted:
+                lines += made[0].rows
+            found += made[1]
+        columns = tuple(
+            each if reference is None else f"{reference}, {each}"
+            for reference in REFERENCES[task]
+            for each in DISTURBANCES[task]
+        )
+        document.add(TableSection(("lever", *columns), tuple(lines), f"Preset {name}"), found)
+    document.write()
+
+
+def _flown(
+    preset: Preset,
+    lever: Lever,
+    task: Task,
+    studies: dict[str, Study],
+    document: Document,
+    *,
+    starts: int,
+    seconds: float,
+) -> tuple[TableSection, list[dict[str, Any]]]:
+    """Fly one component under all disturbances; return its line of the table, and the rows behind it."""
+    run, reporter = document.run, document.reporter
+    cells, found = list[str](), list[dict[str, Any]]()
+    for reference in REFERENCES[task]:
+        study = _study(_follows(preset, reference), studies, document.seeds, run, reporter)
+        scenarios = [Scenario(each, reference=reference) for each in DISTURBANCES[task]]
+        methods = (lever.method,)
+        flights = fly_all(study, scenarios, run, reporter, methods=methods, starts=starts, seconds=seconds)
+        for scenario in scenarios:
+            group = [flight for flight in flights.flown if flight.spec.scenario == scenario]
+            if group:
+                found.append(_row(group, preset.name, lever))
+                cells.append(cell(found[-1], digits=4))
+    return TableSection((), ((lever.label, *cells),)), found
+
+
+def _follows(preset: Preset, reference: str | None) -> Preset:
+    """Return the preset of a policy for ``reference``; a policy without preview is trained on this reference."""
+    if reference is None or preset.track is None or preset.track.looks_ahead:
+        return preset
+    return changed(preset, track={"reference": reference})
+
+
+def _study(preset: Preset, studies: dict[str, Study], seeds: Sequence[int], run: Run, reporter: Reporter) -> Study:
+    """Return the policies of a preset; presets with the same training share them."""
+    key = dump(replace(preset, adapt=Adapt()))
+    if key not in studies:
+        studies[key] = train_all(preset, seeds, run, reporter)
+    return replace(studies[key], preset=preset)
+
+
+def _row(flights: Sequence[Flight], preset: str, lever: Lever) -> dict[str, Any]:
+    errors = np.array([flight.late for flight in flights])
+    whole, scenario = errors[np.isfinite(errors)], flights[0].spec.scenario
+    return {
+        "preset": preset,
+        "lever": lever.label.strip("*"),
+        "method": lever.method,
+        "metric": "late",
+        "disturbance": scenario.disturbance,
+        "reference": scenario.reference,
+        "mean": float(whole.mean()) if len(whole) else None,
+        "std": float(whole.std(ddof=1)) if len(whole) > 1 else None,
+        "n": len(errors),
+        "crashes": len(errors) - len(whole),
+    }

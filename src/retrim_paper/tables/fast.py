@@ -1,0 +1,58 @@
+"""Fast flight: references at the limits of a vehicle, in wind."""
+
+import re
+
+from retrim.config.presets import Preset
+from retrim.config.scenario import Scenario
+from retrim.evaluation.study import table_presets
+from retrim.runkit.document import Document
+from retrim.runkit.reporter import Reporter
+from retrim.runkit.run import Run
+
+from .levels import Levels, fly_levels
+
+INTRO = """\
+Made by `retrim reproduce fast`. Mean distance from the present point of the reference [m], over the last 10 s: mean ±
+standard deviation over flights. In step: after the best constant shift in time. Cross-track: distance from the
+nearest point of the lap. `circle=8`: a top speed of 8 m/s, on a circle as large as the vehicle's acceleration needs;
+`star=1.5`: so fast through its corners, too, which no vehicle can fly. A file is a loop that training never saw;
+`race.csv` comes with the examples. The wind is steady. Learning is charged to flight time by the preset's
+fixed latencies. The paper has no such table."""
+LEVELS = {"none": "no disturbance", "wind=4": "wind of 4 m/s", "large": "large, 2 m/s² per axis"}
+
+
+def fast(
+    run: Run,
+    reporter: Reporter,
+    *,
+    preset: str = "track/fast",
+    references: tuple[str, ...] = ("circle=8", "figure8=8", "star=1.5"),
+    methods: tuple[str, ...] = ("base", "base-i", "base-do", "geometric-i", "indi", "full", "lora"),
+    seeds: tuple[int, ...] = (0,),
+    seconds: float = 60.0,
+    starts: int = 8,
+    plant: str = "bem",
+) -> None:
+    """References at the limits of the vehicle, undisturbed, in wind and under a large push.
+
+    Args:
+        run: Folder of fast.md, fast.json and the pictures.
+        reporter: Receives progress and the sections.
+        preset: Preset to train and fly, on its own vehicle.
+        references: Shapes with a top speed [m/s], and CSV files.
+        methods: Methods of the flights.
+        seeds: Training seeds.
+        seconds: Length of a flight [s].
+        starts: Flights per disturbance, method and seed.
+        plant: Plant of the flights.
+    """
+    (loaded,) = table_presets([preset], "track", seeds=seeds, starts=starts, seconds=seconds)
+    sections = [_section(loaded, reference, plant, methods) for reference in references]
+    document = Document(run, "fast", "Fast flight", INTRO, seeds, reporter)
+    fly_levels(document, sections, starts=starts, seconds=seconds)
+
+
+def _section(preset: Preset, reference: str, plant: str, methods: tuple[str, ...]) -> Levels:
+    stem = "fast_" + re.sub(r"[^A-Za-z0-9]+", "-", reference).strip("-")
+    scenario = Scenario(plant=plant, reference=reference)
+    return Levels(reference, preset, scenario, stem, methods, levels=LEVELS)

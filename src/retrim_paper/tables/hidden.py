@@ -1,0 +1,296 @@
+"""The gauntlet of hidden vehicles: one policy for many vehicles that it does not know."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from retrim.config.hidden_vehicles import HiddenVehicle, draw_vehicles
+from retrim.config.loading import load_for
+from retrim.config.methods import find_method
+from retrim.config.scenario import Scenario
+from retrim.errors import ConfigError
+from retrim.evaluation.kept_flights import forget_flights
+from retrim.evaluation.limits import check_flights, check_seeds
+from retrim.evaluation.metrics import metres
+from retrim.evaluation.study import Study, fly_all, refuse_misfits, train_all
+from retrim.runkit.document import Document, TableSection
+from retrim.runkit.flights import Flight
+from retrim.runkit.recovery import recoveries
+from retrim.runkit.reporter import Reporter
+from retrim.runkit.run import Run
+from retrim.viz import plots
+from retrim.viz.vehicle_map import vehicle_map
+
+MOST_VEHICLES = 10_000
+PUSHED = 4.0  # [s], time of the push in hover
+AFTER = 5.0  # [s] after the push: the error is scored for one second from here on
+SPUN_UP = 5.0  # [s]: tracking errors are scored from here on, when the reference has its own speed
+INTRO = """\
+Made by `retrim gauntlet --vehicles hidden{option}`: {count} vehicles, drawn from one size factor (seed {seed}), from
+30 g to 3 kg: lag of the body rates 15 to 150 ms (second order, damping ratio 0.4 to 1.2), command delay 0 to 60 ms,
+thrust lag 10 to 80 ms, thrust gain 0.6 to 1.6, and at full command 1.4 times the weight or more. Plant `second-order`,
+{sensors} sensors. Vehicle "not known": the method receives no vehicle file. Vehicle "known": the method receives the
+true mass, limits, delay and lags, but not the thrust gain. lost: flights that left the bounds. {metrics} Cells: median
+over all flights, 95th percentile, and worst; a lost flight counts as infinite (∞)."""
+
+
+@dataclass(frozen=True)
+class Course:
+    """A flight of every vehicle."""
+
+    title: str
+    stem: str
+    """Name of the figure."""
+    disturbance: str
+    seconds: float
+    reference: str | None = None
+
+
+@dataclass(frozen=True)
+class Scoring:
+    """Figures of a flight; the first one colours the map."""
+
+    columns: Mapping[str, str]
+    """Heading of each figure in tables, by its name."""
+    score: Callable[[Flight], Mapping[str, float]]
+    colour: str
+    """Label of the colour scale."""
+    about: str
+
+
+def _hover_scores(flight: Flight) -> dict[str, float]:
+    t, error, lost = flight.log.t, flight.error, flight.log.terminated
+    return {
+        "error_m": np.inf if lost else float(np.mean(error[t >= PUSHED + AFTER - 1e-6])),
+        "to_10cm_s": recoveries(t, error, [PUSHED], 0.1, terminated=lost)[0],
+        "to_2cm_s": recoveries(t, error, [PUSHED], 0.02, terminated=lost)[0],
+        "peak_m": np.inf if lost else float(np.max(error[t >= PUSHED])),
+    }
+
+
+def _track_scores(flight: Flight) -> dict[str, float]:
+    if flight.log.terminated:
+        return {"rmse_m": np.inf, "peak_m": np.inf}
+    error = flight.error[flight.log.t >= SPUN_UP]
+    return {"rmse_m": float(np.sqrt(np.mean(error**2))), "peak_m": float(np.max(error))}
+
+
+HOVER = Course("Hover, a push of 2 m/s² per axis at 4 s", "hidden", "early-step", PUSHED + AFTER + 1.0)
+COURSES: dict[str, tuple[Course, ...]] = {
+    "hover": (HOVER,),
+    "track": (
+        Course("Figure-8 of 10 s", "hidden_10s", "none", 25.0, "lissajous=0.8886"),
+        Course("Figure-8 of 5.5 s", "hidden_5.5s", "none", 25.0, "lissajous"),
+    ),
+}
+SCORINGS = {
+    "hover": Scoring(
+        {"error_m": "error [m]", "to_10cm_s": "to 10 cm [s]", "to_2cm_s": "to 2 cm [s]", "peak_m": "peak [m]"},
+        _hover_scores,
+        "error 5 s after the push [m], worst flight",
+        "error: mean from 5 to 6 s after the push. to 10 cm, to 2 cm: time after the push until the error stays below; "
+        "infinite where it never does. peak: largest error after the push.",
+    ),
+    "track": Scoring(
+        {"rmse_m": "RMSE [m]", "peak_m": "peak [m]"},
+        _track_scores,
+        "root mean square error [m], worst flight",
+        "Figure-8 of 2 m x 1 m, without a disturbance. RMSE: root mean square error from 5 s on, and its mean over the "
+        "flights that were not lost. peak: largest error from 5 s on.",
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Entrant:
+    """A preset and a method of the benchmark."""
+
+    preset: str
+    method: str
+    told: bool = False
+    """Whether the method receives a vehicle file with the true numbers."""
+
+    @property
+    def label(self) -> str:
+        """Name in tables and figures."""
+        return f"{self.method}, vehicle known" if self.told else f"{self.preset} {self.method}"
+
+
+OPPONENTS = ("base", "base-do", "geometric-i", "indi")
+ENTRANTS: dict[str, tuple[Entrant, ...]] = {
+    task: (
+        *(Entrant(f"{task}/retrim", method) for method in OPPONENTS),
+        Entrant(f"{task}/retrim", "indi", told=True),
+        *(Entrant(f"{task}/any", method) for method in ("base", "base-do", "base-id")),
+    )
+    for task in COURSES
+}
+
+
+def entrants_of(task: str, preset: str, methods: Sequence[str]) -> tuple[Entrant, ...]:
+    """Return the entrants of a command: those of the published page, or the methods of one preset.
+
+    Args:
+        task: Task of the preset.
+        preset: Name of a preset, or a file.
+        methods: Methods to fly; empty for the published ones.
+
+    Raises:
+        ConfigError: There is no such benchmark for the task.
+    """
+    if task not in COURSES:
+        raise ConfigError(f"preset {preset!r} is for {task}; hidden vehicles are flown for {', '.join(COURSES)}")
+    return tuple(Entrant(preset, method) for method in methods) if methods else ENTRANTS[task]
+
+
+def fly_hidden(
+    run: Run,
+    reporter: Reporter,
+    *,
+    task: str,
+    entrants: Sequence[Entrant],
+    count: int,
+    draw: int,
+    seeds: tuple[int, ...],
+    starts: int,
+    sensors: str,
+) -> None:
+    """Fly hidden vehicles, and write ``hidden.md``, ``results.json`` and a map for each course.
+
+    Args:
+        run: Folder of the results.
+        reporter: Receives progress and the tables.
+        task: Task of the entrants: hover or track.
+        entrants: Presets and methods.
+        count: Number of vehicles.
+        draw: Seed of the vehicles.
+        seeds: Training seeds.
+        starts: Flights per vehicle, method and training seed.
+        sensors: Name of a sensor model.
+
+    Raises:
+        ConfigError: A name does not exist, or the parts do not fit together. Raised before training.
+    """
+    if not 1 <= count <= MOST_VEHICLES:
+        raise ConfigError(f"count must be 1 to {MOST_VEHICLES} vehicles, got {count}")
+    courses, scoring = COURSES[task], SCORINGS[task]
+    check_seeds(seeds)
+    check_flights(starts, courses[0].seconds)
+    vehicles = draw_vehicles(count, draw)
+    presets = {name: load_for(task, name) for name in dict.fromkeys(each.preset for each in entrants)}
+    for entrant in entrants:
+        first = [_scenario(course, vehicles[0], sensors) for course in courses]
+        methods = (entrant.method,)
+        refuse_misfits(presets[entrant.preset], first, methods=methods, starts=starts, seconds=courses[0].seconds)
+    option = "" if task == "hover" else f" --preset {task}/retrim"
+    intro = INTRO.format(count=count, seed=draw, sensors=sensors, option=option, metrics=scoring.about)
+    document = Document(run, "hidden", "Hidden vehicles", intro, seeds, reporter, data="results")
+    studies = {name: train_all(preset, seeds, run, reporter) for name, preset in presets.items()}
+    about = " ".join(study.about() for study in studies.values())
+    for course in courses:
+        found = list[dict[str, Any]]()
+        for entrant in entrants:
+            if run.interrupted:
+                break
+            reporter.say(f"{course.title}: {entrant.label}, {count} vehicles")
+            flights = _fly(studies[entrant.preset], entrant, course, vehicles, run, reporter, starts, sensors)
+            found += [_row(entrant, course, vehicles, flight, scoring) for flight in flights]
+        if found:
+            document.add(_section(found, entrants, course, scoring, vehicles, run, about), found)
+    document.write()
+    if not run.interrupted:
+        forget_flights(run)
+
+
+def _scenario(course: Course, vehicle: HiddenVehicle, sensors: str) -> Scenario:
+    return vehicle.scenario(course.disturbance, sensors=sensors, reference=course.reference)
+
+
+def _fly(
+    study: Study,
+    entrant: Entrant,
+    course: Course,
+    vehicles: Sequence[HiddenVehicle],
+    run: Run,
+    reporter: Reporter,
+    starts: int,
+    sensors: str,
+) -> list[Flight]:
+    """Return the flights of all vehicles by one entrant."""
+    scenarios = [_scenario(course, vehicle, sensors) for vehicle in vehicles]
+    options: dict[str, Any] = {"methods": (entrant.method,), "starts": starts, "seconds": course.seconds}
+    if not entrant.told:
+        return fly_all(study, scenarios, run, reporter, **options).flown
+    flights = list[Flight]()
+    for vehicle, scenario in zip(vehicles, scenarios, strict=True):  # each vehicle file makes another set-up
+        told = replace(study, preset=replace(study.preset, vehicle=vehicle.spec))
+        flights += fly_all(told, [scenario], run, reporter, **options).flown
+    return flights
+
+
+def _row(
+    entrant: Entrant, course: Course, vehicles: Sequence[HiddenVehicle], flight: Flight, scoring: Scoring
+) -> dict[str, Any]:
+    """Return the figures of one flight and the numbers of its vehicle; None stands for infinity."""
+    number = next(n for n, each in enumerate(vehicles) if each.spec == flight.spec.scenario.vehicle)
+    vehicle = vehicles[number]
+    return {
+        "course": course.title,
+        "preset": entrant.preset,
+        "method": entrant.method,
+        "vehicle_known": entrant.told,
+        "seed": flight.spec.seed,
+        "start": flight.spec.start,
+        "vehicle": number,
+        "mass_kg": vehicle.spec.mass,
+        "rate_lag_s": vehicle.rate_lag,
+        "damping": vehicle.damping,
+        "delay_s": vehicle.delay,
+        "thrust_lag_s": vehicle.spec.motor_tau,
+        "thrust_gain": vehicle.thrust_gain,
+        "thrust_to_weight": round(vehicle.thrust_to_weight, 3),
+        "lost": flight.log.terminated,
+        **{name: value if np.isfinite(value) else None for name, value in scoring.score(flight).items()},
+    }
+
+
+def _section(
+    found: Sequence[dict[str, Any]],
+    entrants: Sequence[Entrant],
+    course: Course,
+    scoring: Scoring,
+    vehicles: Sequence[HiddenVehicle],
+    run: Run,
+    about: str,
+) -> TableSection:
+    lines, maps, (coloured, *_) = list[tuple[str, ...]](), dict[str, np.ndarray](), scoring.columns
+    means = coloured.startswith("rms")
+    for entrant in entrants:
+        key = entrant.preset, entrant.method, entrant.told
+        own = [row for row in found if (row["preset"], row["method"], row["vehicle_known"]) == key]
+        if not own:
+            continue
+        lost, label = sum(row["lost"] for row in own), find_method(entrant.method).label
+        cells = [_quantiles([row[name] for row in own], name) for name in scoring.columns]
+        survived = [row[coloured] for row in own if row[coloured] is not None]
+        cells += [metres(float(np.mean(survived))) if survived else "-"] if means else []
+        known = "known" if entrant.told else "not known"
+        lines.append((f"`{entrant.preset}`", label, known, f"{lost} of {len(own)}", *cells))
+        worst = np.full(len(vehicles), -np.inf)
+        for row in own:
+            worst[row["vehicle"]] = max(worst[row["vehicle"]], np.inf if row[coloured] is None else row[coloured])
+        maps[entrant.label] = worst
+    lag, delay = (np.array([getattr(v, name) for v in vehicles]) for name in ("rate_lag", "delay"))
+    picture = plots.save(vehicle_map(course.title, lag, delay, maps, scoring.colour), run.folder, course.stem)[0]
+    columns = ("preset", "method", "vehicle", "lost", *scoring.columns.values(), *(["mean RMSE [m]"] if means else []))
+    return TableSection(columns, tuple(lines), course.title, about, picture)
+
+
+def _quantiles(values: Sequence[float | None], name: str) -> str:
+    """Return median, 95th percentile and worst value of all flights."""
+    ranked = np.sort([np.inf if value is None else value for value in values])
+    chosen = [ranked[min(len(ranked) - 1, int(share * len(ranked)))] for share in (0.5, 0.95, 1.0)]
+    text = metres if name.endswith("_m") else "{:.2f}".format
+    return " / ".join(text(value) if np.isfinite(value) else "∞" for value in chosen)

@@ -1,0 +1,199 @@
+"""Table sections in the paper's layout: a row per method, a column per level of disturbance."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from jax import random
+
+from retrim.config.baselines import BASELINES
+from retrim.config.loading import dump
+from retrim.config.methods import find_method
+from retrim.config.presets import Preset
+from retrim.config.scenario import Scenario
+from retrim.config.setup import Setup
+from retrim.evaluation.figures import picture
+from retrim.evaluation.kept import files_behind, keep, kept, named_by, named_in
+from retrim.evaluation.kept_flights import forget_flights
+from retrim.evaluation.metrics import cell, metres, rows
+from retrim.evaluation.study import Study, fly_all, refuse_misfits, train_all
+from retrim.runkit.document import Document, TableSection
+from retrim.runkit.provenance import section_key
+from retrim.runkit.reporter import Reporter
+from retrim.runkit.run import Run
+
+from ..datt.training import DATT_STEPS, RIVALS, check_rival, check_steps
+from .beside import figures_table
+
+LEVELS = {"none": "no disturbance", "small": "small, 0.5 m/s² per axis", "large": "large, 2 m/s² per axis"}
+"""The paper's disturbances and their labels."""
+PaperRows = Mapping[str, tuple[str, str, str]]
+"""The paper's figures for the three levels [m], by method."""
+METHODS = ("base", "base-i", "base-do", "geometric", "geometric-i", "indi", "mppi", "l1-mpc", "full", "lora")
+"""Methods of the paper's tables, except for those that need minutes of training."""
+
+
+def of_policies(methods: Sequence[str]) -> tuple[str, ...]:
+    """Return the methods that fly a policy of the table's preset."""
+    others = {*BASELINES, *RIVALS}
+    return tuple(method for method in methods if method not in others and find_method(method).on_board is None)
+
+
+@dataclass(frozen=True)
+class Levels:
+    """One section in the paper's layout: a row per method, a column per level of disturbance."""
+
+    title: str
+    preset: Preset
+    scenario: Scenario
+    """Scenario of the flights; each level replaces its disturbance."""
+    stem: str
+    """Name of the picture."""
+    methods: Sequence[str] = ("base", "full", "lora")
+    paper: PaperRows = field(default_factory=dict)
+    levels: Mapping[str, str] = field(default_factory=lambda: LEVELS)
+    """Disturbances and their labels."""
+    drawn: Sequence[str] = ("base", "full")
+    """Methods in the picture, which shows the last level."""
+
+    @property
+    def scenarios(self) -> list[Scenario]:
+        """Scenario of each level."""
+        return [replace(self.scenario, disturbance=level) for level in self.levels]
+
+
+def fly_levels(
+    document: Document,
+    sections: Sequence[Levels],
+    *,
+    starts: int,
+    seconds: float | None,
+    datt_steps: int = DATT_STEPS,
+) -> None:
+    """Train, fly and lay out every section; write the document after each, and after an interruption.
+
+    Args:
+        document: Receives the sections. Its seeds are those of training.
+        sections: Sections of the table; each preset is trained once.
+        starts: Flights per disturbance, method and seed.
+        seconds: Length of a flight; the task's own by default.
+        datt_steps: Training steps of DATT, if it is among the methods.
+
+    Raises:
+        ConfigError: A name does not exist, or two settings are incompatible; raised before any training.
+    """
+    run, reporter, studies = document.run, document.reporter, dict[tuple[str, bool], Study]()
+    check_steps(datt_steps)
+    sections = [section for section in sections if section.methods]
+    for section in sections:
+        if any(method in RIVALS for method in section.methods):
+            check_rival(section.preset)
+        own = [method for method in section.methods if method not in RIVALS] or ["base"]
+        refuse_misfits(section.preset, section.scenarios, methods=own, starts=starts, seconds=seconds)
+    for section in sections:
+        name = section_key(
+            preset=dump(section.preset), scenarios=[repr(each) for each in section.scenarios], title=section.title,
+            methods=list(section.methods), seeds=list(document.seeds), starts=starts, seconds=seconds,
+            datt_steps=datt_steps if "datt" in section.methods else 0, files=_files_behind(section),
+        )  # fmt: skip
+        if (made := kept(run, name)) is not None:
+            reporter.say(f"{section.title}: as an earlier run of this folder has made it")
+            document.add(*made)
+            document.add(figures_table(made[1], section.title, section.levels))
+            continue
+        trains = bool(of_policies(section.methods))
+        key = dump(section.preset), trains
+        if key not in studies and trains:
+            studies[key] = train_all(section.preset, document.seeds, run, reporter)
+        elif key not in studies:  # no method flies a policy, so that only the seeds of the study matter
+            untrained = Setup.from_preset(section.preset).new_policy(random.key(0))
+            studies[key] = Study(section.preset, dict.fromkeys(document.seeds, untrained), ())
+        made = _level_section(
+            studies[key], section, run, reporter, starts=starts, seconds=seconds, datt_steps=datt_steps
+        )
+        if made is not None:
+            document.add(*made)
+            document.add(figures_table(made[1], section.title, section.levels))
+        if run.interrupted:
+            break
+        if made is not None:
+            keep(run, name, *made)
+            forget_flights(run)
+    document.write()
+
+
+def _files_behind(section: Levels) -> dict[str, str]:
+    """Return digests of the files that the section depends on, outside retrim and the preset."""
+    named = list[str | None](section.methods)
+    for each in section.scenarios:
+        named += named_by(each)
+    return files_behind(*named, *named_in(section.preset))
+
+
+def _level_section(
+    study: Study,
+    section: Levels,
+    run: Run,
+    reporter: Reporter,
+    *,
+    starts: int,
+    seconds: float | None,
+    datt_steps: int,
+) -> tuple[TableSection, list[dict[str, Any]]] | None:
+    """Return the section and its rows of results; None if no flight was completed."""
+    methods, title = section.methods, section.title
+    own = [method for method in methods if method not in RIVALS]
+    flown = []
+    if own:
+        flown = fly_all(study, section.scenarios, run, reporter, methods=own, starts=starts, seconds=seconds).flown
+    for rival in (method for method in methods if method in RIVALS):
+        nets = RIVALS[rival](study.preset, tuple(study.policies), run, reporter, steps=datt_steps)
+        trained = Study(study.preset, nets, ())
+        flown += fly_all(
+            trained, section.scenarios, run, reporter, methods=[rival], starts=starts, seconds=seconds
+        ).flown
+    if not flown:
+        return None
+    place = {scenario: i for i, scenario in enumerate(section.scenarios)}
+    flown.sort(key=lambda flight: (place[flight.spec.scenario], methods.index(flight.spec.method)))
+    found = [{**row, "preset": study.preset.name, "section": title} for row in rows(flown)]
+    kinds = [event.kind for flight in flown for event in flight.events]
+    crashed = sum(flight.log.terminated for flight in flown)
+    about = (
+        f"{study.about()} The gate admitted {kinds.count('policy')} policies and refused {kinds.count('rejected')}. "
+        f"{crashed} of {len(flown)} flights crashed."
+    )
+    setup = Setup.from_preset(study.preset, section.scenario.reference)
+    first = [f for f in flown if f.spec.seed == flown[0].spec.seed and f.spec.method in section.drawn]
+    drawn = picture(first, setup, section.scenarios[-1], run.folder, stem=section.stem)
+    table = level_table(found, methods, section.paper, title, section.levels)
+    return replace(table, about=about, picture=drawn[0] if drawn else None), found
+
+
+def level_table(
+    found: Sequence[dict[str, Any]],
+    methods: Sequence[str],
+    paper: PaperRows,
+    title: str,
+    levels: Mapping[str, str] = LEVELS,
+) -> TableSection:
+    """Return rows of results in the paper's layout: methods down, disturbances across, its figures in brackets."""
+    by = {(row["method"], row["disturbance"]): row for row in found}
+    cells = list[tuple[str, ...]]()
+    for method in methods:
+        ours = [by.get((method, level)) for level in levels]
+        theirs = [f" ({figure})" for figure in paper[method]] if method in paper else [""] * len(levels)
+        figures = ("-" if row is None else cell(row) + they for row, they in zip(ours, theirs, strict=True))
+        cells.append((find_method(method).label, *figures))
+        if any(row is not None and "cross_track_m" in row for row in ours):
+            cells.append(("... in step; cross-track", *map(_in_step, ours)))
+    absent = [method for method in paper if method not in methods]
+    cells += [(f"{find_method(m).label}, the paper's", *(f"({figure})" for figure in paper[m])) for m in absent]
+    return TableSection(("error [m]", *levels.values()), tuple(cells), title)
+
+
+def _in_step(row: dict[str, Any] | None) -> str:
+    """Return the error after the best constant time shift, and the distance from the reference's nearest point [m]."""
+    if row is None or row.get("unshifted_m") is None or "cross_track_m" not in row:
+        return "-"
+    return f"{metres(row['unshifted_m'])}; {metres(row['cross_track_m'])}"

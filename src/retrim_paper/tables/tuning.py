@@ -1,0 +1,166 @@
+"""Settings of the classical baselines, by random search on conditions that are not part of any table."""
+
+import contextlib
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import numpy as np
+from jax import random
+
+from retrim.config.baselines import BASELINES, Baseline, Settings
+from retrim.config.loading import load
+from retrim.config.methods import MethodRequest
+from retrim.config.scenario import Scenario
+from retrim.config.setup import Setup
+from retrim.errors import ConfigError
+from retrim.evaluation.limits import check_flights, check_seeds
+from retrim.plants.sim import SimPlant
+from retrim.runkit.document import Document, TableSection
+from retrim.runkit.flights import FlightSpec
+from retrim.runkit.flying import scored, until_terminated
+from retrim.runkit.reporter import Reporter
+from retrim.runkit.run import Run
+from retrim.runtime.flight import FlightStopped
+from retrim.runtime.pilot import ControllerPilot
+from retrim.runtime.together import fly_together
+
+Shown = Literal["state", "keypoints"]
+CONDITIONS: dict[Shown, tuple[tuple[str, str, str, str | None], ...]] = {
+    "state": (
+        ("hover/retrim", "push=1.2", "onboard", None),
+        ("hover/retrim", "gusts=3+step=-1.5", "ideal", None),
+        ("track/retrim", "wind=5+push=-0.8", "onboard", "figure8"),
+    ),
+    "keypoints": (
+        ("vision/retrim", "push=1.2", "onboard", None),
+        ("vision/retrim", "gusts=3+step=-1.5", "ideal", None),
+        ("vision/retrim", "push=-1.8", "ideal", None),
+    ),
+}
+"""Conditions by input of the controllers: preset (for task and declared lag), disturbance, sensors and reference."""
+SHOWN = {"state": "the measured state", "keypoints": "the pose that a filter estimates from keypoints"}
+CRASH = 1.0  # [m], error of a crashed flight in the score
+SETTLING = 3.0  # [s], start of a flight that does not count
+
+
+def tuning(
+    run: Run,
+    reporter: Reporter,
+    *,
+    methods: tuple[str, ...] = tuple(BASELINES),
+    shown: Shown = "state",
+    candidates: int = 96,
+    starts: int = 2,
+    seconds: float = 12.0,
+    seed: int = 100,
+    plant: str = "bem",
+) -> None:
+    """Settings of the classical baselines: the best of random candidates, on separate pushes, starts and seeds.
+
+    Args:
+        run: Folder of tuning.md and tuning.json; the names contain the input of the controllers unless it is the state.
+        reporter: Receives progress and the sections.
+        methods: Baselines to tune.
+        shown: Input of the controllers: the measured state, or the pose that a filter estimates from keypoints.
+        candidates: Number of settings to try for each baseline, in addition to the present ones; a third for MPPI.
+        starts: Flights per candidate and condition.
+        seconds: Length of a flight [s]; the first 3 s do not count.
+        seed: Seed of candidates, starts and gusts.
+        plant: Plant of the flights; bem or simple.
+    """
+    check_seeds([seed])
+    check_flights(starts, seconds)
+    if seconds < SETTLING + 1.0:
+        raise ConfigError(
+            f"--seconds {seconds:g} must be at least {SETTLING + 1.0:g}: the first {SETTLING:g} do not count"
+        )
+    if not 0 <= candidates <= 10_000:
+        raise ConfigError(f"--candidates {candidates} must be between 0 and 10000")
+    if unknown := [name for name in methods if name not in BASELINES]:
+        raise ConfigError(f"{', '.join(unknown)}: no baseline with settings; there are {', '.join(BASELINES)}")
+    conditions = CONDITIONS[shown]
+    listed = "; ".join(
+        f"{preset.partition('/')[0]}{f' ({reference})' if reference else ''}, {disturbed}, sensors {sensors}"
+        for preset, disturbed, sensors, reference in conditions
+    )
+    intro = (
+        f"Made by `retrim reproduce tuning --shown {shown}`. {candidates} candidates for each method (a third for "
+        "MPPI), drawn evenly in the logarithm of each range, and the present settings, fly the small quadrotor on "
+        f"plant `{plant}` by {SHOWN[shown]}, from {starts} starts (seed {seed}) under: {listed}. The score is the root "
+        f"mean square of the error after {SETTLING:g} s, the mean over flights [m], a crash counting {CRASH:g} m. No "
+        "table flies these conditions, starts or seeds."
+    )
+    stem = "tuning" if shown == "state" else f"tuning_{shown}"
+    document = Document(run, stem, "Settings of the baselines", intro, [], reporter)
+    setups = [Setup.from_preset(load(preset), reference) for preset, *_, reference in conditions]
+    for name in methods:
+        if run.interrupted:
+            break
+        baseline = BASELINES[name]
+        tried = [dict(baseline.settings_for(setups[0])), *_drawn(baseline, -(-candidates // baseline.cost), seed)]
+        with contextlib.suppress(FlightStopped), run.interruptible(), reporter.progress(name) as advance:
+            scores = np.zeros(len(tried))
+            for i, (setup, (_, disturbed, sensors, reference)) in enumerate(zip(setups, conditions, strict=True)):
+                scenario = Scenario(disturbed, plant, sensors=sensors, reference=reference)
+                advance(i / len(conditions), f"condition {i + 1} of {len(conditions)}")
+                found = _flown(
+                    baseline, tried, setup, scenario, starts=starts, seconds=seconds, seed=seed, stop=run.stop
+                )
+                scores += np.array(found) / len(conditions)
+            document.add(_section(name, tried, scores), _rows(name, tried, scores))
+    document.write()
+
+
+def _drawn(baseline: Baseline, n: int, seed: int) -> list[Settings]:
+    """Return random candidates; those of a baseline depend on the seed only."""
+    low, high = np.array(list(baseline.ranges.values())).T
+    shares = np.asarray(random.uniform(random.key(seed), (n, len(low))))
+    drawn = low * (high / low) ** shares
+    return [dict(zip(baseline.ranges, row, strict=True)) for row in drawn.tolist()]
+
+
+def _flown(
+    baseline: Baseline,
+    tried: Sequence[Settings],
+    setup: Setup,
+    scenario: Scenario,
+    *,
+    starts: int,
+    seconds: float,
+    seed: int,
+    stop: Any,
+) -> list[float]:
+    """Return the score of each candidate; all candidates fly as one batch."""
+    specs = [FlightSpec(scenario, "base", start, seed) for start in range(starts)]
+    begun, dt = setup.flight_starts(starts, seed), setup.preset.dt
+    made = [scenario.make("small", dt=dt, seed=spec.plant_seed) for _ in tried for spec in specs]
+    plants = [each for each in made if isinstance(each, SimPlant)]
+    if len(plants) < len(made):
+        raise ConfigError(f"plant {scenario.plant!r}: candidates are flown as one batch, which bem and simple can be")
+    pilots = [
+        ControllerPilot(MethodRequest(setup, None).by_state(baseline.make(setup, settings, spec.key())))
+        for settings in tried
+        for spec in specs
+    ]
+    logs = fly_together(plants, pilots, begun * len(tried), ticks=round(seconds / dt), stop=stop)
+    flights = [scored(setup, specs[0], until_terminated(setup.flown, log)) for log in logs]
+    errors = [
+        CRASH if flight.log.terminated else float(np.sqrt(np.mean(flight.error[flight.log.t > SETTLING] ** 2)))
+        for flight in flights
+    ]
+    means: list[float] = np.reshape(errors, (len(tried), starts)).mean(axis=1).tolist()
+    return means
+
+
+def _rows(name: str, tried: Sequence[Settings], scores: np.ndarray) -> list[dict[str, Any]]:
+    scored_ones = zip(tried, scores.tolist(), strict=True)
+    return [{"method": name, "settings": dict(settings), "score": score} for settings, score in scored_ones]
+
+
+def _section(name: str, tried: Sequence[Settings], scores: np.ndarray) -> TableSection:
+    """Return a table of the present settings and the best three."""
+    best = [int(i) for i in np.argsort(scores)[:3]]
+    columns = ("settings", *tried[0], "score [m]")
+    shown = [("present", 0), *((f"{'best' if k == 0 else f'{k + 1}.'}", i) for k, i in enumerate(best))]
+    lines = tuple((word, *(f"{v:.3g}" for v in tried[i].values()), f"{scores[i]:.4f}") for word, i in shown)
+    return TableSection(columns, lines, BASELINES[name].label)

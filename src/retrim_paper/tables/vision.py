@@ -1,0 +1,83 @@
+"""Table III of the paper: hover from keypoints."""
+
+from collections.abc import Sequence
+
+from retrim.config.baselines import BASELINES
+from retrim.config.presets import Preset
+from retrim.config.scenario import Scenario
+from retrim.errors import ConfigError
+from retrim.evaluation.study import table_presets
+from retrim.runkit.document import Document
+from retrim.runkit.reporter import Reporter
+from retrim.runkit.run import Run
+
+from ..datt.training import RIVALS
+from .levels import METHODS, Levels, PaperRows, fly_levels
+
+PAPER: PaperRows = {  # Table III [m]
+    "base": ("0.133 ± 0.009", "0.404 ± 0.039", "1.383 ± 0.176"),
+    "full": ("0.082 ± 0.009", "0.099 ± 0.021", "0.207 ± 0.041"),
+    "lora": ("0.084 ± 0.014", "0.111 ± 0.024", "0.205 ± 0.048"),
+}
+TITLES = {
+    "vision/retrim": "Our preset: only points in the image, 1 px of noise, 5 % missed; felt gravity",
+    "vision/ideal": "The paper's loop, a small budget: all points are observed",
+    "vision/occluded": "The paper's loop, a small budget: only points in the image, 1 px of noise, 5 % of them missed",
+    "vision/paper": "The paper's formulation: its reward and sizes, raw pixels, all points are observed",
+}
+INTRO = """\
+Made by `retrim reproduce vision`. Steady-state error [m], the mean over the last 2 s: mean ± standard deviation
+over flights. Small quadrotor; seven points on the ground, five frames, three past commands, no state. The
+residual is learned from the state, as in the paper. Learning is charged to flight time by the preset's fixed
+latencies. Controllers without a policy fly by the estimate of the pose filter, which sees the points that the
+policy sees; INDI also has an inertial unit, which the policy does not have. In brackets the paper's figures,
+which are from its own plant."""
+
+
+def vision(
+    run: Run,
+    reporter: Reporter,
+    *,
+    presets: tuple[str, ...] = tuple(TITLES),
+    methods: tuple[str, ...] = (),
+    seeds: tuple[int, ...] = (0,),
+    seconds: float = 30.0,
+    starts: int = 8,
+    plant: str = "bem",
+) -> None:
+    """Table III: hover from seven points on the ground under three disturbances.
+
+    Args:
+        run: Folder of vision.md, vision.json and the pictures.
+        reporter: Receives progress and the sections.
+        presets: Presets to train and fly; vision/paper trains for several minutes.
+        methods: Methods of the flights; by default all that the preset supports: baselines with the estimate of a pose
+            filter, and base-do in the frame of felt gravity.
+        seeds: Training seeds.
+        seconds: Length of a flight [s].
+        starts: Flights per disturbance, method and seed.
+        plant: Plant of the flights.
+    """
+    loaded = table_presets(presets, "vision", seeds=seeds, starts=starts, seconds=seconds)
+    if trained := [method for method in methods if method in RIVALS]:
+        raise ConfigError(f"--methods {trained[0]}: it is trained by a measured state; this table has none")
+    document = Document(run, "vision", "Hover from keypoints (Table III of the paper)", INTRO, seeds, reporter)
+    sections = [_section(preset, Scenario(plant=plant), methods) for preset in loaded]
+    fly_levels(document, sections, starts=starts, seconds=seconds)
+
+
+def _section(preset: Preset, scenario: Scenario, methods: Sequence[str]) -> Levels:
+    stem = f"vision_{preset.name.rpartition('/')[2]}"
+    drawn = ("base", "indi", "full")
+    flown = methods or _flyable(preset)
+    return Levels(TITLES.get(preset.name, preset.name), preset, scenario, stem, flown, PAPER, drawn=drawn)
+
+
+def _flyable(preset: Preset) -> list[str]:
+    """Return the methods of the other tables that work with keypoints or with the pose that a filter estimates."""
+    cannot = {"base-i"}
+    if preset.adapt.frame != "gravity":
+        cannot.add("base-do")
+    if preset.vision is None or not preset.vision.occlusion:
+        cannot.update(BASELINES)
+    return [method for method in METHODS if method not in cannot]

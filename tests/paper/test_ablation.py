@@ -1,0 +1,21 @@
+"""The ablation: every lever is one change that can be flown."""
+
+import pytest
+
+from retrim.config import Setup, changed
+from retrim.config import named_presets as presets
+from retrim.config.methods import find_method
+from retrim_paper.levers import CONTROL, OFF, ON
+
+
+@pytest.mark.parametrize(("task", "kind"), [(task, kind) for task in OFF for kind in ("retrim", "paper")])
+def test_every_lever_is_one_change_of_its_preset(task, kind):
+    preset = presets.PRESETS[f"{task}/{kind}"]
+    each = OFF[task] if kind == "retrim" else ON[task]
+    made = [(changed(preset, **lever.changes), lever.method) for lever in (*CONTROL, *each)]
+    for one, method in made:
+        find_method(method)
+        Setup.from_preset(one)
+    assert made.count((preset, "full")) == 1
+    assert len({(str(one), method) for one, method in made}) == len(made)
+    assert len({lever.label for lever in (*CONTROL, *each)}) == len(made)

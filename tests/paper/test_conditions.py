@@ -1,0 +1,121 @@
+"""The conditions of the gauntlet are what their names say."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from retrim.config import PRESETS, changed
+from retrim.config.faults import FAULTS, NO_FAULT
+from retrim.config.scenario import THRUST_ERROR, Scenario
+from retrim.physics.vehicle import kingfisher, small
+from retrim_paper.conditions import FLOWN, PUSH, conditions, fault_conditions
+
+AGREE = ("disturbance", "plant", "sensors", "reference", "thrust_error", "delay")
+
+
+def numbers(vehicle):
+    """Numbers of a vehicle that make it another one; of a built one, or of one from a file."""
+    names = ("mass", "inertia", "arm", "thrust_max", "motor_tau", "drag_area")
+    return {name: np.asarray(getattr(vehicle, name), dtype=float) for name in names}
+
+
+def ratios(spec, like):
+    mine, theirs = numbers(spec), numbers(like)
+    return {name: mine[name] / theirs[name] for name in mine}
+
+
+def test_a_condition_at_hover_is_its_disturbance_with_one_thing_changed():
+    found = conditions(PRESETS["hover/retrim"])
+    for name, scenario in found.items():
+        what, _, where = name.partition("/")
+        if what.startswith("thrust"):
+            what, where = "step", what
+        disturbance = "wind+payload+battery+weak-rotor" if what == "all" else what
+        differs = {
+            "": {}, "mocap": {"sensors": "mocap"}, "onboard": {"sensors": "onboard"}, "rough": {"sensors": "rough"},
+            "thrust+20": {"thrust_error": 0.2}, "thrust-20": {"thrust_error": -0.2}, "delay-40ms": {"delay": 0.04},
+            "simple": {"plant": "simple"}, "rotorpy": {"plant": "rotorpy"}, "mujoco": {"plant": "mujoco"},
+            "crazyflow": {"plant": "crazyflow"},
+        }.get(where, {})  # fmt: skip
+        plain = {"plant": "bem", "sensors": "ideal", "reference": None, "thrust_error": THRUST_ERROR, "delay": 0.02}
+        assert {field: getattr(scenario, field) for field in AGREE} == plain | {"disturbance": disturbance} | differs
+        if where in ("kingfisher", "large-quadrotor"):
+            assert scenario.vehicle == where.removesuffix("-quadrotor")
+        else:
+            assert (scenario.vehicle is not None) == where.startswith(("random", "slow"))
+    slow = ratios(found["step/slow-motors"].vehicle, small())
+    assert {name: np.unique(np.round(ratio, 6)).tolist() for name, ratio in slow.items()} == {
+        name: [2.0 if name == "motor_tau" else 1.0] for name in slow
+    }
+
+
+def test_a_fault_condition_has_one_fault_beside_a_push():
+    found = fault_conditions(PRESETS["hover/retrim"])
+    assert set(FAULTS) - {NO_FAULT} <= set(found)
+    for name, scenario in found.items():
+        differs = {field for field in (*AGREE, "fault") if getattr(scenario, field) != getattr(Scenario(PUSH), field)}
+        assert len(differs) == 1, name
+        if "fault" in differs:
+            assert scenario.fault == name
+    heavier = found["mass+50"].disturbance.removeprefix(f"{PUSH}+payload=")
+    assert float(heavier) == pytest.approx(0.5 * float(small().mass), rel=1e-3)
+    assert (found["delay-60ms"].delay, found["thrust-50"].thrust_error) == (0.06, -0.5)
+
+
+@pytest.mark.parametrize("preset", ["hover/retrim", "track/retrim"])
+def test_other_sensors_measure_every_condition_that_names_none_and_has_some(preset):
+    ideal, rough = conditions(PRESETS[preset]), conditions(PRESETS[preset], "rough")
+    assert {scenario.sensors for scenario in rough.values()} == {"rough"}
+    for name, scenario in ideal.items():
+        if name in rough:
+            assert scenario == replace(rough[name], sensors="ideal")
+        else:
+            assert scenario.sensors != "ideal" or not scenario.entry.has_sensors
+
+
+@pytest.mark.parametrize(("preset", "own"), [("track/retrim", small), ("track/fast", kingfisher)])
+def test_every_reference_is_flown_in_every_weather_and_the_first_on_other_vehicles(preset, own):
+    trained = PRESETS[preset]
+    references = trained.track.reference.split("+")
+    found = conditions(trained)
+    assert {scenario.reference for scenario in found.values()} == set(references)
+    for name, scenario in found.items():
+        reference, _, what = name.rpartition("/")
+        assert scenario.reference == reference
+        if what in FLOWN:
+            assert (scenario.disturbance, scenario.sensors, scenario.vehicle) == (*FLOWN[what], None)
+        else:
+            assert reference == references[0]
+    of_first = {name.removeprefix(f"{references[0]}/"): scenario for name, scenario in found.items()}
+    assert of_first["thrust+20"].thrust_error == 0.2
+    assert of_first["thrust-20"].thrust_error == -0.2
+    assert of_first["delay-40ms"].delay == 0.04
+    assert (of_first["simple"].plant, of_first["simple"].disturbance) == ("simple", "wind")
+    slow = ratios(of_first["slow-motors"].vehicle, own())
+    assert float(slow.pop("motor_tau")) == pytest.approx(2.0)
+    for ratio in slow.values():
+        np.testing.assert_allclose(ratio, 1.0)
+
+
+def test_a_vehicle_of_one_s_own_has_conditions_like_itself():
+    heavy = changed(PRESETS["track/retrim"], vehicle="large")
+    slow = next(s.vehicle for name, s in conditions(heavy).items() if name.endswith("/slow-motors"))
+    assert slow.mass == pytest.approx(0.6, rel=0.05)
+
+
+def test_random_vehicles_are_plausible_and_differ():
+    """0.7 to 1.6 times the mass; inertia as the mass, thrust and motors within a third or a factor of two of it."""
+    found = [conditions(PRESETS["hover/retrim"])[f"step/random-{n}"].vehicle for n in range(3)]
+    told = [ratios(spec, small()) for spec in found]
+    for of in told:
+        assert 0.7 <= of["mass"] <= 1.6
+        np.testing.assert_allclose(of["inertia"], of["inertia"][0])
+        assert 0.8 <= of["inertia"][0] / of["mass"] <= 1.25
+        assert 0.8 <= of["thrust_max"] <= 1.2
+        assert 0.7 <= of["motor_tau"] <= 2.0
+        np.testing.assert_allclose(of["arm"], 1.0)
+        np.testing.assert_allclose(of["drag_area"], 1.0)
+    assert [spec.name for spec in found] == ["random-0", "random-1", "random-2"]
+    assert len({round(float(of["mass"]), 6) for of in told}) == 3
+    assert all(spec.rates_max == tuple(np.asarray(small().omega_max).tolist()) for spec in found)

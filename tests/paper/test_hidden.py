@@ -1,0 +1,133 @@
+"""Hidden vehicles: the population, and the table of their flights."""
+
+import dataclasses
+import importlib
+
+import jax
+import numpy as np
+import pytest
+
+from commands import results
+from helpers import brief_preset
+from retrim import ConfigError, Setup
+from retrim.config import named_presets as presets
+from retrim.config.hidden_vehicles import draw_vehicles
+from retrim.config.vehicles import make_vehicle
+from retrim.evaluation.fleet import Fleet
+from retrim.runkit import Run
+from retrim.runkit.reporter import Silent
+from retrim_paper.tables.hidden import ENTRANTS, entrants_of
+
+gauntlet = importlib.import_module("retrim_paper.tables.gauntlet")
+
+pytestmark = pytest.mark.usefixtures("as_a_user")
+
+
+@pytest.fixture(scope="module")
+def population():
+    return draw_vehicles(300, seed=5)
+
+
+def test_every_vehicle_lies_in_the_ranges(population):
+    ranges = {
+        "mass": (0.03, 3.0), "rate_lag": (0.015, 0.15), "delay": (0.0, 0.06), "damping": (0.4, 1.2),
+        "thrust_gain": (0.6, 1.6), "thrust_to_weight": (1.39, 8.1),
+    }  # fmt: skip
+    for name, (low, high) in ranges.items():
+        values = np.array([v.spec.mass if name == "mass" else getattr(v, name) for v in population])
+        assert low <= values.min() < low + 0.1 * (high - low), name
+        assert high - 0.25 * (high - low) < values.max() <= high, name
+
+
+def test_vehicles_grow_as_a_whole(population):
+    """Mass grows with the cube of the arm, inertia with the fifth power, and lag and delay with the size."""
+    arm, mass, inertia = (
+        np.array(values)
+        for values in zip(*((v.spec.arm[0], v.spec.mass, v.spec.inertia[0]) for v in population), strict=True)
+    )
+    for values, power in ((mass, 3.0), (inertia, 5.0)):
+        np.testing.assert_allclose(np.polyfit(np.log(arm), np.log(values), 1)[0], power, rtol=1e-6)
+    size = [v.size for v in population]
+    assert np.corrcoef(size, np.log([v.rate_lag for v in population]))[0, 1] > 0.9
+    assert np.corrcoef(size, [v.delay for v in population])[0, 1] > 0.8
+
+
+def test_more_vehicles_begin_with_the_same_ones(population):
+    assert draw_vehicles(3, seed=5) == population[:3]
+    assert draw_vehicles(3, seed=6) != population[:3]
+
+
+def test_the_plant_is_the_vehicle(population):
+    """Second order, with its lag, damping, gain and delay; nothing of it is in the preset."""
+    for vehicle in population[:3]:
+        plant = vehicle.scenario("early-step").make("small")
+        response = plant.simulation.model.response
+        np.testing.assert_allclose(response.rate_lag, vehicle.rate_lag, rtol=1e-6)
+        np.testing.assert_allclose(response.inverse_damping, 1.0 / vehicle.damping, rtol=1e-6)
+        assert float(response.thrust_gain) == pytest.approx(vehicle.thrust_gain, rel=1e-6)
+        assert float(make_vehicle(vehicle.spec).mass) == pytest.approx(vehicle.spec.mass)
+
+
+def test_flights_of_vehicles_that_differ_in_numbers_are_one_program(population):
+    preset = brief_preset()
+    policy = Setup.from_preset(preset).new_policy(jax.random.key(0))
+    scenarios = [vehicle.scenario("early-step") for vehicle in population[:4]]
+    fleet = Fleet(preset, policy, scenarios, methods=("base",), starts=1, seconds=1.0)
+    lots = fleet.lots(fleet.specs)
+    assert all(len(lot.specs) > 1 for lot in lots)
+    flown = fleet.run().flown
+    alone = Fleet(preset, policy, scenarios[2:3], methods=("base",), starts=1, seconds=1.0).run().flown
+    np.testing.assert_allclose(flown[2].log.p, alone[0].log.p, atol=1e-5)
+
+
+def test_another_vehicle_with_other_numbers_stated_is_another_program(population):
+    first = population[0].scenario("none")
+    silent = dataclasses.replace(first, vehicle=dataclasses.replace(population[1].spec, rate_damping=None))
+    assert first.without_numbers() == population[1].scenario("none").without_numbers()
+    assert first.without_numbers() != silent.without_numbers()
+
+
+@pytest.mark.parametrize(
+    ("preset", "courses", "columns"),
+    [
+        ("hover/fast", ["Hover, a push of 2 m/s² per axis at 4 s"], ("error_m", "to_10cm_s", "to_2cm_s", "peak_m")),
+        ("track/retrim", ["Figure-8 of 10 s", "Figure-8 of 5.5 s"], ("rmse_m", "peak_m")),
+    ],
+)
+def test_the_table_has_a_row_for_each_flight(tmp_path, imagine, drawn, monkeypatch, preset, courses, columns):
+    hidden = importlib.import_module("retrim_paper.tables.hidden")
+    drawn(hidden, "vehicle_map")
+    monkeypatch.setattr(hidden.plots, "save", lambda figure, folder, stem: (folder / f"{stem}.png", folder / stem))
+    imagine(hidden, lambda spec: None if spec.method == "indi" else 0.01)
+    sizes = {"count": 3, "starts": 2, "seeds": (0, 1), "methods": ("base", "indi")}
+    gauntlet.gauntlet(Run("test", tmp_path), Silent(), preset=preset, vehicles="hidden", **sizes)
+    rows = results(tmp_path, "results.json")["rows"]
+    assert [len([row for row in rows if row["course"] == course]) for course in courses] == [2 * 3 * 2 * 2] * len(
+        courses
+    )
+    for row in rows:
+        assert row["lost"] == (row["method"] == "indi")
+        assert all((row[name] is None) == row["lost"] for name in columns)
+    text = (tmp_path / "hidden.md").read_text()
+    assert "| `" + preset + "` | INDI | not known | 12 of 12 | ∞ / ∞ / ∞ |" in text
+
+
+def test_what_cannot_be_flown_is_refused_before_training(tmp_path):
+    run = Run("test", tmp_path)
+    for words, message in (
+        ({"count": 0}, "count must be 1 to 10000 vehicles, got 0"),
+        ({"faults": True}, "--vehicles hidden has one condition"),
+        ({"preset": "vision/ideal"}, "hidden vehicles are flown for hover, track"),
+        ({"preset": "hover/retrim", "methods": ("base-id",)}, "is for one vehicle"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            gauntlet.gauntlet(run, Silent(), vehicles="hidden", **words)
+
+
+def test_the_published_page_has_every_kind_of_method():
+    for task in ("hover", "track"):
+        found = entrants_of(task, "any", ())
+        assert found == ENTRANTS[task]
+        assert {entrant.method for entrant in found} >= {"base", "base-do", "geometric-i", "indi", "base-id"}
+        assert all(entrant.preset in presets.PRESETS for entrant in found)
+        assert any(entrant.told for entrant in found)

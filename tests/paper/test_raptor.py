@@ -1,0 +1,105 @@
+"""RAPTOR on board: its network computes what its package computes, and its motors are ours."""
+
+import importlib
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax, random
+
+from commands import results, retrim
+from helpers import GOAL, hover_task, tiny_preset
+from retrim import ConfigError, Scenario, Setup
+from retrim.evaluation import Fleet
+from retrim.evaluation.metrics import record
+from retrim.physics import Command, ExternalEffects, State, kingfisher, so3
+from retrim.physics.bem import BemQuadrotor
+from retrim_paper.raptor.plant import RaptorNet, RaptorQuadrotor
+
+foundation_policy = pytest.importorskip("foundation_policy")
+
+
+@pytest.fixture(scope="module")
+def net():
+    return RaptorNet.load()
+
+
+@pytest.fixture(scope="module")
+def untrained():
+    return Setup.from_preset(tiny_preset()).new_policy(random.key(0))
+
+
+def test_the_network_computes_what_its_package_computes(net, key):
+    theirs, hidden = foundation_policy.Raptor(), net.start
+    theirs.reset()
+    step = jax.jit(lambda hidden, o: net(hidden, o))
+    for o in np.asarray(random.normal(key, (30, 22)), dtype=np.float32):
+        action, hidden = step(hidden, jnp.asarray(o, dtype=float))
+        np.testing.assert_allclose(action, theirs.evaluate_step(o[None])[0], atol=2e-5)
+
+
+@pytest.fixture(scope="module")
+def flown(net):
+    """States after some seconds of hover, by the heading of the goal and what is commanded from outside."""
+
+    def fly(x0, heading, outside):
+        here = hover_task().wanted(jnp.array(0.0))
+        model = RaptorQuadrotor(BemQuadrotor.of(kingfisher(), 0.02), net, lambda t: here._replace(heading=heading))
+        calm = ExternalEffects.calm(x0.p.dtype)
+
+        def tick(s, _):
+            s, _ = lax.scan(lambda s, _: (model.substep(s, outside, calm), None), s, length=20)
+            return s, model.state(s)
+
+        return lax.scan(tick, model.init(x0), length=200)[1]
+
+    return jax.jit(fly)
+
+
+def test_it_comes_to_hover_facing_where_it_should_and_listens_to_nobody(flown):
+    x0 = State.at(jnp.array(GOAL) + jnp.array([0.6, -0.4, 0.3]))
+    path = flown(x0, jnp.array(0.5), Command.hover(float))
+    assert float(jnp.max(jnp.linalg.norm(path.p[-50:] - jnp.array([GOAL]), axis=1))) < 0.15
+    heading = jnp.arctan2(path.R[-1, 1, 0], path.R[-1, 0, 0])
+    assert abs(float(heading) - 0.5) < 0.2
+    other = flown(x0, jnp.array(0.5), Command(jnp.array(3.0), jnp.array([2.0, -2.0, 1.0])))
+    np.testing.assert_array_equal(other.p, path.p)
+
+
+def test_it_does_not_care_which_way_is_north(flown):
+    """Goal, vehicle and heading turned about the vertical by an angle: the path is turned by it."""
+    turn, offset = 1.1, jnp.array([0.5, 0.2, -0.2])
+    Q = so3.rotz(jnp.array(turn))
+    at = jnp.array(GOAL)
+    path = flown(State.at(at + offset), jnp.array(0.0), Command.hover(float))
+    x0 = State(at + Q @ offset, Q, jnp.zeros(3))
+    turned = flown(x0, jnp.array(turn), Command.hover(float))
+    np.testing.assert_allclose(turned.p - at[None], (path.p - at[None]) @ Q.T, atol=1e-5)
+
+
+def test_it_flies_as_a_method_and_commands_no_rates(untrained):
+    preset = tiny_preset(vehicle="kingfisher")
+    fleet = Fleet(preset, untrained, [Scenario()], methods=["raptor"], starts=2, seconds=4.0)
+    flights = fleet.run().flown
+    assert [flight.log.terminated for flight in flights] == [False, False]
+    assert all(flight.error[-1] < 0.3 for flight in flights)
+    assert record(flights[0])["rates_rms"] is None
+
+
+@pytest.mark.parametrize(
+    ("scenario", "said"), [(Scenario(plant="simple"), "plant 'bem' alone"), (Scenario(sensors="rough"), "'ideal'")]
+)
+def test_what_it_cannot_fly_is_refused_before_anything_flies(scenario, said, untrained):
+    with pytest.raises(ConfigError, match=said):
+        Fleet(tiny_preset(), untrained, [scenario], methods=["raptor"])
+
+
+def test_it_flies_beside_others_by_its_command(tmp_path, monkeypatch, as_a_user):
+    table = importlib.import_module("retrim_paper.tables.raptor")  # the package has a function of that name
+    monkeypatch.setattr(table, "DISTURBED", {"none": "calm"})
+    words = "--methods", "raptor", "--vehicles", "kingfisher", "--seeds", "0", "--starts", "1"
+    retrim("reproduce", "raptor", *words, "--seconds", "2", "--out", "t", cwd=tmp_path)
+    rows = results(tmp_path / "t", "raptor.json")["rows"]
+    assert [(row["vehicle"], row["method"], row["n"]) for row in rows] == [("kingfisher", "raptor", 1)] * 2
+    assert "| RAPTOR |" in (tmp_path / "t" / "raptor.md").read_text()
