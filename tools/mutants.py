@@ -120,7 +120,8 @@ def watch() -> None:
     shutil.rmtree(PLACE, ignore_errors=True)
     PLACE.mkdir(parents=True)
     environment = {**os.environ, "COVERAGE_FILE": str(PLACE / "reached")}
-    command = [sys.executable, "-m", "pytest", "-m", "not slow", "--cov=retrim", "--cov=retrim_paper", "--cov-context=test", "--cov-report=",
+    command = [sys.executable, "-m", "pytest", "-m", "not slow", "--cov=retrim", "--cov=retrim_paper",
+               "--cov-context=test", "--cov-report=",
                f"--junitxml={PLACE / 'times.xml'}"]  # fmt: skip
     if subprocess.run(command, cwd=ROOT, env=environment, check=False).returncode > 1:
         raise SystemExit("the suite could not be run")
