@@ -1,11 +1,13 @@
 """Methods by name: whom they fly for, and whom they refuse."""
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import pytest
 from jax import random
 
 from helpers import brief_preset
-from retrim import ConfigError, Setup
+from retrim import AdaptivePilot, ConfigError, Setup, State, changed, load
 from retrim.config.methods import METHODS, MethodRequest, find_method
 from retrim.control.seen_pose import SeenPose
 from retrim.plants.plant import Measurement
@@ -81,3 +83,18 @@ def test_a_low_rank_delta_is_drawn_from_the_key_and_kept_where_there_is_one(key)
     has_one = setup.low_rank(policy, key)
     assert setup.low_rank(has_one, random.key(3)) is has_one
     assert setup.pilot(policy).dt == setup.preset.dt
+
+
+@pytest.mark.parametrize("method", ["base", "base-do", "base-id", "full", "lora"])
+@pytest.mark.parametrize("name", ["hover/any", "track/any"])
+def test_every_method_of_a_policy_for_many_vehicles_gives_a_command(name, method):
+    """Traced, not compiled: each method wraps the policy in other controllers."""
+    setup = Setup.from_preset(changed(load(name), pretrain={"hidden_sizes": (16, 16)}))
+    pilot = setup.pilot(setup.new_policy(random.key(0)), method, random.key(1))
+    learning = isinstance(pilot, AdaptivePilot)
+    controller = pilot.controller_of(pilot.state) if learning else pilot.controller
+    x = State.at(setup.flown.home())
+    memory = eqx.filter_eval_shape(controller.init, x)
+    u, after = eqx.filter_eval_shape(controller, memory, jnp.zeros_like(x.p[0]), x)
+    assert (u.c.shape, u.omega.shape) == ((), (3,))
+    assert jax.tree.structure(memory) == jax.tree.structure(after)

@@ -155,12 +155,16 @@ class Monitor(AbstractController[MonitorState]):
         grows, since an uncompensated push needs an error to hold against it.
         """
         swung = (memory.cause == Cause.OSCILLATION) & (memory.stage == Stage.BASE)
-        return jnp.where(swung, REACH + WIDENING * (HOLD - jnp.minimum(memory.wait, HOLD)), jnp.inf)
+        own = jnp.where(swung, REACH + WIDENING * (HOLD - jnp.minimum(memory.wait, HOLD)), jnp.inf)
+        inner = self.frame.inner
+        return jnp.minimum(own, inner.reach) if isinstance(inner, NearTarget) else own
 
     @property
     def _inner(self) -> PolicyController:
-        assert isinstance(self.frame.inner, PolicyController)
-        return self.frame.inner
+        inner = self.frame.inner
+        policy = inner.inner if isinstance(inner, NearTarget) else inner
+        assert isinstance(policy, PolicyController)
+        return policy
 
     def _judged(self, s: MonitorState, t: Float[Array, ""], x: State) -> MonitorState:
         """Return the memory after the tests of this tick."""
