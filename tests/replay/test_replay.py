@@ -96,7 +96,7 @@ def test_a_log_that_is_too_short_says_what_to_choose(log):
         ({"buffer": 0.0}, "--buffer 0"),
         ({"delay": 2.0}, "--delay 2"),
         ({"adapt": "full"}, "--adapt and --policy go together"),
-        ({"adapt": "some"}, "must be full, lora or none"),
+        ({"adapt": "base", "policy": "p"}, "must be full, lora or none"),
         ({"updates": 0}, "--updates 0"),
     ],
 )
@@ -210,7 +210,7 @@ def test_a_policy_learns_the_push_of_a_log(files, tmp_path):
     setup = Setup.from_preset(preset)
     policy = setup.new_policy(jax.random.key(0))
     log = read_flight_log(files[0], read_map(files[1]), dt=preset.dt)
-    result = adapt_to(rows_of(log), setup, policy, low_rank=False, updates=4, seed=0, reporter=Silent())
+    result = adapt_to(rows_of(log), setup, policy, method="full", updates=4, seed=0, reporter=Silent())
     assert 0 <= result.admitted <= result.tried == 4
     model = setup.learner.residual_model
     x, u = jax.tree.map(lambda leaf: leaf[100], (rows_of(log).x, rows_of(log).u))

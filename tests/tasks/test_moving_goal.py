@@ -4,8 +4,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax import random
 
 from helpers import draw_starts, random_state
+from retrim.config import Setup, TaskEntry, changed, load, register_task
+from retrim.config.families import policy_controller
+from retrim.config.tasks import TASKS
+from retrim.control import PolicyController
+from retrim.control.resting import RestingController
 from retrim.errors import FrameError
 from retrim.physics import Command, State
 from retrim.physics.felt_frame import FeltFrame
@@ -119,3 +125,17 @@ def test_only_a_task_without_a_moving_target_rests():
     assert hover(jnp.zeros(3)).rests
     assert not moving().rests
     assert not Height(StateObs(jnp.zeros(3), jnp.full(3, 6.0), 0)).rests
+
+
+def test_only_a_policy_whose_task_rests_is_shifted_at_rest():
+    """A policy for many vehicles commands hover at home, but not at the first position of a moving goal."""
+    register_task("orbit-family", TaskEntry(lambda request: request.hover(goal=circle)))
+    try:
+        kinds = []
+        for task in ("hover", "orbit-family"):
+            setup = Setup.from_preset(changed(load("hover/any"), task=task, pretrain={"hidden_sizes": (8, 8)}))
+            policy = setup.new_policy(random.key(0))
+            kinds.append(type(policy_controller(setup.preset, setup.flown, policy).inner))
+        assert kinds == [RestingController, PolicyController]
+    finally:
+        del TASKS._known["orbit-family"]

@@ -75,15 +75,17 @@ def policy_controller(preset: Preset, task: AbstractTask, policy: AbstractPolicy
     """Return a policy with the observation used in flight.
 
     Args:
-        preset: Preset of the policy. In a task without reference, a policy for a family is shifted so that it commands
-            hover at home, and the distance from home in its input is limited.
+        preset: Preset of the policy. In a task without reference, the distance from the target in the input of a policy
+            for a family is limited; if the task rests at home, the policy is shifted so that it commands hover there.
         task: Task of the flight.
         policy: Policy of the flight.
     """
     observation = task.observation_in_flight
     if preset.family is None or find_task(preset.task).has_reference:
         return PolicyController(observation, policy)
-    return NearTarget(RestingController(observation, policy, task.home()), task, jnp.array(REACH))
+    plain = PolicyController(observation, policy)
+    inner = RestingController(observation, policy, task.home()) if task.rests else plain
+    return NearTarget(inner, task, jnp.array(REACH))
 
 
 def track_actuators(controller: AbstractController[Any], preset: Preset) -> AbstractController[Any]:
