@@ -96,7 +96,7 @@ def test_a_log_that_is_too_short_says_what_to_choose(log):
         ({"buffer": 0.0}, "--buffer 0"),
         ({"delay": 2.0}, "--delay 2"),
         ({"adapt": "full"}, "--adapt and --policy go together"),
-        ({"adapt": "base", "policy": "p"}, "must be full, lora or none"),
+        ({"adapt": "base"}, "must be full, lora or none"),
         ({"updates": 0}, "--updates 0"),
     ],
 )
