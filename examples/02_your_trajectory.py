@@ -43,7 +43,7 @@ def main(*, quick: bool = False) -> None:
     def error(setup: Setup, method: str) -> float:
         """Fly; return the mean distance over the last 8 s from where the vehicle should have been [m]."""
         log = fly(plant, setup.pilot(policy, method, jax.random.key(1)), x0, ticks=ticks)
-        return float(jax.vmap(setup.flown.error)(jax.numpy.asarray(log.t), log.true.as_state())[-400:].mean())
+        return float(jax.vmap(setup.flight_task.error)(jax.numpy.asarray(log.t), log.true.as_state())[-400:].mean())
 
     print(f"the climb in 3 m/s of wind, as it is: {error(setup, 'base'):.3f} m off")
     print(f"adapted in flight:                    {error(setup, 'full'):.3f} m off")

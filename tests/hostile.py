@@ -24,7 +24,7 @@ from jax import random
 
 from helpers import tiny_preset
 from made_up_log import MAP, columns, flown, write_csv
-from retrim import Setup, load_learnt, load_policy
+from retrim import Setup, load_learner_state, load_policy
 from retrim.adapt.updates import PolicyUpdate, ResidualUpdate, Skip, pack_update, unpack_update
 from retrim.config import changed, load, overlaid, read_vehicle
 from retrim.config.loading import dump, values
@@ -34,8 +34,8 @@ from retrim.evaluation.sweep import Sweep, _Kept, read_sweep
 from retrim.io.checkpoint import architecture, load_delta, lora_header
 from retrim.io.logs import read_flight_log, read_map
 from retrim.io.logs.log_map import LogMap
-from retrim.live.knobs import Knobs
-from retrim.live.mission import Mission
+from retrim.live.learner_mission import LearnerMission
+from retrim.live.manual_disturbance import ManualDisturbance
 from retrim.onboard.messages import (
     COLUMNS,
     FlightRows,
@@ -273,7 +273,9 @@ class Maker:
 
         def case(name, state, about, fine=False):
             def read():
-                return load_learnt(self.file(wire.pack(state, kind="learnt", about=written(about)), ".safetensors"))
+                return load_learner_state(
+                    self.file(wire.pack(state, kind="learnt", about=written(about)), ".safetensors")
+                )
 
             return Case(name, read, fine)
 
@@ -442,7 +444,7 @@ class Maker:
                 file = start if isinstance(start, bytes) else start()
                 about = written({"fields": text, "bytes": str(len(file))})
                 data = pack_arrays({"start": np.frombuffer(file, np.uint8)}, kind="mission", about=about)
-                mission = Mission.unpack(data)
+                mission = LearnerMission.unpack(data)
                 mission.check(())
                 return mission
 
@@ -460,12 +462,12 @@ class Maker:
 
     def messages(self) -> Iterator[Case]:
         """Small messages: notes, knobs, parameters, updates."""
-        knobs = dict(vars(Knobs()))
+        knobs = dict(vars(ManualDisturbance()))
         for name, text, fine in variants(json.loads(json.dumps(knobs)), toml=False):
             may = fine or "key" in name or any(word in name for word in ("true", "text", "kicks"))
 
             def read(text=text):
-                return Knobs.unpack(pack_arrays({}, kind="knobs", about={"fields": text()}))
+                return ManualDisturbance.unpack(pack_arrays({}, kind="knobs", about={"fields": text()}))
 
             yield Case(f"knobs {name}", read, may)
         many = "{" + ",".join(f'"k{i}":1' for i in range(9999)) + "}"

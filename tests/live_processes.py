@@ -10,11 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
+from retrim.onboard.commands import wait_for_take_off
 from retrim.onboard.guard import UP, G
-from retrim.onboard.heart import Heart
+from retrim.onboard.heartbeat import Heart
 from retrim.onboard.messages import Parameters, Sample, Setpoint, pack_note
-from retrim.onboard.orders import wait_for_take_off
-from retrim.onboard.realtime import Lifeline, be_punctual, sleep_until
+from retrim.onboard.realtime import ParentWatch, be_punctual, sleep_until
 from retrim.onboard.topics import OUT
 from retrim.transport.remote import Address
 from retrim.transport.shared_memory import SharedMemoryBus
@@ -57,7 +57,7 @@ class DrillPlan:
 
 def plant(plan: DrillPlan) -> None:
     """A point mass with a delay of a tick, against the clock."""
-    bus, parent = SharedMemoryBus(plan.folder), Lifeline(plan.parent)
+    bus, parent = SharedMemoryBus(plan.folder), ParentWatch(plan.parent)
     bus.publish("ready.plant", pack_note("ready", refused=be_punctual(20, {0})))
     if (epoch := wait_for_take_off(bus, parent)) is None:
         return
@@ -81,7 +81,7 @@ def plant(plan: DrillPlan) -> None:
 
 def learner(plan: DrillPlan) -> None:
     """Gains near those that are flown, now and then."""
-    bus, parent = SharedMemoryBus(plan.folder), Lifeline(plan.parent)
+    bus, parent = SharedMemoryBus(plan.folder), ParentWatch(plan.parent)
     bus.publish(f"ready.{plan.role}", pack_note("ready", base=plan.base))
     topic, rng, heart = "parameters.policy", np.random.default_rng(), Heart(bus, plan.role)
     while not parent.gone(0.1) and bus.latest("ended") is None:

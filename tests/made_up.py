@@ -5,7 +5,7 @@ import contextlib
 import numpy as np
 
 from retrim import Log, Scenario
-from retrim.evaluation.gathering import Flights
+from retrim.evaluation.executor import Flights
 from retrim.evaluation.study import Study
 from retrim.runkit import Flight, FlightSpec
 from retrim.runkit.reporter import Silent

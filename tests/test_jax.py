@@ -9,7 +9,7 @@ from pathlib import Path
 import jax
 import pytest
 
-from retrim.evaluation.known_fault import EXCLUDED
+from retrim.evaluation.jax_bug_check import EXCLUDED
 
 ROOT = Path(__file__).parent.parent
 
@@ -19,7 +19,7 @@ def test_batched_products_are_right_as_users_compile_them():
     sizes = [("float32", 1_000), ("float32", 16_385), ("float32", 32_769), ("float64", 16_385)]
     code = (
         "import retrim, jax; jax.config.update('jax_enable_x64', True); import jax.numpy as jnp\n"
-        "from retrim.evaluation.known_fault import wrong_rows\n"
+        "from retrim.evaluation.jax_bug_check import wrong_rows\n"
         f"print([wrong_rows(n, jnp.dtype(dtype)) for dtype, n in {sizes}])"
     )
     plain = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}

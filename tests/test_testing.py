@@ -69,7 +69,7 @@ def test_a_faulty_plant_breaks_a_law_by_name(fault, law):
 
 @pytest.mark.parametrize("preset", ["hover/fast", "track/preview", "vision/occluded"])
 def test_tasks_conform(preset):
-    testing.check_task(Setup.from_preset(load(preset)).flown, starts=4)
+    testing.check_task(Setup.from_preset(load(preset)).flight_task, starts=4)
 
 
 def test_a_faulty_task_breaks_a_law_by_name():

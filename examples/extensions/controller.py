@@ -18,4 +18,4 @@ class Pd(retrim.AbstractController):
         return retrim.Command(thrust[2], jnp.array([-thrust[1], thrust[0], 0.0])), memory
 
 
-pd = retrim.MethodEntry(lambda request: retrim.ControllerPilot(Pd(request.setup.flown)), "PD")
+pd = retrim.MethodEntry(lambda request: retrim.ControllerPilot(Pd(request.setup.flight_task)), "PD")

@@ -58,10 +58,10 @@ from .errors import PlantError as PlantError
 from .errors import RetrimError as RetrimError
 from .evaluation import Fleet as Fleet
 from .io import load_delta as load_delta
-from .io import load_learnt as load_learnt
+from .io import load_learner_state as load_learner_state
 from .io import load_policy as load_policy
 from .io import save_delta as save_delta
-from .io import save_learnt as save_learnt
+from .io import save_learner_state as save_learner_state
 from .io import save_policy as save_policy
 from .learn import EnsembleModel as EnsembleModel
 from .learn import Env as Env

@@ -73,7 +73,7 @@ class Trained(NamedTuple):
 def flown(setup: Setup, policy: AbstractPolicy, n: int, seconds: float, seed: int) -> list[Log]:
     """Fly a policy without learning from random starts, on the study's plant, as one batch."""
     plants = [Scenario(PUSH, PLANT).make(setup.preset.vehicle, dt=setup.preset.dt) for _ in range(n)]
-    controller = PolicyController(setup.flown.observation_in_flight, policy)
+    controller = PolicyController(setup.flight_task.observation_in_flight, policy)
     return fly_together(
         [plant for plant in plants if isinstance(plant, SimPlant)],
         [ControllerPilot(controller) for _ in plants],
@@ -117,7 +117,7 @@ def retrained(setup: Setup, policy: AbstractPolicy, logs: Sequence[Log], key: Ke
     rows = _rows(windows, nominal, setup.preset.plant_delay_ticks)
     adapt = setup.preset.adapt
     adam = _adam(adapt.fit_learning_rate)
-    residual = EnsembleResidual.of(setup.flown.home(), setup.vehicle.omega_max, key=k_fit, members=1)
+    residual = EnsembleResidual.of(setup.flight_task.home(), setup.vehicle.omega_max, key=k_fit, members=1)
     fitted, errors = _fitted(EnsembleState.of(residual, adam), rows, adam, fit_epochs)
     dynamics = design_dynamics(setup, fitted.residual, choice)
     env = Env(dynamics, setup.env.task, setup.env.delay, longest_delay=setup.env.longest_delay)

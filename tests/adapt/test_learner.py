@@ -183,7 +183,7 @@ def test_the_papers_update_is_untouched_by_the_levers(setup, fresh, window):
             optax.scale_by_adam(),
             optax.scale_by_schedule(lambda step: -setup.preset.adapt.learning_rate * schedule(step)),
         )
-        x0 = random_starts(setup.flown, random.split(random.key(8), 3)[0], learner.num_updates, learner.num_envs)
+        x0 = random_starts(setup.flight_task, random.split(random.key(8), 3)[0], learner.num_updates, learner.num_envs)
         env = setup.env.with_residual(FittedResidual(learner.residual_model, residual))
         return bptt(PolicyState(policy, adam.init(policy.params)), env, x0, optimiser=adam)[0]
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from commands import SMALL, results, retrim
-from retrim import Fleet, load_learnt, load_policy
+from retrim import Fleet, load_learner_state, load_policy
 
 pytestmark = pytest.mark.usefixtures("as_a_user")
 
@@ -70,11 +70,11 @@ def test_fly_writes_rows_events_logs_and_pictures(folder):
 
 
 def test_what_was_learnt_is_kept_and_goes_on(folder):
-    state, preset = load_learnt(folder / "f" / "learnt.safetensors")
+    state, preset = load_learner_state(folder / "f" / "learner_state.safetensors")
     assert preset.name == "hover/retrim"
     adapted, _ = load_policy(folder / "f" / "adapted.safetensors")
     np.testing.assert_array_equal(adapted.layers[0].weight, state.policy.policy.layers[0].weight)
-    retrim("fly", "--resume", "f/learnt.safetensors", *ROUGH, "--seconds", "2", "--out", "r", cwd=folder)
+    retrim("fly", "--resume", "f/learner_state.safetensors", *ROUGH, "--seconds", "2", "--out", "r", cwd=folder)
     went_on = results(folder / "r")["rows"]
     assert [row["method"] for row in went_on] == ["base", "full"]
 
@@ -95,7 +95,7 @@ def test_a_full_disk_loses_no_flight(folder, monkeypatch):
     for name in ("what was learnt", "events.jsonl", "the logs", "results.json"):
         assert f"retrim: {name} cannot be written to full (No space left on device); it is in {place}" in out
     assert results(place)["rows"] == results(folder / "f")["rows"]
-    assert load_learnt(place / "learnt.safetensors")[1].name == "hover/retrim"
+    assert load_learner_state(place / "learner_state.safetensors")[1].name == "hover/retrim"
     assert len(list((place / "logs").glob("*.npz"))) == 4
     shutil.rmtree(place)
 
@@ -126,7 +126,7 @@ def test_live_flies_against_the_clock_learns_and_lands(folder):
     assert found["steady"] < 0.4  # as in lockstep; as it is, this small policy is metres off after five seconds
     assert (found["refused_messages"], found["restarts"]) == (0, 0)
     assert found["fallback_ticks"] < 125  # of 250: where other tests run, a process may be held back once for 0.1 s
-    assert load_learnt(folder / "l" / "learnt.safetensors")[1].name == "hover/retrim"
+    assert load_learner_state(folder / "l" / "learner_state.safetensors")[1].name == "hover/retrim"
     load_policy(folder / "l" / "adapted.safetensors")
     assert (folder / "l" / "live.png").stat().st_size > 10_000
     events = [json.loads(line) for line in (folder / "l" / "events.jsonl").read_text().splitlines()]
@@ -137,7 +137,7 @@ def test_what_live_refuses(folder):
     for words, said in (
         (("--fence", "0.1"), "--fence 0.1 m must be between 0.5 and 1000"),
         (("--seconds", "0"), "--seconds 0 must be between 1 and 3600"),
-        (("--resume", "f/learnt.safetensors"), "give either --policy FILE or --resume FILE"),
+        (("--resume", "f/learner_state.safetensors"), "give either --policy FILE or --resume FILE"),
         (("--adapt", "nothing"), "'nothing'"),
         (("--plant", "moon"), "'moon'"),
         (("--policy-age", "-1"), "--policy-age -1 s must be positive"),
@@ -169,7 +169,7 @@ def test_what_was_adapted_flies_as_it_is_and_the_default_folder_is_a_new_one_und
     retrim("fly", "--policy", "f/adapted.safetensors", "--seconds", "2", "--adapt", "none", cwd=folder)
     (made,) = (folder / "runs").glob("fly-*")
     assert [row["method"] for row in results(made)["rows"]] == ["base"]
-    assert not (made / "learnt.safetensors").exists()
+    assert not (made / "learner_state.safetensors").exists()
 
 
 def test_demo_at_reduced_size(folder, monkeypatch):

@@ -8,7 +8,7 @@ import pytest
 
 from commands import retrim
 from helpers import tiny_preset
-from retrim import Setup, changed, load, save_delta, save_learnt, save_policy
+from retrim import Setup, changed, load, save_delta, save_learner_state, save_policy
 
 pytestmark = pytest.mark.usefixtures("as_a_user")
 
@@ -53,7 +53,9 @@ def folder(tmp_path_factory, as_a_user):
         policy = setup.new_policy(jax.random.key(0))
         save_policy(here / name / "policy.safetensors", policy, preset)
         if name == "p":
-            save_learnt(here / "learnt.safetensors", setup.learner.init(policy, jax.random.key(1)), preset)
+            save_learner_state(
+                here / "learner_state.safetensors", setup.learner.init(policy, jax.random.key(1)), preset
+            )
             other = setup.new_policy(jax.random.key(2))
             save_delta(here / "delta.safetensors", setup.low_rank(other, jax.random.key(3)))
     whole = (here / "p" / "policy.safetensors").read_bytes()
@@ -151,16 +153,19 @@ WRONG = [
     ((*FLY, "--config", "history.toml"), "command_history = 3, but the policy was trained with 2"),
     ((*FLY, "--config", "trained.toml"), "[pretrain] cannot change for a policy that is trained"),
     (("fly",), "give either --policy FILE or --resume FILE"),
-    ((*FLY, "--resume", "learnt.safetensors"), "give either --policy FILE or --resume FILE"),
+    ((*FLY, "--resume", "learner_state.safetensors"), "give either --policy FILE or --resume FILE"),
     (("fly", "--policy", "missing"), "missing: no such file; `retrim pretrain hover --out DIR` makes one"),
     (("fly", "--policy", "cut.safetensors"), "cut.safetensors: not a whole safetensors file"),
     (("fly", "--policy", "flipped.safetensors"), "flipped.safetensors: the checksum does not match"),
     (("fly", "--policy", "notes.safetensors"), "notes.safetensors: not a whole safetensors file"),
-    (("fly", "--policy", "learnt.safetensors"), "learnt.safetensors: holds what a flight has learnt; go on from it"),
+    (
+        ("fly", "--policy", "learner_state.safetensors"),
+        "learner_state.safetensors: holds what a flight has learnt; go on from it",
+    ),
     (("fly", "--resume", "p/policy.safetensors"), "holds a 'policy', expected a 'learnt'"),
-    (("fly", "--resume", "missing"), "missing: no such file; `retrim fly --out DIR` makes a learnt.safetensors"),
-    (("fly", "--resume", "learnt.safetensors", "--delta", "delta.safetensors"), "--delta goes with --policy"),
-    (("fly", "--resume", "learnt.safetensors", "--residual", "ensemble"), "goes on with its own residual"),
+    (("fly", "--resume", "missing"), "missing: no such file; `retrim fly --out DIR` makes a learner_state.safetensors"),
+    (("fly", "--resume", "learner_state.safetensors", "--delta", "delta.safetensors"), "--delta goes with --policy"),
+    (("fly", "--resume", "learner_state.safetensors", "--residual", "ensemble"), "goes on with its own residual"),
     ((*FLY, "--delta", "delta.safetensors"), "made for another base policy"),
     ((*FLY, "--delta", "p/policy.safetensors"), "holds a 'policy', expected a 'delta'"),
     # sweeps

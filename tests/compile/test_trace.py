@@ -14,7 +14,7 @@ from retrim.compile.ops.program import NumpyProgram
 from retrim.compile.trace import numpy_program, plain
 from retrim.config.named_presets import PRESETS
 from retrim.config.setup import Setup
-from retrim.control.mppi import Mppi
+from retrim.control.mppi import MppiController
 from retrim.errors import ConfigError
 from retrim.live.controllers import plain_source
 from retrim.onboard.pilot import LivePilot
@@ -198,7 +198,7 @@ def test_a_controller_that_plans_by_random_roll_outs_flies_the_same_commands():
     setup = Setup.from_preset(PRESETS["hover/fast"])
     pilot = setup.pilot(setup.new_policy(random.key(0)), "mppi", random.key(1))
     assert isinstance(pilot, ControllerPilot)
-    assert isinstance(pilot.controller, Mppi)
+    assert isinstance(pilot.controller, MppiController)
     controller = dataclasses.replace(pilot.controller, samples=8, horizon=6)
     live, lockstep = LivePilot(plain_source(setup, controller)), ControllerPilot(controller)
     for i in range(5):

@@ -9,9 +9,9 @@ from jax import random
 from helpers import brief_preset
 from retrim import AdaptivePilot, ConfigError, Setup, State, changed, load
 from retrim.config.methods import METHODS, MethodRequest, find_method
-from retrim.control.seen_pose import SeenPose
+from retrim.control.pose_filtered import PoseFilteredController
 from retrim.plants.plant import Measurement
-from retrim_paper.raptor.passive import Passive
+from retrim_paper.raptor.passive import HoverController
 
 
 @pytest.fixture(scope="module")
@@ -48,11 +48,11 @@ def test_methods_that_need_what_keypoints_do_not_give_are_refused(seeing, name, 
 def test_a_controller_flies_by_the_pose_that_the_filter_sees(seeing, key):
     setup = seeing["retrim"]
     pilot = setup.pilot(setup.new_policy(key), "indi", key)
-    assert type(pilot.controller) is SeenPose
+    assert type(pilot.controller) is PoseFilteredController
     pilot.reset(Measurement(0.0, setup.flight_starts(1)[0]))
     plain = Setup.from_preset(brief_preset()).pilot(None, "indi", key)
-    assert type(plain.controller) is not SeenPose
-    own = Passive()
+    assert type(plain.controller) is not PoseFilteredController
+    own = HoverController()
     assert MethodRequest(Setup.from_preset(brief_preset()), None).by_state(own) is own
     with pytest.raises(ConfigError, match="method 'Passive' needs the state"):
         MethodRequest(seeing["ideal"], None).by_state(own)
@@ -93,7 +93,7 @@ def test_every_method_of_a_policy_for_many_vehicles_gives_a_command(name, method
     pilot = setup.pilot(setup.new_policy(random.key(0)), method, random.key(1))
     learning = isinstance(pilot, AdaptivePilot)
     controller = pilot.controller_of(pilot.state) if learning else pilot.controller
-    x = State.at(setup.flown.home())
+    x = State.at(setup.flight_task.home())
     memory = eqx.filter_eval_shape(controller.init, x)
     u, after = eqx.filter_eval_shape(controller, memory, jnp.zeros_like(x.p[0]), x)
     assert (u.c.shape, u.omega.shape) == ((), (3,))

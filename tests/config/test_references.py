@@ -76,10 +76,10 @@ def test_every_registered_name_makes_a_reference():
 def test_a_flight_lasts_as_long_as_a_reference_that_ends(lap):
     """Its last seconds are what is scored: a flight of 60 s would be scored while it hovers."""
     preset = load("track/preview")
-    assert Setup.from_preset(preset, str(lap)).flown.flight_seconds == 60.0
-    assert Setup.from_preset(preset, f"{lap}:once").flown.flight_seconds == pytest.approx(math.pi, abs=1e-3)
-    assert Setup.from_preset(preset, "circle").flown.flight_seconds == 60.0
-    assert Setup.from_preset(preset).flown.flight_seconds == 60.0
+    assert Setup.from_preset(preset, str(lap)).flight_task.flight_seconds == 60.0
+    assert Setup.from_preset(preset, f"{lap}:once").flight_task.flight_seconds == pytest.approx(math.pi, abs=1e-3)
+    assert Setup.from_preset(preset, "circle").flight_task.flight_seconds == 60.0
+    assert Setup.from_preset(preset).flight_task.flight_seconds == 60.0
 
 
 def test_limits_are_those_of_the_vehicle_that_flies():

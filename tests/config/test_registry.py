@@ -205,9 +205,9 @@ def test_ones_own_task(mine):
     preset = changed(tiny_preset(), task=f"{mine}:task", options={"height": 2.5})
     setup = Setup.from_preset(preset)
     assert type(setup.env.task).__name__ == "Higher"
-    np.testing.assert_array_equal(setup.flown.home(), [0.0, 0.0, 2.5])
+    np.testing.assert_array_equal(setup.flight_task.home(), [0.0, 0.0, 2.5])
     assert setup.env.task.horizon == preset.pretrain.horizon
-    assert setup.learner.env.task is setup.flown
+    assert setup.learner.env.task is setup.flight_task
     assert float(setup.flight_starts(1)[0].p[2]) == pytest.approx(2.5, abs=1.0)
     entry = changed(tiny_preset(), task=f"{mine}:entry", options={"height": 2.5})
     assert type(Setup.from_preset(entry).env.task).__name__ == "Higher"
@@ -278,7 +278,7 @@ def test_ones_own_reference(mine):
     found = make_reference(f"{mine}:reference")
     np.testing.assert_allclose(found(jnp.array(2.0)).p, [0.0, 0.0, 1.2], atol=1e-6)
     setup = Setup.from_preset(changed(load("track/paper"), pretrain={"hidden_sizes": (8,)}), f"{mine}:reference")
-    np.testing.assert_allclose(setup.flown.reference(jnp.array(2.0)).p, [0.0, 0.0, 1.2], atol=1e-6)
+    np.testing.assert_allclose(setup.flight_task.reference(jnp.array(2.0)).p, [0.0, 0.0, 1.2], atol=1e-6)
     with pytest.raises(ConfigError, match=r"reference 'circle': a hover policy follows none"):
         Setup.from_preset(tiny_preset(), "circle")
     with pytest.raises(ConfigError, match=rf"reference '{mine}:no_vehicle' is a str, not a function that gives"):

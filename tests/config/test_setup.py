@@ -22,7 +22,7 @@ from retrim.config.vehicle_file import VehicleSpec
 from retrim.config.vehicles import make_vehicle
 from retrim.control.actuator_tracking import ActuatorTracking
 from retrim.control.controller import PolicyController
-from retrim.control.gravity_frame import GravityFrame, SeenFrame
+from retrim.control.gravity_frame import GravityFrame, PoseFrame
 from retrim.control.identified import IdentifiedFlight
 from retrim.control.monitor import Monitor
 from retrim.control.near_target import NearTarget
@@ -66,7 +66,7 @@ def test_every_clock_ticks_alike(built):
     preset, made = built
     for env in (made.env, made.learner.env):
         assert env.dynamics.dt == env.task.dt == preset.dt
-    assert made.flown.dt == preset.dt
+    assert made.flight_task.dt == preset.dt
     assert Scenario().make(dt=preset.dt).dt == preset.dt
 
 
@@ -136,7 +136,7 @@ def test_the_observation_has_the_presets_numbers(built):
 
 def test_occlusion_is_switched_on_in_flight_alone(built):
     preset, made = built
-    flown = made.flown.observation_in_flight
+    flown = made.flight_task.observation_in_flight
     if preset.name in ("vision/occluded", "vision/retrim"):
         assert isinstance(flown, OccludedKeypoints)
         assert float(flown.dropout) == preset.vision.dropout == 0.05
@@ -146,7 +146,7 @@ def test_occlusion_is_switched_on_in_flight_alone(built):
         np.testing.assert_array_equal(flown.full.whiten, made.env.task.observation.whiten)
         assert isinstance(made.learner.env.task.observation, Keypoints)  # nor in updates
     else:
-        assert flown is made.flown.observation
+        assert flown is made.flight_task.observation
 
 
 def test_a_policy_has_the_presets_layers_and_the_vehicles_limits(built):
@@ -186,7 +186,7 @@ def test_the_learner_has_the_presets_numbers(built):
         assert isinstance(learner.view, RestView if preset.task == "vision" else GravityView)
     else:
         assert isinstance(learner.view, WorldView)
-    assert learner.env.task is made.flown
+    assert learner.env.task is made.flight_task
     assert isinstance(learner.trim, RestTrim if a.trim == "rest" else Untrimmed)
     model = learner.residual_model
     if a.residual != "ensemble":
@@ -234,7 +234,7 @@ def test_the_pilot_has_the_presets_schedule(built, latency, monkeypatch):
         assert isinstance(flown.inner, ActuatorTracking)
         flown = flown.inner.inner
     if a.frame == "gravity" and preset.task == "vision":
-        assert isinstance(flown, SeenFrame)
+        assert isinstance(flown, PoseFrame)
         flown = flown.inner
     elif a.frame == "gravity":
         assert isinstance(flown, Monitor)
@@ -251,9 +251,9 @@ def test_the_pilot_has_the_presets_schedule(built, latency, monkeypatch):
         flown = flown.inner
     assert isinstance(flown, PolicyController)
     if preset.family is None:
-        assert flown.observation is made.flown.observation_in_flight
+        assert flown.observation is made.flight_task.observation_in_flight
     else:  # with the belief about the vehicle
-        assert flown.observation.inner is made.flown.observation.inner
+        assert flown.observation.inner is made.flight_task.observation.inner
 
 
 def test_methods(built):
@@ -361,7 +361,7 @@ def test_a_frame_is_refused_for_what_cannot_be_turned():
             return self.goal + t
 
     fixed = Setup.from_preset(tiny_preset())
-    f = fixed.flown
+    f = fixed.flight_task
     check_frame(fixed.preset, f)
     with pytest.raises(ConfigError, match="Moving overrides target"):
         check_frame(fixed.preset, Moving(f.goal, f.observation, f.box, f.heading, f.dt, f.horizon))
@@ -369,13 +369,13 @@ def test_a_frame_is_refused_for_what_cannot_be_turned():
         Setup.from_preset(changed(load("vision/ideal"), adapt={"frame": "gravity"}))
     seeing = Setup.from_preset("vision/retrim")
     assert isinstance(seeing.learner.view, RestView)
-    assert isinstance(seeing.pilot(seeing.new_policy(random.key(0)), "base-do").controller, SeenFrame)
+    assert isinstance(seeing.pilot(seeing.new_policy(random.key(0)), "base-do").controller, PoseFrame)
 
 
 def test_training_follows_references_as_they_are_felt():
     """Every member of the family is a built-in reference, level or tilted and scaled; flight follows the plain one."""
     made = Setup.from_preset(changed(load("track/retrim"), track={"reference": "circle+star", "felt_copies": 2}))
-    trained, flown = made.env.task.reference, made.flown.reference
+    trained, flown = made.env.task.reference, made.flight_task.reference
     assert trained.joins.shape[0] == 2 * (1 + 2)
     assert flown.joins.shape[0] == 2
     starts = trained.joins[:, 0]

@@ -7,7 +7,7 @@ import pytest
 from jax import random
 
 from helpers import tiny_preset
-from retrim import CheckpointError, ConfigError, Setup, load_learnt, load_policy, save_learnt, save_policy
+from retrim import CheckpointError, ConfigError, Setup, load_learner_state, load_policy, save_learner_state, save_policy
 from retrim.config import changed, load, overlaid
 from retrim.config.trust import check_trust, python_names
 from retrim.evaluation.sweep import read_sweep
@@ -68,14 +68,14 @@ def test_a_policy_file_imports_what_is_trusted_and_nothing_else(mine, tmp_path, 
     policy = setup.new_policy(random.key(0))
     state = setup.learner.init(policy, random.key(1))
     save_policy(tmp_path / "p.safetensors", policy, changed(preset, **{key: name}))
-    save_learnt(tmp_path / "l.safetensors", state, changed(preset, **{key: name}))
-    for read, file in ((load_policy, "p.safetensors"), (load_learnt, "l.safetensors")):
+    save_learner_state(tmp_path / "l.safetensors", state, changed(preset, **{key: name}))
+    for read, file in ((load_policy, "p.safetensors"), (load_learner_state, "l.safetensors")):
         for trust in ((), (f"{mine}:other",)):
             with pytest.raises(CheckpointError, match=f"names Python code, '{name}'"):
                 read(tmp_path / file, trust=trust)
     assert not (tmp_path / "mark").exists()
     assert mine not in sys.modules
-    for read, file in ((load_policy, "p.safetensors"), (load_learnt, "l.safetensors")):
+    for read, file in ((load_policy, "p.safetensors"), (load_learner_state, "l.safetensors")):
         assert getattr(read(tmp_path / file, trust=(name,))[1], key) == name
     assert (tmp_path / "mark").exists()
 

@@ -10,8 +10,8 @@ from jax import lax, random
 
 from helpers import GOAL, at, first_order, hover_task, random_state
 from retrim.control.attitude import LEAST_LIFT, attitude_of, command_for, flyable, thrust_of
-from retrim.control.geometric import Gains, Geometric
-from retrim.control.indi import Incremental
+from retrim.control.geometric import Gains, GeometricController
+from retrim.control.indi import IndiController
 from retrim.estimation.prediction import Prediction
 from retrim.physics import Command, CommandPath, PointMass, State, small, so3
 from retrim.physics.actuators import Lagged
@@ -29,8 +29,8 @@ def gains(integral=0.0):
 
 def made(kind, task):
     if kind == "indi":
-        return Incremental(task, gains(), PREDICTION, jnp.array(0.08), *LIMITS)
-    return Geometric(task, gains(12.0 if kind == "geometric-i" else 0.0), PREDICTION, jnp.array(6.0), *LIMITS)
+        return IndiController(task, gains(), PREDICTION, jnp.array(0.08), *LIMITS)
+    return GeometricController(task, gains(12.0 if kind == "geometric-i" else 0.0), PREDICTION, jnp.array(6.0), *LIMITS)
 
 
 @eqx.filter_jit

@@ -13,13 +13,13 @@ from helpers import GOAL, first_order, hover_env, hover_task, random_command, ra
 from retrim.adapt.views import GravityView, RestView, WorldView
 from retrim.control import Policy
 from retrim.control.controller import PolicyController
-from retrim.control.gravity_frame import GravityFrame, SeenFrame, Unsteady
+from retrim.control.gravity_frame import GravityFrame, PoseFrame, StateDependentResidual
 from retrim.estimation.disturbance_observer import DisturbanceObserver
 from retrim.learn import Env, FittedResidual, rollout
 from retrim.learn.residuals import RegressionModel
 from retrim.physics import ActuatorState, Command, Hybrid, PointMass, State, small, so3
 from retrim.physics.actuators import Lagged, RateBiased
-from retrim.physics.felt_frame import FeltFrame
+from retrim.physics.effective_gravity import EffectiveGravityFrame
 from retrim.tasks import (
     Keypoints,
     L2Track,
@@ -56,7 +56,7 @@ def close(a, b, atol=1e-12):
 
 @pytest.mark.parametrize("d", PUSHES)
 def test_felt_gravity_is_standard_gravity_in_the_frame(d):
-    frame = FeltFrame.of(jnp.array(d))
+    frame = EffectiveGravityFrame.of(jnp.array(d))
     np.testing.assert_allclose(frame.Q @ frame.Q.T, np.eye(3), atol=1e-12)
     assert float(jnp.linalg.det(frame.Q)) == pytest.approx(1.0)
     felt = jnp.array([0.0, 0.0, -9.81]) + jnp.array(d)
@@ -73,7 +73,7 @@ def test_a_tick_in_the_frame_is_a_tick_in_the_world(model, key):
 
     def ticks(d, drag):
         residual = lambda x, u: d - drag * x.v + drag * u.c * x.R[:, 0]  # noqa: E731
-        frame = FeltFrame.of(d)
+        frame = EffectiveGravityFrame.of(d)
         left = lambda x, u: frame.vector(residual(frame.world_state(x), frame.world_command(u)) - d)  # noqa: E731
         world, inside = Hybrid(model, residual), Hybrid(model, left)
         s, turned = world.init(x), inside.init(frame.state(x))
@@ -88,7 +88,7 @@ def test_a_tick_in_the_frame_is_a_tick_in_the_world(model, key):
 
 
 def test_into_the_frame_and_back_is_nothing(key):
-    frame = FeltFrame.of(jnp.array([1.0, -2.0, 3.0]))
+    frame = EffectiveGravityFrame.of(jnp.array([1.0, -2.0, 3.0]))
     x, u = random_state(key), random_command(key)
     close(frame.world_state(frame.state(x)), x)
     close(frame.world_command(frame.command(u)), u)
@@ -102,7 +102,7 @@ def test_flatness_flies_the_turned_reference(make):
     @jax.jit
     @jax.vmap
     def seen(d):
-        frame = FeltFrame.of(d)
+        frame = EffectiveGravityFrame.of(d)
         here, framed = jax.vmap(reference)(times), reference.in_frame(frame)
         turned = jax.vmap(framed)(times)
         close_to = (jax.vmap(frame.vector)(here.p), jax.vmap(frame.vector)(here.v))
@@ -127,7 +127,7 @@ def test_the_turned_command_follows_the_turned_path():
     @jax.jit
     @jax.vmap
     def ends(d):
-        reference = circle().in_frame(FeltFrame.of(d))
+        reference = circle().in_frame(EffectiveGravityFrame.of(d))
 
         def attitude(t):
             here = reference(t)
@@ -152,7 +152,7 @@ def test_the_turned_command_follows_the_turned_path():
 @pytest.mark.parametrize("kind", [Track, L2Track])
 def test_a_turned_task_sees_and_rewards_the_same(kind, key):
     """The reference's own state has the same reward, and what a preview shows is turned and scaled."""
-    reference, frame = figure8(), FeltFrame.of(jnp.array([1.0, 2.0, -1.0]))
+    reference, frame = figure8(), EffectiveGravityFrame.of(jnp.array([1.0, 2.0, -1.0]))
     task = kind(reference, Preview(reference, small().omega_max), jnp.array(1.0), jnp.array(5.0), 0.02, 50)
     t, x = jnp.array(4.2), random_state(key)
 
@@ -179,7 +179,7 @@ def test_a_turned_task_sees_and_rewards_the_same(kind, key):
 def test_a_constant_push_leaves_nothing_to_learn(d, key):
     """Roll-outs in the view under a known push are those without one, in the frame; so are their rewards."""
     env, d = hover_env(horizon=25), jnp.array(d)  # too short to be terminated
-    frame, policy = FeltFrame.of(d), fresh(15, key)
+    frame, policy = EffectiveGravityFrame.of(d), fresh(15, key)
     start = Start(jnp.array(0.0), random_state(key))
     pushed = roll(GravityView(LIMIT)(env, eqx.Partial(always, d)), policy, start)
     calm_env, calm_start = Env(env.dynamics, env.task.in_frame(frame)), Start(start.t, frame.state(start.x))
@@ -223,7 +223,7 @@ def test_what_is_known_needs_no_estimate(key):
         memory = replaced(memory, observer=observer.issued(first, u))  # no delay is declared: it acts at once
         after = Hybrid(PointMass(0.02), residual).step(x, u, jnp.zeros(3))
         _, memory = framed(memory, jnp.array(0.0), after)
-        apart = Unsteady(residual, jnp.array(1.0))(x, u) + d, residual(x, u)
+        apart = StateDependentResidual(residual, jnp.array(1.0))(x, u) + d, residual(x, u)
         return apart, memory.observer.d_hat, (memory.frame.d, residual(after, u))
 
     apart, d_hat, both = seen()
@@ -239,7 +239,7 @@ def test_the_frame_is_capped_and_defined_near_free_fall():
     falling = State(jnp.zeros(3), jnp.eye(3), jnp.array([0.0, 0.0, -1e4]))
     s = observer(replaced(s, t=jnp.array(0.0)), jnp.array(0.02), falling)
     assert float(jnp.linalg.norm(s.d_hat)) <= 6.0 + 1e-6
-    frame = FeltFrame.of(s.d_hat)
+    frame = EffectiveGravityFrame.of(s.d_hat)
     assert np.isfinite(frame.Q).all()
     assert 0.0 < float(frame.scale) < 3.0
 
@@ -247,10 +247,10 @@ def test_the_frame_is_capped_and_defined_near_free_fall():
 def test_what_a_pose_filter_feels_turns_the_picture(key):
     """With an estimate that is right, the command under a push is that of the calm flight; the last one is kept."""
     d, x = jnp.array([1.5, -1.0, 2.0]), State(HOME + jnp.array([0.1, -0.1, 0.1]), jnp.eye(3), jnp.zeros(3))
-    frame = FeltFrame.of(d)
+    frame = EffectiveGravityFrame.of(d)
     full = Keypoints.of(HOME, small().omega_max, whitened=False)
     policy = awake(full.size, key)
-    controller = SeenFrame(PolicyController(OccludedKeypoints(full, jnp.array(1.0)), policy), LIMIT)
+    controller = PoseFrame(PolicyController(OccludedKeypoints(full, jnp.array(1.0)), policy), LIMIT)
     calm = PolicyController(full.in_frame(frame), policy)
 
     @jax.jit
@@ -289,7 +289,7 @@ def test_what_a_roll_out_remembers_of_pictures_is_of_the_frame_that_it_flies_in(
 
     looking = Looking(**{f.name: getattr(full, f.name) for f in dataclasses.fields(full)})
     env = eqx.tree_at(lambda e: e.task.observation, env, looking)
-    frame = FeltFrame.of(d)
+    frame = EffectiveGravityFrame.of(d)
     at_rest = State(HOME, frame.world_state(State.at(frame.vector(HOME))).R, jnp.zeros(3))
     policy = fresh(full.size, key)
     still = eqx.tree_at(lambda p: p.layers[-1].weight, policy, jnp.zeros_like(policy.layers[-1].weight))
@@ -303,7 +303,7 @@ def test_training_on_keypoints_sees_one_frame(key):
     """That of what was learnt, at rest; its norm is limited."""
     d, env = jnp.array([1.5, -1.0, 2.0]), hover_env(horizon=3)
     seen = RestView(LIMIT)(env, lambda x, u: d - 0.5 * x.v)
-    close(seen.frame(random_state(key), Command.hover()), FeltFrame.of(d))
+    close(seen.frame(random_state(key), Command.hover()), EffectiveGravityFrame.of(d))
     far = RestView(LIMIT)(env, lambda x, u: 9.0 * d).frame(random_state(key), Command.hover())
     np.testing.assert_allclose(jnp.linalg.norm(far.d), LIMIT, rtol=1e-6)
 
@@ -314,7 +314,7 @@ def test_a_flight_under_a_known_push_is_the_calm_flight_turned(d, tracking):
     """With a perfect estimate, a controller flies under a push as without one, in the frame."""
     env, d = hover_env(horizon=40), jnp.array(d)
     frame, x0 = (
-        FeltFrame.of(d),
+        EffectiveGravityFrame.of(d),
         State(HOME + jnp.array([0.2, -0.1, 0.3]), so3.exp(jnp.array([0.1, 0.2, 0.0])), jnp.zeros(3)),
     )
     if tracking is not None:

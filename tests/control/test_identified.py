@@ -171,7 +171,7 @@ def test_the_tracked_rates_are_those_of_the_vehicle(x0, sensed):
 @pytest.mark.parametrize("wrap", [FiniteController, "integral", "near", "tracking"])
 def test_controllers_around_another_one_pass_the_vehicle_on(wrap, x0):
     """A wrapper that swallowed it would fly a policy for the wrong vehicle without a word."""
-    task = Setup.from_preset("hover/retrim").flown
+    task = Setup.from_preset("hover/retrim").flight_task
     makers = {
         "integral": lambda inner: IntegralAction(inner, task, jnp.array(0.5), jnp.array(1.0)),
         "near": lambda inner: NearTarget(inner, task, jnp.array(1.0)),

@@ -10,7 +10,7 @@ import pytest
 from jax import lax, random
 
 from helpers import GOAL, first_order, hover_task, random_state
-from retrim.control.mppi import Mppi, _turned
+from retrim.control.mppi import MppiController, _turned
 from retrim.estimation.l1 import L1Estimator
 from retrim.estimation.prediction import Prediction
 from retrim.physics import Command, CommandPath, PointMass, State, small, so3
@@ -25,7 +25,7 @@ PREDICTION = Prediction.of(CommandPath.of(DT, first_order(TAU)), DT)
 
 def mppi(estimator=None, samples=256, seed=0):
     numbers = (jnp.array(v) for v in (0.1, 0.05, 10.0, 1.0, 1.0))
-    return Mppi(
+    return MppiController(
         hover_task(),
         PREDICTION,
         small().command_min,

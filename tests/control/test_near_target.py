@@ -11,7 +11,7 @@ from helpers import hover_task, random_state
 from retrim.control import Policy, PolicyController
 from retrim.control.near_target import NearTarget
 from retrim.physics import State, small
-from retrim.physics.felt_frame import FeltFrame
+from retrim.physics.effective_gravity import EffectiveGravityFrame
 
 REACH = 0.3
 
@@ -46,7 +46,7 @@ def test_an_infinite_limit_changes_nothing(controller):
 
 
 def test_it_turns_with_its_task(controller):
-    frame, x = FeltFrame.of(jnp.array([1.0, -2.0, 0.5])), random_state(random.key(3))
+    frame, x = EffectiveGravityFrame.of(jnp.array([1.0, -2.0, 0.5])), random_state(random.key(3))
     turned, seen = controller.in_frame(frame), frame.state(x)
     home = turned.task.home()
     near = home + REACH * (seen.p - home) / jnp.linalg.norm(seen.p - home)

@@ -12,7 +12,7 @@ from retrim.control import Policy
 from retrim.control.controller import PolicyController
 from retrim.control.resting import RestingController
 from retrim.physics import Command, State, small, so3
-from retrim.physics.felt_frame import FeltFrame
+from retrim.physics.effective_gravity import EffectiveGravityFrame
 from retrim.physics.path_family import PathBelief
 from retrim.tasks import StateObs
 from retrim.tasks.vehicle_obs import VehicleObs
@@ -45,7 +45,7 @@ def test_at_rest_it_commands_hover(controller, heading, known):
 
 
 def test_it_turns_with_its_home(controller):
-    frame = FeltFrame.of(jnp.array([1.0, -2.0, 0.5]))
+    frame = EffectiveGravityFrame.of(jnp.array([1.0, -2.0, 0.5]))
     turned, x = controller.in_frame(frame), random_state(random.key(1))
     home = frame.state(State.at(jnp.array(GOAL)))
     heading = jnp.arctan2(home.R[1, 0], home.R[0, 0])

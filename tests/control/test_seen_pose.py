@@ -11,7 +11,7 @@ from helpers import GOAL, first_order, random_state, replaced
 from retrim import ConfigError, Setup
 from retrim.config.baselines import BASELINES
 from retrim.config.methods import MethodRequest
-from retrim.control.seen_pose import SeenPose
+from retrim.control.pose_filtered import PoseFilteredController
 from retrim.physics import Command, PointMass, State, so3
 from retrim.physics.actuators import Lagged
 from retrim.physics.state import STANDARD_GRAVITY
@@ -30,7 +30,7 @@ def setup():
 def made(setup, name, **changed):
     """The baseline as tables fly it from keypoints."""
     controller = MethodRequest(setup, None).by_state(BASELINES[name].controller(setup))
-    assert isinstance(controller, SeenPose)
+    assert isinstance(controller, PoseFilteredController)
     return replaced(controller, observation=replaced(controller.observation, **changed))
 
 

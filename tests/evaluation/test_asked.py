@@ -7,44 +7,51 @@ import pytest
 
 from helpers import brief_preset
 from retrim import ConfigError, Setup, changed, load
-from retrim.config.registry import told_of_own_module
-from retrim.evaluation.asked import Where, asked_preset, flown_reference, loaded, same_policy, with_residual
+from retrim.cli.arguments import (
+    FlightArguments,
+    loaded,
+    reference_of_flight,
+    same_policy,
+    training_preset,
+    with_residual,
+)
+from retrim.config.registry import describe_user_error
 from retrim.io.trained import load_policy, save_policy
 
 SEVEN_INCH = Path(__file__).parents[2] / "examples" / "extensions" / "vehicle.toml"
 
 
 def test_a_preset_is_that_of_the_task_with_what_was_asked_on_top(tmp_path):
-    assert asked_preset("hover") == load("hover/retrim")
-    assert asked_preset("hover", "hover/fast") == load("hover/fast")
+    assert training_preset("hover") == load("hover/retrim")
+    assert training_preset("hover", "hover/fast") == load("hover/fast")
     overlay = tmp_path / "a.toml"
     overlay.write_text("delay_ticks = 2\n[pretrain]\nnum_updates = 7\nnum_envs = 3\n[adapt]\nnum_updates = 9\n")
-    found = asked_preset("hover", config=overlay, num_updates=5, num_envs=None, residual="zero", vehicle="large")
+    found = training_preset("hover", config=overlay, num_updates=5, num_envs=None, residual="zero", vehicle="large")
     assert (found.delay_ticks, found.pretrain.num_updates, found.pretrain.num_envs) == (2, 5, 3)
     assert (found.adapt.num_updates, found.adapt.residual, found.vehicle) == (9, "zero", "large")
-    tracked = asked_preset("track", reference="circle")
+    tracked = training_preset("track", reference="circle")
     assert tracked == changed(load("track/retrim"), track={"reference": "circle"})
-    assert asked_preset("hover", vehicle=str(SEVEN_INCH)).vehicle.mass == pytest.approx(1.2)
+    assert training_preset("hover", vehicle=str(SEVEN_INCH)).vehicle.mass == pytest.approx(1.2)
     with pytest.raises(ConfigError, match="--reference circle: a hover policy follows none"):
-        asked_preset("hover", reference="circle")
+        training_preset("hover", reference="circle")
     with pytest.raises(ConfigError, match="'track/paper' is for track"):
-        asked_preset("hover", "track/paper")
+        training_preset("hover", "track/paper")
 
 
 def test_the_reference_of_a_flight_is_one_that_the_policy_can_follow():
     family, blind = load("track/preview"), changed(load("track/blind"), track={"reference": "circle"})
     one = changed(family, track={"reference": "star"})
-    assert flown_reference(load("hover/fast"), None) is None
-    assert [flown_reference(one, name) for name in (None, "star", "figure8")] == ["star", "star", "figure8"]
-    assert [flown_reference(blind, name) for name in (None, "circle")] == ["circle", "circle"]
-    assert flown_reference(family, "circle") == "circle"
+    assert reference_of_flight(load("hover/fast"), None) is None
+    assert [reference_of_flight(one, name) for name in (None, "star", "figure8")] == ["star", "star", "figure8"]
+    assert [reference_of_flight(blind, name) for name in (None, "circle")] == ["circle", "circle"]
+    assert reference_of_flight(family, "circle") == "circle"
     for preset, name, said in (
         (load("hover/fast"), "circle", "a hover policy follows none"),
         (family, None, "say which to fly"),
         (blind, "star", "does not see its reference, and was trained on circle"),
     ):
         with pytest.raises(ConfigError, match=said):
-            flown_reference(preset, name)
+            reference_of_flight(preset, name)
 
 
 def test_a_flight_changes_nothing_that_the_weights_were_trained_for():
@@ -94,11 +101,11 @@ def test_a_residual_is_another_one_but_not_in_a_flight_that_goes_on(key):
 
 def test_where_a_flight_takes_place_is_its_scenario():
     preset = load("track/preview")
-    found = Where("wind=3", "simple", "figure8", "large", "mocap", 0.01, 0.04).scenario(preset)
+    found = FlightArguments("wind=3", "simple", "figure8", "large", "mocap", 0.01, 0.04).scenario(preset)
     assert (found.disturbance, found.plant, found.reference) == ("wind=3", "simple", "figure8")
     assert (found.vehicle, found.sensors, found.thrust_error, found.delay) == ("large", "mocap", 0.01, 0.04)
-    assert Where().scenario(load("hover/fast")).disturbance == "large"
-    assert Where(plant="mavlink:udp:127.0.0.1:14550").scenario(load("hover/fast")).disturbance == "none"
+    assert FlightArguments().scenario(load("hover/fast")).disturbance == "large"
+    assert FlightArguments(plant="mavlink:udp:127.0.0.1:14550").scenario(load("hover/fast")).disturbance == "none"
 
 
 def test_weights_are_of_a_policy_or_of_an_earlier_flight(tmp_path, key):
@@ -121,9 +128,9 @@ def test_a_mistake_in_a_module_of_ones_own_is_told_in_a_line(tmp_path, monkeypat
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(ZeroDivisionError) as caught:
         __import__("mine_that_fails").wind()
-    said = told_of_own_module(caught.value, ["retrim", "fly"])
+    said = describe_user_error(caught.value, ["retrim", "fly"])
     assert said.startswith(f"{tmp_path / 'mine_that_fails.py'}, line 2: ZeroDivisionError: division by zero")
     with pytest.raises(KeyError) as ours:
         {}["x"]
-    assert told_of_own_module(ours.value, ["retrim", "fly", "--starts", "1"]) is None
-    assert told_of_own_module(ours.value, ["retrim", "fly", "--disturbance", "mine:wind"]).startswith("KeyError: 'x'")
+    assert describe_user_error(ours.value, ["retrim", "fly", "--starts", "1"]) is None
+    assert describe_user_error(ours.value, ["retrim", "fly", "--disturbance", "mine:wind"]).startswith("KeyError: 'x'")

@@ -73,15 +73,15 @@ def test_lots_that_travel_are_the_flights_of_one_process(here, fleet):
 
 
 def test_a_job_that_fails_is_told_and_the_others_land(here, fleet, monkeypatch):
-    fly = jobs.fly_lot
+    fly = jobs.fly_batch
 
     def failing(setup, policies, specs, *rest, **more):
         if specs[0].method == "full":
             raise OSError("the disk\nis full")
         return fly(setup, policies, specs, *rest, **more)
 
-    monkeypatch.setattr(jobs, "fly_lot", failing)
-    monkeypatch.setattr("retrim.evaluation.lots.lanes", lambda: 1)
+    monkeypatch.setattr(jobs, "fly_batch", failing)
+    monkeypatch.setattr("retrim.evaluation.batches.lanes", lambda: 1)
     with Cluster(here) as there:
         flights = fleet.run(there, by_lot=True)
     assert [flight.spec.method for flight in flights.flown] == ["base", "base"]
@@ -104,7 +104,7 @@ def test_a_table_with_holes_is_not_made(here, tmp_path, monkeypatch):
     def failing(*_, **__):
         raise OSError("the disk is full")
 
-    monkeypatch.setattr(jobs, "fly_lot", failing)
+    monkeypatch.setattr(jobs, "fly_batch", failing)
     monkeypatch.setitem(named_presets.PRESETS, "hover/fast", small())
     words = "--presets", "hover/fast", "--methods", "base", "--seeds", "0", "--starts", "4", "--seconds", "1"
     said = retrim("reproduce", "hover", *words, "--on", here, "--out", "h", cwd=tmp_path, code=1)
@@ -127,15 +127,15 @@ def test_a_training_that_fails_costs_no_other(here, tmp_path, monkeypatch):
 
 
 def test_a_flight_that_fails_leaves_the_others_and_an_exit_code(here, tmp_path, monkeypatch):
-    fly = jobs.fly_lot
+    fly = jobs.fly_batch
 
     def failing(setup, policies, specs, *rest, **more):
         if specs[0].method == "indi":
             raise OSError("gone")
         return fly(setup, policies, specs, *rest, **more)
 
-    monkeypatch.setattr(jobs, "fly_lot", failing)
-    monkeypatch.setattr("retrim.evaluation.lots.lanes", lambda: 1)
+    monkeypatch.setattr(jobs, "fly_batch", failing)
+    monkeypatch.setattr("retrim.evaluation.batches.lanes", lambda: 1)
     (tmp_path / "study.toml").write_text(SWEEP.format(starts=1).replace('"full"', '"indi"'))
     said = retrim("sweep", "study.toml", "--on", here, "--out", "s", cwd=tmp_path, code=1)
     assert "2 flights failed elsewhere, the first by OSError: gone; the same command flies them" in said

@@ -16,8 +16,10 @@ import made_up
 from helpers import brief_preset, tiny_preset
 from retrim import ConfigError, Fleet, PlantError, Scenario, Setup, enable_compile_cache, load
 from retrim.config.loading import dump
+from retrim.evaluation import batches as lots
+from retrim.evaluation import executor as gathering
 from retrim.evaluation import fleet as fleet_module
-from retrim.evaluation import gathering, jobs, lots
+from retrim.evaluation import jobs
 from retrim.evaluation.jobs import setup_for
 from retrim.physics import State
 from retrim.runkit import flying
@@ -106,12 +108,12 @@ def test_no_flight_of_a_program_is_left_by_itself(monkeypatch, n, cores):
     """However many cores there are: Python steps a single flight, and that uses one of them."""
     monkeypatch.setattr(lots, "lanes", lambda: cores)
     group = [FlightSpec(Scenario("small"), "base", start) for start in range(n)]
-    found = lots.in_lots([group], lambda specs: "program")
+    found = lots.in_batches([group], lambda specs: "program")
     assert sorted((spec for lot in found for spec in lot.specs), key=group.index) == group
     sizes = [len(lot.specs) for lot in found]
     assert n == 1 or min(sizes) > 1
     assert max(sizes) <= max(2, -(-n // cores)) + 1
-    assert [len(lot.specs) for lot in lots.in_lots([group], lambda specs: None)] == [1] * n
+    assert [len(lot.specs) for lot in lots.in_batches([group], lambda specs: None)] == [1] * n
 
 
 def test_other_lots_of_a_program_wait_until_it_is_compiled_not_until_it_has_landed(monkeypatch):
@@ -133,7 +135,7 @@ def test_other_lots_of_a_program_wait_until_it_is_compiled_not_until_it_has_land
 
     monkeypatch.setattr(lots, "lanes", lambda: 2)
     monkeypatch.setattr(fleet_module, "lanes", lambda: 2)
-    monkeypatch.setattr(fleet_module, "fly_lot", flown)
+    monkeypatch.setattr(fleet_module, "fly_batch", flown)
     fleet.run()
     assert order[:2] == ["first", "other"]
 
@@ -290,7 +292,7 @@ def test_a_crash_says_why(fleet, off, why):
     alone = flying.fly_one(setup, policy, spec, x0, 0.4)
     for flight in (
         alone,
-        *flying.fly_lot(setup, [policy] * 2, [spec, dataclasses.replace(spec, start=1)], [x0, x0], 0.4),
+        *flying.fly_batch(setup, [policy] * 2, [spec, dataclasses.replace(spec, start=1)], [x0, x0], 0.4),
     ):
         assert flight.log.terminated
         assert flight.events[-1].kind == "terminated"
@@ -314,7 +316,7 @@ def test_what_was_learnt_before_reaches_every_flight(monkeypatch):
         return flown
 
     for module in (fleet_module, jobs):
-        monkeypatch.setattr(module, "fly_lot", flies("lot", []))
+        monkeypatch.setattr(module, "fly_batch", flies("lot", []))
         monkeypatch.setattr(module, "fly_one", flies("one", made_up.flight(0.1)))
     for lot in (*fleet.lots(fleet.specs), *fleet.lots(fleet.specs[:1])):
         fleet._fly(lot, lambda share: None, threading.Event())

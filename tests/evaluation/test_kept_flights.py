@@ -7,7 +7,7 @@ import pytest
 from helpers import brief_preset
 from made_up import Watching
 from retrim import Scenario, Setup
-from retrim.evaluation.kept_flights import FLIGHTS, forget_flights
+from retrim.evaluation.flight_store import FLIGHTS, clear_flights
 from retrim.evaluation.packed_flights import packed, unpacked
 from retrim.evaluation.study import Study, fly_all
 from retrim.runkit import Run, provenance
@@ -30,7 +30,7 @@ def flown(study, folder, *, methods=("base", "indi"), reporter=None, starts=2):
     run = Run("test", folder)
     told = Silent() if reporter is None else reporter
     flights = fly_all(study, [CALM, PUSH], run, told, methods=methods, starts=starts, seconds=1.0)
-    return flights, run.taken_over
+    return flights, run.reused
 
 
 def bits(flights):
@@ -83,6 +83,6 @@ def test_only_the_same_is_taken_and_nothing_once_it_is_forgotten(study, tmp_path
     assert taken() == 4
     monkeypatch.setattr(provenance, "code", lambda: "changed")
     assert taken() == 0
-    forget_flights(Run("test", tmp_path))
+    clear_flights(Run("test", tmp_path))
     assert not (tmp_path / FLIGHTS).exists()
     assert taken() == 0

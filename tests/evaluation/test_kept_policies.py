@@ -6,8 +6,8 @@ import pytest
 
 from helpers import tiny_preset
 from retrim import load_policy
-from retrim.evaluation import kept_policies
-from retrim.evaluation.kept_policies import trained_policies
+from retrim.evaluation import policy_store as kept_policies
+from retrim.evaluation.policy_store import trained_policies
 from retrim.evaluation.study import train_all
 from retrim.runkit import Run, provenance
 from retrim.runkit.reporter import Silent

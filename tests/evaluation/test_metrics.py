@@ -12,7 +12,7 @@ from retrim.evaluation import rows
 from retrim.evaluation.metrics import cell, interval, mean_and_deviation, metres
 from retrim.runkit import FlightSpec
 from retrim.runtime.flight import States
-from retrim_paper.tables.beside import figures_table
+from retrim_paper.tables.further_figures import figures_table
 
 
 def test_the_error_is_over_the_last_seconds_and_no_others():

@@ -13,7 +13,7 @@ from made_up import DT, flight, log
 from retrim import Event, LoraPolicy, Scenario, Setup
 from retrim.evaluation.metrics import failed_record, notes, summary
 from retrim.io.logs.viewers import can_record
-from retrim.io.trained import load_learnt, load_policy
+from retrim.io.trained import load_learner_state, load_policy
 from retrim.runkit import FlightSpec, Run, outputs
 
 SPECS = [FlightSpec(Scenario(), method, start, 4) for method in ("base", "full") for start in (0, 1)]
@@ -82,7 +82,7 @@ def test_what_the_first_whole_flight_learnt_is_kept(setup, tmp_path):
     assert preset == setup.preset
     for one, other in zip(weights(policy), weights(states[1].policy.policy), strict=True):
         np.testing.assert_array_equal(one, other)
-    state, _ = load_learnt(tmp_path / "learnt.safetensors")
+    state, _ = load_learner_state(tmp_path / "learner_state.safetensors")
     np.testing.assert_array_equal(weights(state.policy.policy)[0], weights(states[1].policy.policy)[0])
     names = sorted(path.name for path in (tmp_path / "logs").glob("*.npz"))
     assert names == ["base_seed4_start0.npz", "full_seed4_start0.npz", "full_seed4_start1.npz", "full_seed4_start2.npz"]
@@ -91,7 +91,10 @@ def test_what_the_first_whole_flight_learnt_is_kept(setup, tmp_path):
     low = dataclasses.replace(flights[2], learnt=learnt(setup, 0, low_rank=True))
     assert isinstance(low.learnt.policy.policy, LoraPolicy)
     outputs.write_flights([low], setup.preset, tmp_path)
-    assert sorted(path.name for path in tmp_path.glob("*.safetensors")) == ["delta.safetensors", "learnt.safetensors"]
+    assert sorted(path.name for path in tmp_path.glob("*.safetensors")) == [
+        "delta.safetensors",
+        "learner_state.safetensors",
+    ]
     assert [path.name for path in (tmp_path / "logs").glob("*.npz")] == [
         "full_seed4_start1.npz"
     ]  # none of earlier ones

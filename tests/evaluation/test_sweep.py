@@ -12,8 +12,9 @@ from commands import OVERLAY, results, retrim, started
 from helpers import brief_preset
 from made_up import flight
 from retrim import ConfigError, Fleet, Scenario, Setup
-from retrim.evaluation import kept_policies, sweep
-from retrim.evaluation.gathering import Flights
+from retrim.evaluation import policy_store as kept_policies
+from retrim.evaluation import sweep
+from retrim.evaluation.executor import Flights
 from retrim.evaluation.metrics import record
 from retrim.evaluation.sweep import Sweep, read_sweep, run_sweep
 from retrim.runkit import FlightSpec, Run, provenance
@@ -131,7 +132,7 @@ def test_policies_and_flights_are_of_the_code_and_the_files_that_made_them(tmp_p
     assert fly() == (1, 2)
     assert results(tmp_path / "out", "sweep.json")["rows"][0]["n"] == 1
     for module in (sweep, kept_policies):
-        monkeypatch.setattr(module, "files_behind", lambda *names: {"mine.csv": "changed"})
+        monkeypatch.setattr(module, "file_digests", lambda *names: {"mine.csv": "changed"})
     assert fly() == (1, 3)
 
 
@@ -194,7 +195,7 @@ def test_a_report_has_a_row_for_each_combination_and_bars_for_each_flight(tmp_pa
     }
     one = [row for row in kept if row["disturbance"] == "large"]
     run = Run("test", tmp_path)
-    run.taken_over = 3
+    run.reused = 3
     sweep._report(asked, one, run, Silent())
     assert "An earlier run had made 3 of the parts" in (tmp_path / "sweep.md").read_text()
     assert list(shown[1]) == ["large"]  # where nothing varies, the disturbance is the label

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from hostile import TEXTS, Maker, Watch
-from retrim import load_learnt, load_policy
+from retrim import load_learner_state, load_policy
 from retrim.config import read_vehicle
 from retrim.errors import CheckpointError, ConfigError, LogError, RetrimError
 from retrim.evaluation import sweep
@@ -121,7 +121,12 @@ def test_sizes_are_looked_at_before_a_file_is_read(folder, monkeypatch):
     with pytest.raises(LogError, match="array 't' has 80128 bytes, more than the 1000 that are accepted"):
         NpzMembers(path)["t"]
     logs = dict.fromkeys(("l.csv", "l.ulg", "l.npz"), read_flight_log)
-    others = {"t.csv": from_csv, "v.toml": read_vehicle, "p.safetensors": load_policy, "s.safetensors": load_learnt}
+    others = {
+        "t.csv": from_csv,
+        "v.toml": read_vehicle,
+        "p.safetensors": load_policy,
+        "s.safetensors": load_learner_state,
+    }
     for name, read in (logs | others).items():
         with (folder / name).open("wb") as file:
             file.truncate(3 * 2**30)  # a hole: it takes no space

@@ -12,7 +12,7 @@ import pytest
 from jax import random
 
 from helpers import tiny_preset
-from retrim import CheckpointError, load_learnt, load_policy, save_learnt, save_policy
+from retrim import CheckpointError, load_learner_state, load_policy, save_learner_state, save_policy
 from retrim.config import PRESETS, Setup, changed, load
 from retrim.config.loading import dump
 from retrim.control import Policy
@@ -140,9 +140,9 @@ def test_a_header_that_lies_is_refused_even_with_a_checksum(tmp_path, setup, val
 
 @pytest.mark.parametrize("method", ["full", "lora"])
 def test_what_was_learnt_comes_back_bit_for_bit(tmp_path, setup, states, method):
-    path = tmp_path / "deep" / "learnt.safetensors"
-    save_learnt(path, states[method], setup.preset)
-    found, preset = load_learnt(path)
+    path = tmp_path / "deep" / "learner_state.safetensors"
+    save_learner_state(path, states[method], setup.preset)
+    found, preset = load_learner_state(path)
     assert preset == setup.preset
     assert jax.tree.structure(found) == jax.tree.structure(states[method])
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(states[method]), strict=True):
@@ -160,10 +160,10 @@ def rewritten(path, setup, state, preset, **header):
 
 @pytest.mark.parametrize(("values", "message"), LIES)
 def test_a_header_of_learnt_weights_that_lies_is_refused(tmp_path, setup, states, values, message):
-    path = tmp_path / "learnt.safetensors"
+    path = tmp_path / "learner_state.safetensors"
     rewritten(path, setup, states["full"], preset_with(setup.preset, **values))
     with pytest.raises(CheckpointError, match=message):
-        load_learnt(path)
+        load_learner_state(path)
 
 
 @pytest.mark.parametrize(
@@ -179,22 +179,22 @@ def test_a_header_of_learnt_weights_that_lies_is_refused(tmp_path, setup, states
     ],
 )
 def test_a_low_rank_header_that_lies_is_refused(tmp_path, setup, states, header, message):
-    path = tmp_path / "learnt.safetensors"
+    path = tmp_path / "learner_state.safetensors"
     rewritten(path, setup, states["lora"], dump(setup.preset), **header)
     with pytest.raises(CheckpointError, match=message):
-        load_learnt(path)
+        load_learner_state(path)
 
 
 def test_a_policy_is_not_what_was_learnt(tmp_path, setup, states):
     path = tmp_path / "file.safetensors"
     save_policy(path, setup.new_policy(random.key(4)), setup.preset)
     with pytest.raises(CheckpointError, match="holds a 'policy', expected a 'learnt'"):
-        load_learnt(path)
-    save_learnt(path, states["full"], setup.preset)
+        load_learner_state(path)
+    save_learner_state(path, states["full"], setup.preset)
     with pytest.raises(CheckpointError, match="holds what a flight has learnt; go on from it"):
         load_policy(path)
     with pytest.raises(CheckpointError, match=r"nothing: no such file; `retrim fly --out DIR`"):
-        load_learnt(tmp_path / "nothing")
+        load_learner_state(tmp_path / "nothing")
 
 
 # ---- numbers that are finite and cannot be flown
@@ -220,9 +220,9 @@ def test_a_policy_whose_numbers_cannot_be_flown_is_refused(tmp_path, setup, stat
     with pytest.raises(CheckpointError, match=message):
         load_policy(tmp_path / "p.safetensors")
     state = eqx.tree_at(lambda s: s.policy.policy, states["full"], with_leaf(policy, where, value))
-    save_learnt(tmp_path / "l.safetensors", state, setup.preset)
+    save_learner_state(tmp_path / "l.safetensors", state, setup.preset)
     with pytest.raises(CheckpointError, match=r"holds|limits"):
-        load_learnt(tmp_path / "l.safetensors")
+        load_learner_state(tmp_path / "l.safetensors")
 
 
 def test_a_delta_is_judged_by_what_it_makes_of_its_base(tmp_path, setup, states):
@@ -234,18 +234,18 @@ def test_a_delta_is_judged_by_what_it_makes_of_its_base(tmp_path, setup, states)
     state = eqx.tree_at(lambda s: s.policy.policy.scale, states["lora"], jnp.asarray(1e9))
     rewritten(tmp_path / "l", setup, state, dump(setup.preset))
     with pytest.raises(CheckpointError, match=r"holds .* at most 100000 can be flown"):
-        load_learnt(tmp_path / "l")
+        load_learner_state(tmp_path / "l")
 
 
 def test_a_residual_that_makes_the_command_useless_is_refused(tmp_path):
     setup = Setup.from_preset(tiny_preset(adapt={"residual": "regression", "frame": "gravity"}))
     state = setup.learner.init(setup.new_policy(random.key(0)), random.key(1))
-    save_learnt(tmp_path / "l.safetensors", state, setup.preset)
-    load_learnt(tmp_path / "l.safetensors")
+    save_learner_state(tmp_path / "l.safetensors", state, setup.preset)
+    load_learner_state(tmp_path / "l.safetensors")
     wild = jax.tree.map(lambda leaf: jnp.full_like(leaf, 1e30), state.residual)
-    save_learnt(tmp_path / "l.safetensors", eqx.tree_at(lambda s: s.residual, state, wild), setup.preset)
+    save_learner_state(tmp_path / "l.safetensors", eqx.tree_at(lambda s: s.residual, state, wild), setup.preset)
     with pytest.raises(CheckpointError, match=r"residual\..* holds 1e\+30; at most 1e\+12 can be flown"):
-        load_learnt(tmp_path / "l.safetensors")
+        load_learner_state(tmp_path / "l.safetensors")
 
 
 def test_the_same_content_is_the_same_file_at_any_time(tmp_path, setup, states, monkeypatch):
@@ -253,7 +253,7 @@ def test_the_same_content_is_the_same_file_at_any_time(tmp_path, setup, states, 
         now = time.struct_time((year, 1, 2, 3, 4, 5, 0, 2, 0))
         monkeypatch.setattr(time, "localtime", lambda *_, now=now: now)
         save_policy(tmp_path / f"{name}.p", setup.new_policy(random.key(4)), setup.preset)
-        save_learnt(tmp_path / f"{name}.l", states["lora"], setup.preset)
+        save_learner_state(tmp_path / f"{name}.l", states["lora"], setup.preset)
         save_delta(tmp_path / f"{name}.d", states["lora"].policy.policy)
         arrays = {"x": np.arange(5.0), "y": np.array("text")}
         (tmp_path / f"{name}.n").write_bytes(npz_bytes(arrays, compressed=True))
@@ -269,7 +269,7 @@ def test_the_same_content_is_the_same_file_at_any_time(tmp_path, setup, states, 
 
 def test_files_say_which_release_wrote_them(tmp_path, setup, states):
     save_policy(tmp_path / "p", setup.new_policy(random.key(4)), setup.preset)
-    save_learnt(tmp_path / "l", states["full"], setup.preset)
+    save_learner_state(tmp_path / "l", states["full"], setup.preset)
     save_delta(tmp_path / "d", states["lora"].policy.policy)
     for name, kind in (("p", "policy"), ("l", "learnt"), ("d", "delta")):
         header = wire.describe((tmp_path / name).read_bytes(), kind=kind, source=name)

@@ -11,8 +11,8 @@ from jax.extend.core import ClosedJaxpr, Jaxpr
 from helpers import draw_starts, hover_env
 from retrim.control import Policy
 from retrim.learn import policy_gradient
-from retrim.learn.both_layouts import BothLayouts, both_layouts
 from retrim.learn.residuals import EnsembleResidual
+from retrim.learn.transposed_layers import TransposedLinear, with_transposed_copy
 from retrim.physics import Hybrid, PointMass, small
 
 
@@ -24,7 +24,7 @@ def test_a_layer_in_both_layouts_is_that_layer(use_bias, key):
     def cost(layer, x):
         return jnp.sum(jnp.sin(jax.vmap(layer)(x)))
 
-    both = eqx.filter_jit(jax.value_and_grad(lambda both: cost(both_layouts(both[0]), both[1])))
+    both = eqx.filter_jit(jax.value_and_grad(lambda both: cost(with_transposed_copy(both[0]), both[1])))
     plain = eqx.filter_jit(jax.value_and_grad(lambda both: cost(*both)))
     x = random.normal(key, (4, 5))
     for found, wanted in zip(jax.tree.leaves(both((layer, x))), jax.tree.leaves(plain((layer, x))), strict=True):
@@ -40,7 +40,7 @@ def test_stacked_layers_are_laid_out_each(key):
         return eqx.filter_vmap(lambda one, x: one(x), in_axes=(eqx.if_array(0), None))(made, x)
 
     x = random.normal(key, (4,))
-    np.testing.assert_allclose(members(both_layouts(made), x), members(made, x), rtol=1e-14)
+    np.testing.assert_allclose(members(with_transposed_copy(made), x), members(made, x), rtol=1e-14)
 
 
 def test_layers_anywhere_are_laid_out_and_all_else_stays(key):
@@ -52,9 +52,9 @@ def test_layers_anywhere_are_laid_out_and_all_else_stays(key):
 
     scalar = eqx.nn.Linear("scalar", 3, key=key)
     tree = {"deep": [eqx.nn.Linear(2, 2, key=key), jnp.ones(3)], "scalar": scalar, "word": "w"}
-    assert type(both_layouts(Doubled(2, 2, key=key))) is Doubled
-    laid = both_layouts(tree)
-    assert isinstance(laid["deep"][0], BothLayouts)
+    assert type(with_transposed_copy(Doubled(2, 2, key=key))) is Doubled
+    laid = with_transposed_copy(tree)
+    assert isinstance(laid["deep"][0], TransposedLinear)
     assert laid["deep"][1] is tree["deep"][1]
     assert (laid["scalar"], laid["word"]) == (scalar, "w")
 

@@ -41,7 +41,7 @@ flights = fleet.run().flown
 low_rank = setup.low_rank(policy, jax.random.key(0))
 state = setup.learner.init(low_rank, jax.random.key(1))
 window, base = RollingBuffer(preset.adapt.window), shared_base(setup.learner, state)
-window.push(0.0, State.at(setup.flown.home()), Command.hover(float))
+window.push(0.0, State.at(setup.flight_task.home()), Command.hover(float))
 workers = [PolicyWorker(setup.learner, state, jax.random.key(i)) for i in range(4)]
 base = learn_base(workers, [window.window()] * 4, base, jax.random.key(4))
 if {devices} > 1:

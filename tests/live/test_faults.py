@@ -16,11 +16,11 @@ from retrim.config.loading import dump
 from retrim.live.events import LiveEvents
 from retrim.live.spec import MAINS, LiveSpec
 from retrim.live.supervisor import Supervisor
-from retrim.onboard.accounts import measured
 from retrim.onboard.guard import Mode
 from retrim.onboard.launch import launch
 from retrim.onboard.messages import COMMAND, TRUE, Setpoint
 from retrim.onboard.recorder import read_log
+from retrim.onboard.timing_stats import measured
 from retrim.transport.message import pack_arrays
 
 DRILL = {"plant": "live_processes:plant", "residual": "live_processes:learner", "policy": "live_processes:learner"}

@@ -12,7 +12,7 @@ from jax import random
 
 from live.test_live_learner import Beside, start  # noqa: F401
 from retrim.config.setup import Setup
-from retrim.io.trained import load_learnt, save_learnt
+from retrim.io.trained import load_learner_state, save_learner_state
 from retrim.live import fleet_learner, fleet_process
 from retrim.live.fleet_learner import FleetLearner
 from retrim.live.fleet_process import FleetProcess
@@ -101,10 +101,10 @@ def test_nothing_is_published_for_a_vehicle_that_went_meanwhile(start, vehicles)
 
 def test_low_rank_vehicles_share_a_base_and_lose_it_with_a_policy_that_is_taken_back(start, tmp_path):  # noqa: F811
     path, controller, _ = start
-    _, preset = load_learnt(path)
+    _, preset = load_learner_state(path)
     setup = Setup.from_preset(preset)
     state = setup.learner.init(setup.low_rank(setup.new_policy(random.key(0)), random.key(1)), random.key(2))
-    save_learnt(tmp_path / "start.safetensors", state, preset)
+    save_learner_state(tmp_path / "start.safetensors", state, preset)
     vehicles = {name: Beside((tmp_path / "start.safetensors", controller, state)) for name in "ab"}
     fleet = fleet_for(vehicles, (tmp_path / "start.safetensors", controller, state), "policy")
     for vehicle in vehicles.values():
@@ -114,7 +114,7 @@ def test_low_rank_vehicles_share_a_base_and_lose_it_with_a_policy_that_is_taken_
     admitted = [vehicle for vehicle in vehicles.values() if vehicle.bus.latest("parameters.policy") is not None]
     moved = np.abs(np.asarray(base.policy.layers[0].weight - state.policy.policy.base.layers[0].weight)).max() > 0
     assert moved == bool(admitted)  # a step that nobody admits is taken back
-    fleet.loops["a"].taken_back += 1
+    fleet.loops["a"].rolled_back += 1
     was = id(base)
     for vehicle in vehicles.values():
         vehicle.fly()

@@ -15,12 +15,12 @@ from live_helpers import TOPICS, plan
 from live_processes import DT, level, moved
 from retrim.config.scenario import Scenario
 from retrim.config.setup import Setup
-from retrim.io.trained import save_learnt
-from retrim.live import following
-from retrim.live.choices import choices, paths
+from retrim.io.trained import save_learner_state
+from retrim.live import reference_switcher as following
 from retrim.live.controllers import adaptive_source
-from retrim.live.following import Following
 from retrim.live.learner_process import LearnerLoop, LearnerPlan
+from retrim.live.live_options import choices, paths
+from retrim.live.reference_switcher import ReferenceSwitcher
 from retrim.live.session import LiveRequest, live_spec
 from retrim.live.status import Status
 from retrim.live.supervisor import Supervisor
@@ -94,7 +94,7 @@ def test_what_is_followed_is_a_parameter_of_the_controller(made, table):
     np.testing.assert_allclose(one.issued, other.issued, atol=0.02)
     for t in (0.9, 2.0, 3.3, 20.0):
         np.testing.assert_allclose(other.loop.pilot.target(t), table(jnp.array(t)).p, atol=1e-9)
-        np.testing.assert_allclose(one.loop.pilot.target(t), made[0].flown.target(jnp.array(t)), atol=1e-9)
+        np.testing.assert_allclose(one.loop.pilot.target(t), made[0].flight_task.target(jnp.array(t)), atol=1e-9)
     assert other.status["versions"] == {"policy": 0, "residual": 0, REFERENCE: 1}
     assert other.status["swaps"] == []  # nothing was learnt
 
@@ -118,7 +118,7 @@ def test_one_that_comes_too_late_would_jump_and_is_refused(made, table):
     flight.bus.publish("parameters.reference", message(table, made[2]))
     flight.until(AT + 0.1)
     assert flight.status["refused"] == {"late reference": 1}
-    np.testing.assert_allclose(flight.loop.pilot.target(9.0), made[0].flown.target(jnp.array(9.0)), atol=1e-9)
+    np.testing.assert_allclose(flight.loop.pilot.target(9.0), made[0].flight_task.target(jnp.array(9.0)), atol=1e-9)
 
 
 # ---- the learner
@@ -127,7 +127,7 @@ def test_one_that_comes_too_late_would_jump_and_is_refused(made, table):
 def test_the_learner_learns_on_it_without_compiling_again(made, table, tmp_path):
     setup, state, controller = made
     start = tmp_path / "start.safetensors"
-    save_learnt(start, state, setup.preset)
+    save_learner_state(start, state, setup.preset)
     bus = InProcessBus(ROOM)
     loop = LearnerLoop(LearnerPlan(tmp_path, "policy", start, "circle", 3, controller.base, 0), bus)
     before = loop.worker.learner
@@ -167,7 +167,7 @@ def asked(made, folder, fence=3.0, behind=0.0):
     setup, state, _ = made
     request = LiveRequest(setup, state.policy.policy, Scenario(reference="circle"), "full", 60.0, 0, fence, folder)
     supervisor = Told(live_spec(request), behind)
-    return Following(request, supervisor, ThreadPoolExecutor(1)), supervisor
+    return ReferenceSwitcher(request, supervisor, ThreadPoolExecutor(1)), supervisor
 
 
 def status(supervisor, version=0):
@@ -210,8 +210,8 @@ def test_a_choice_becomes_a_table_and_counts_once_it_is_taken(made, tmp_path):
 
     whole = made[0].on(spliced(follows.pieces))  # what its errors are measured by
     x = State.at(wanted)
-    assert float(whole.flown.error(jnp.array(t), x)) < 1e-3
-    assert float(whole.flown.error(jnp.array(5.0), State.at(circle()(jnp.array(5.0)).p))) < 1e-9
+    assert float(whole.flight_task.error(jnp.array(t), x)) < 1e-3
+    assert float(whole.flight_task.error(jnp.array(5.0), State.at(circle()(jnp.array(5.0)).p))) < 1e-9
 
 
 def test_a_plant_that_fell_behind_the_wall_goes_over_by_its_own_time(made, tmp_path):
@@ -265,6 +265,6 @@ def test_a_set_up_on_another_reference_is_the_same_but_for_it(made, table):
     other = made[0].on(table)
     assert other.followed is table
     assert other.env is made[0].env
-    assert dataclasses.replace(other, flown=made[0].flown, learner=made[0].learner).preset == made[0].preset
+    assert dataclasses.replace(other, flight_task=made[0].flight_task, learner=made[0].learner).preset == made[0].preset
     back = other.on(made[0].followed)
-    jax.tree.map(np.testing.assert_array_equal, jax.tree.leaves(back.flown), jax.tree.leaves(made[0].flown))
+    jax.tree.map(np.testing.assert_array_equal, jax.tree.leaves(back.flown), jax.tree.leaves(made[0].flight_task))

@@ -13,10 +13,11 @@ from live_processes import HOME, DrillPlan, level
 from retrim.config import PRESETS, changed
 from retrim.config.loading import dump
 from retrim.errors import ConfigError, MessageError, PlantError
-from retrim.live import ground, remote_learners
+from retrim.live import learner_server as ground
+from retrim.live import remote_learners
 from retrim.live.events import LiveEvents
-from retrim.live.ground import Ground, learn_for
-from retrim.live.mission import Mission
+from retrim.live.learner_mission import LearnerMission
+from retrim.live.learner_server import LearnerServer, learn_for
 from retrim.live.page import free_port
 from retrim.live.spec import PageSpec
 from retrim.onboard.guard import Mode
@@ -35,7 +36,7 @@ SECONDS = 3.0
 KEY, OTHER = SharedKey(b"k" * 32), SharedKey(b"o" * 32)
 
 
-class DrillGround(Ground):
+class DrillGround(LearnerServer):
     """Its learners are those of the drill."""
 
     def _start(self, layer):
@@ -163,14 +164,14 @@ def learnt_by(preset):
 def mission_in(folder, base, number=1, start=None, reference=None):
     (folder / "start").write_bytes(start or learnt_by(PRESETS["hover/retrim"]))
     capacities = dict.fromkeys((*OUT, *INTO), 10_000)
-    return Mission.of(number, reference, 0, base, ("residual", "policy"), 0, capacities, folder / "start").pack()
+    return LearnerMission.of(number, reference, 0, base, ("residual", "policy"), 0, capacities, folder / "start").pack()
 
 
 def test_a_new_flight_has_new_learners_and_an_old_one_none(tmp_path, monkeypatch):
     network, started = InProcessBus(dict.fromkeys((*OUT, *INTO), 100_000)), []
     monkeypatch.setattr(Address, "join", lambda *_, **__: network)
 
-    class Noted(Ground):
+    class Noted(LearnerServer):
         def _start(self, layer):
             started.append((self._mission.base, self._mission.number, layer))
             self.processes[layer] = launch("live_processes:nothing", None, tmp_path / "log")
@@ -218,7 +219,7 @@ def joined(tmp_path, monkeypatch):
     network = InProcessBus(dict.fromkeys((*OUT, *INTO), 100_000))
     monkeypatch.setattr(Address, "join", lambda *_, **__: network)
 
-    class Idle(Ground):
+    class Idle(LearnerServer):
         def _start(self, layer):
             self.processes[layer] = launch("live_processes:nothing", None, tmp_path / "log")
 
@@ -297,7 +298,7 @@ def test_a_failure_is_told_while_the_other_flights_go_on_and_raised_at_the_end(m
     monkeypatch.setattr(Address, "join", lambda *_, **__: InProcessBus({}))
     told = threading.Event()
 
-    class Other(Ground):
+    class Other(LearnerServer):
         def wait(self):
             return iter(())
 
@@ -312,7 +313,7 @@ def test_a_failure_is_told_while_the_other_flights_go_on_and_raised_at_the_end(m
         if text == "zenoh:127.0.0.1:1/a: failed: OSError('no room'); zenoh:127.0.0.1:1/b: learnt: policy 7":
             told.set()
 
-    monkeypatch.setattr(ground, "Ground", Other)
+    monkeypatch.setattr(ground, "LearnerServer", Other)
     with pytest.raises(OSError, match="no room"):
         learn_for([Address.of("zenoh:127.0.0.1:1/a"), Address.of("zenoh:127.0.0.1:1/b")], threading.Event(), tell)
     assert told.is_set()
@@ -322,8 +323,8 @@ def test_a_mission_survives_the_bus_and_nothing_else_is_one(tmp_path):
     start = tmp_path / "start"
     start.write_bytes(np.random.default_rng(0).bytes(1000))
     capacities = {"flight": 1000, "parameters.policy": 5000, "knobs": 10}
-    mission = Mission.of(3, "circle", 7, "abc", ("residual", "policy"), 5, capacities, start)
-    found = Mission.unpack(mission.pack())
+    mission = LearnerMission.of(3, "circle", 7, "abc", ("residual", "policy"), 5, capacities, start)
+    found = LearnerMission.unpack(mission.pack())
     assert found == mission
     assert found.capacities == {"flight": 1000, "parameters.policy": 5000}  # knobs stay where the flight is
     rng, whole = np.random.default_rng(1), mission.pack()
@@ -331,10 +332,10 @@ def test_a_mission_survives_the_bus_and_nothing_else_is_one(tmp_path):
         data = bytearray(whole)
         data[rng.integers(len(data))] ^= int(rng.integers(1, 256))
         with pytest.raises(MessageError):
-            Mission.unpack(bytes(data))
+            LearnerMission.unpack(bytes(data))
     for data in (b"", whole[:-1], rng.bytes(500)):
         with pytest.raises(MessageError):
-            Mission.unpack(data)
+            LearnerMission.unpack(data)
 
 
 def test_a_bridge_carries_each_topic_its_way_and_no_more_than_needed():

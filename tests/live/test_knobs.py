@@ -8,7 +8,7 @@ import pytest
 
 from retrim.config.scenario import Scenario
 from retrim.errors import MessageError, PlantError
-from retrim.live.knobs import KICK_S, KnobbedPlant, Knobs
+from retrim.live.manual_disturbance import KICK_S, KnobbedPlant, ManualDisturbance
 from retrim.onboard.messages import pack_note
 from retrim.physics import Command, State
 from retrim.plants.plant import Measurement, Plant, as_numpy
@@ -26,8 +26,8 @@ def speeds(plant, ticks):
 
 
 def test_knobs_survive_the_bus():
-    knobs = Knobs((1.0, -2.0, 0.5), (3.0, 0.0, -1.0), 0.05, 0.8, (8.0, 0.0, 0.0), 3)
-    assert Knobs.unpack(knobs.pack()) == knobs
+    knobs = ManualDisturbance((1.0, -2.0, 0.5), (3.0, 0.0, -1.0), 0.05, 0.8, (8.0, 0.0, 0.0), 3)
+    assert ManualDisturbance.unpack(knobs.pack()) == knobs
 
 
 @pytest.mark.parametrize(
@@ -39,32 +39,32 @@ def test_knobs_survive_the_bus():
     ],
 )  # fmt: skip
 def test_a_knob_that_is_turned_too_far_is_refused(fields):
-    good = json.loads(json.dumps(vars(Knobs())))
-    assert Knobs.unpack(pack_note("knobs", **good)) == Knobs()
+    good = json.loads(json.dumps(vars(ManualDisturbance())))
+    assert ManualDisturbance.unpack(pack_note("knobs", **good)) == ManualDisturbance()
     with pytest.raises(MessageError, match="knobs"):
-        Knobs.unpack(pack_note("knobs", **(good | fields)))
+        ManualDisturbance.unpack(pack_note("knobs", **(good | fields)))
 
 
 def test_a_push_is_an_acceleration_and_ends_with_the_knob():
     plant, still = knobbed(), knobbed()
-    plant.turn(Knobs(push=(1.0, 0.0, 0.0)))
+    plant.turn(ManualDisturbance(push=(1.0, 0.0, 0.0)))
     pushed = speeds(plant, 10) - speeds(still, 10)
     np.testing.assert_allclose(pushed[-1], [0.2, 0.0, 0.0], atol=0.01)
-    plant.turn(Knobs())
+    plant.turn(ManualDisturbance())
     after = speeds(plant, 10)[:, 0]
     np.testing.assert_allclose(after, after[0], atol=0.02)
 
 
 def test_knobs_come_on_top_of_the_disturbance():
     both, alone = knobbed(disturbance="push=1"), knobbed(disturbance="push=1")
-    both.turn(Knobs(push=(-1.0, 0.0, 0.0)))
+    both.turn(ManualDisturbance(push=(-1.0, 0.0, 0.0)))
     difference = speeds(both, 10)[-1] - speeds(alone, 10)[-1]
     np.testing.assert_allclose(difference, [-0.2, 0.0, 0.0], atol=0.01)
 
 
 def test_a_kick_ends_by_itself_and_comes_once():
     plant, still = knobbed(), knobbed()
-    kicked = Knobs(kick=(8.0, 0.0, 0.0), kicks=1)
+    kicked = ManualDisturbance(kick=(8.0, 0.0, 0.0), kicks=1)
     plant.turn(kicked)
     gained = (speeds(plant, 30) - speeds(still, 30))[:, 0]
     assert abs(int(np.argmax(gained)) - (round(KICK_S / 0.02) - 1)) <= 1  # from then on, drag slows it down
@@ -74,7 +74,9 @@ def test_a_kick_ends_by_itself_and_comes_once():
     assert abs(speeds(plant, 5)[-1, 0] - before) < 0.2
 
 
-@pytest.mark.parametrize("knobs", [Knobs(load=0.05), Knobs(rotor=0.7), Knobs(wind=(4.0, 0.0, 0.0))])
+@pytest.mark.parametrize(
+    "knobs", [ManualDisturbance(load=0.05), ManualDisturbance(rotor=0.7), ManualDisturbance(wind=(4.0, 0.0, 0.0))]
+)
 def test_every_knob_moves_the_vehicle(knobs):
     plant, still = knobbed(), knobbed()
     plant.turn(knobs)
@@ -83,10 +85,10 @@ def test_every_knob_moves_the_vehicle(knobs):
 
 def test_a_plant_that_does_not_know_an_effect_flies_on():
     plant, still = knobbed("rotorpy"), knobbed("rotorpy")
-    plant.turn(Knobs(load=0.1, push=(1.0, 0.0, 0.0)))
+    plant.turn(ManualDisturbance(load=0.1, push=(1.0, 0.0, 0.0)))
     np.testing.assert_array_equal(speeds(plant, 5), speeds(still, 5))
     assert "cannot carry a load" in plant.refused
-    plant.turn(Knobs(push=(1.0, 0.0, 0.0)))
+    plant.turn(ManualDisturbance(push=(1.0, 0.0, 0.0)))
     assert plant.refused == ""
     assert speeds(plant, 5)[-1, 0] - speeds(still, 5)[-1, 0] > 0.05
 
@@ -107,7 +109,7 @@ def test_a_plant_without_knobs_says_so_and_its_errors_are_its_own():
             pass
 
     plant = KnobbedPlant(Bare(), Scenario(), 0)
-    plant.turn(Knobs(push=(1.0, 0.0, 0.0)))
+    plant.turn(ManualDisturbance(push=(1.0, 0.0, 0.0)))
     assert plant.refused == "this plant has no knobs"
     assert plant.step(Command.hover(jnp.zeros(0).dtype))[0].t == 0.0
     with pytest.raises(PlantError, match="too much"):

@@ -10,11 +10,11 @@ from helpers import tiny_preset
 from live_helpers import DT, TOPICS
 from retrim.adapt.updates import PolicyUpdate, Rejection, pack_update, unpack_update
 from retrim.config.setup import Setup
-from retrim.io.trained import save_learnt
+from retrim.io.trained import save_learner_state
 from retrim.learn.bptt import PolicyState
 from retrim.live.controllers import adaptive_source
 from retrim.live.learner_process import LearnerLoop, LearnerPlan
-from retrim.live.published import flown_update, keep
+from retrim.live.published_updates import active_update, keep
 from retrim.onboard.messages import COLUMNS, COMMAND, MEASURED, FlightRows, Parameters, pack_note
 from retrim.onboard.topics import slot
 from retrim.transport.in_process import InProcessBus
@@ -30,7 +30,7 @@ def start(tmp_path_factory):
         setup = Setup.from_preset(preset)
         state = setup.learner.init(setup.new_policy(random.key(0)), random.key(1))
         path = tmp_path_factory.mktemp("learner") / "start.safetensors"
-        save_learnt(path, state, preset)
+        save_learner_state(path, state, preset)
         return path, adaptive_source(setup, state), state
 
 
@@ -253,5 +253,5 @@ def test_what_is_flown_stays_on_the_bus_however_much_is_learnt_that_nobody_takes
         keep(
             beside.bus, "policy", version, update, {"newest": {"policy": newest}, "given_up": given_up * (version > 5)}
         )
-    found, _ = flown_update(beside.bus, beside.state, "policy", {"newest": {"policy": 5}, "given_up": given_up})
+    found, _ = active_update(beside.bus, beside.state, "policy", {"newest": {"policy": 5}, "given_up": given_up})
     assert found == (4 if given_up else 5)

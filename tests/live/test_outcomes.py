@@ -16,11 +16,11 @@ import numpy as np
 import pytest
 
 from commands import SMALL, results, retrim, started
-from retrim import load_learnt, load_policy
-from retrim.onboard.accounts import measured
+from retrim import load_learner_state, load_policy
 from retrim.onboard.guard import Mode
 from retrim.onboard.messages import TRUE
 from retrim.onboard.recorder import read_log
+from retrim.onboard.timing_stats import measured
 from retrim.transport.shared_memory import SharedMemoryBus
 
 pytestmark = [pytest.mark.usefixtures("as_a_user"), pytest.mark.slow]
@@ -85,7 +85,7 @@ def whole(path):
 
 def kept(folder):
     """Assert that what was learnt can be gone on from, and flown."""
-    state, _ = load_learnt(folder / "learnt.safetensors")
+    state, _ = load_learner_state(folder / "learner_state.safetensors")
     adapted, _ = load_policy(folder / "adapted.safetensors")
     np.testing.assert_array_equal(adapted.layers[0].weight, state.policy.policy.layers[0].weight)
 

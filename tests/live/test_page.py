@@ -13,7 +13,7 @@ import pytest
 
 from live_processes import DT, HOME, level
 from retrim.errors import ConfigError
-from retrim.live.knobs import Knobs
+from retrim.live.manual_disturbance import ManualDisturbance
 from retrim.live.page import PagePlan, _Page, free_port
 from retrim.live.page_access import page_url
 from retrim.live.scene import quaternion
@@ -133,12 +133,12 @@ def test_a_knob_in_a_browser_is_a_message_on_the_bus(flight):
         push.fill("1.5")
         push.press("Enter")
         hover(bus, 20.0, lambda: bus.latest("knobs") is not None)
-        assert Knobs.unpack(bus.latest("knobs").data).push == (1.5, 0.0, 0.0)
+        assert ManualDisturbance.unpack(bus.latest("knobs").data).push == (1.5, 0.0, 0.0)
         page.get_by_text("+x").click()
-        hover(bus, 20.0, lambda: Knobs.unpack(bus.latest("knobs").data).kicks == 1)
-        assert Knobs.unpack(bus.latest("knobs").data).kick[0] > 0
+        hover(bus, 20.0, lambda: ManualDisturbance.unpack(bus.latest("knobs").data).kicks == 1)
+        assert ManualDisturbance.unpack(bus.latest("knobs").data).kick[0] > 0
         page.get_by_role("button", name="Calm").click()
-        hover(bus, 20.0, lambda: Knobs.unpack(bus.latest("knobs").data).push[0] == 0.0)
+        hover(bus, 20.0, lambda: ManualDisturbance.unpack(bus.latest("knobs").data).push[0] == 0.0)
         page.get_by_role("combobox", name="reference").click()
         page.get_by_role("option", name="figure8").click()
         hover(bus, 20.0, lambda: bus.latest("wish") is not None)

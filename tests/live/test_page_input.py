@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from live_processes import HOME, level
-from retrim.live.knobs import Knobs
+from retrim.live.manual_disturbance import ManualDisturbance
 from retrim.live.page import _Page, free_port
 from retrim.live.page_input import take_values_only
 from retrim.live.refused_notes import RefusedNotes
@@ -94,8 +94,8 @@ def test_no_value_of_any_control_stops_the_page_and_land_lands(server, bus):
             sent(server, handle, value=good)
     assert settled(lambda: last_note(bus, "wish").get("reference") == "figure8")
     assert settled(lambda: last_note(bus, "wish").get("method") == "lora")
-    assert settled(lambda: Knobs.unpack(bus.latest("knobs").data).load == 0.1)
-    assert settled(lambda: Knobs.unpack(bus.latest("knobs").data).push == (1.0, 0.5, 0.0))
+    assert settled(lambda: ManualDisturbance.unpack(bus.latest("knobs").data).load == 0.1)
+    assert settled(lambda: ManualDisturbance.unpack(bus.latest("knobs").data).push == (1.0, 0.5, 0.0))
     sent(server, found["Land"], value=True)
     assert settled(lambda: last_note(bus, "wish").get("land") is True)
     _Page(SPEC, bus, MagicMock())  # a page that is started again begins from that

@@ -32,7 +32,7 @@ def flown(asked, ticks=30):
     rows = np.zeros((ticks, len(COLUMNS)))
     rows[:, 0] = np.arange(ticks)
     rows[:, 1] = DT * rows[:, 0]
-    rows[:, MEASURED] = rows[:, TRUE] = level(np.asarray(asked.setup.flown.home()))
+    rows[:, MEASURED] = rows[:, TRUE] = level(np.asarray(asked.setup.flight_task.home()))
     rows[:, COMMAND], rows[:, ACCOUNTS["step"]] = HOVER, 1e-3
     return rows
 

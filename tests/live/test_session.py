@@ -28,14 +28,14 @@ class Lost(Hover):
 def request_for(task, folder, seconds):
     with jax.numpy_dtype_promotion("standard"):
         setup = Setup.from_preset(tiny_preset())
-        fields = {each.name: getattr(setup.flown, each.name) for each in dataclasses.fields(setup.flown)}
-        setup = dataclasses.replace(setup, flown=task(**fields))
+        fields = {each.name: getattr(setup.flight_task, each.name) for each in dataclasses.fields(setup.flight_task)}
+        setup = dataclasses.replace(setup, flight_task=task(**fields))
         return LiveRequest(setup, setup.new_policy(random.key(0)), Scenario(), "full", seconds, 0, 3.0, folder)
 
 
 def test_a_fence_holds_all_that_the_reference_passes_and_none_is_made_for_one_that_is_not_finite(tmp_path):
     limits = live_spec(request_for(Lost, tmp_path, 2.0)).limits
-    home = np.asarray(request_for(Hover, tmp_path, 2.0).setup.flown.home())
+    home = np.asarray(request_for(Hover, tmp_path, 2.0).setup.flight_task.home())
     np.testing.assert_allclose(limits.high, home + 3.0)
     assert limits.broken(np.concatenate([home + np.array([3.1, 0.0, 0.0]), np.eye(3).ravel(), np.zeros(3)]))
     with pytest.raises(ConfigError, match=r"its reference is not finite at 2 s; no fence can hold it"):

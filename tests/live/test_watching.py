@@ -6,9 +6,9 @@ import time
 
 import pytest
 
+from retrim.live.child_processes import watched
 from retrim.live.events import LiveEvents
 from retrim.live.status import Status
-from retrim.live.watching import watched
 from retrim.runtime.events import Event
 
 

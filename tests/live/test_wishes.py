@@ -13,15 +13,15 @@ from retrim.adapt.updates import PolicyUpdate
 from retrim.config.scenario import Scenario
 from retrim.config.setup import Setup
 from retrim.control.lora import LoraPolicy
-from retrim.io.trained import load_learnt
+from retrim.io.trained import load_learner_state
 from retrim.learn.bptt import PolicyState
-from retrim.live import wishes
-from retrim.live.knobs import Knobs
-from retrim.live.published import keep
+from retrim.live import operator_requests as wishes
+from retrim.live.manual_disturbance import ManualDisturbance
+from retrim.live.operator_requests import OperatorRequests
+from retrim.live.published_updates import keep
 from retrim.live.session import LiveRequest, live_spec
 from retrim.live.status import Status
 from retrim.live.supervisor import Supervisor
-from retrim.live.wishes import Wishes
 from retrim.onboard.messages import pack_note
 from retrim.transport.in_process import InProcessBus
 
@@ -54,7 +54,7 @@ def asked(tmp_path):
         setup = Setup.from_preset(tiny_preset())
         policy = setup.new_policy(random.key(0))
         request = LiveRequest(setup, policy, Scenario(), "full", 10.0, 0, 3.0, tmp_path)
-        return Wishes(request, Told(live_spec(request)))
+        return OperatorRequests(request, Told(live_spec(request)))
 
 
 def status(**control):
@@ -86,7 +86,7 @@ def test_pausing_keeps_what_flies_and_none_does_not(asked):
 
 def test_another_way_of_learning_goes_on_from_what_is_flown(asked):
     supervisor = asked._supervisor
-    state = load_learnt(supervisor.start)[0]
+    state = load_learner_state(supervisor.start)[0]
     nudged = state.policy.policy.with_params(jax.tree.map(lambda leaf: leaf + 0.01, state.policy.policy.params))
     keep(supervisor.bus, "policy", 3, PolicyUpdate(1.0, 1.0, 2.0, PolicyState(nudged, state.policy.optimiser)), {})
     flying = status(newest={"policy": 3}, given_up=[])
@@ -97,7 +97,7 @@ def test_another_way_of_learning_goes_on_from_what_is_flown(asked):
         asked.obey(flying)
         time.sleep(0.01)
     assert supervisor.told == [(False, True), supervisor.start]
-    found = load_learnt(supervisor.start)[0].policy.policy
+    found = load_learner_state(supervisor.start)[0].policy.policy
     assert isinstance(found, LoraPolicy)
     for leaf, expected in zip(jax.tree.leaves(found.merged().params), jax.tree.leaves(nudged.params), strict=True):
         np.testing.assert_allclose(leaf, expected, atol=1e-12)
@@ -107,6 +107,6 @@ def test_knobs_are_an_event_once_they_rest(asked, monkeypatch):
     monkeypatch.setattr(wishes, "SETTLED_S", 0.0)
     asked._supervisor.bus.publish("knobs", b"noise")
     assert asked.obey(status()) == []
-    asked._supervisor.bus.publish("knobs", Knobs(load=0.05, push=(1.0, 0.0, 0.0)).pack())
+    asked._supervisor.bus.publish("knobs", ManualDisturbance(load=0.05, push=(1.0, 0.0, 0.0)).pack())
     assert [event.kind for event in asked.obey(status())] == ["knobs"]
     assert asked.obey(status()) == []

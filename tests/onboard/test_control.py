@@ -15,7 +15,6 @@ from live_processes import DT, HOME, level, moved
 from retrim import PlantError
 from retrim.adapt.learner_state import LearnerState
 from retrim.live.controllers import adaptive_source, plain_source
-from retrim.onboard.accounts import measured
 from retrim.onboard.control import ControlLoop
 from retrim.onboard.guard import Mode
 from retrim.onboard.messages import (
@@ -30,7 +29,8 @@ from retrim.onboard.messages import (
     pack_note,
     unpack_note,
 )
-from retrim.onboard.shares import PHASE, SHARE
+from retrim.onboard.tick_budget import PHASE, SHARE
+from retrim.onboard.timing_stats import measured
 from retrim.physics import Command, State
 from retrim.physics.disturbance import Constant
 from retrim.plants.sim import SimPlant

@@ -5,8 +5,8 @@ import pytest
 
 from bus_ends import LOCAL, NETWORK, arrived, two_ends
 from live_helpers import holding
-from retrim.onboard.intake import Intake
 from retrim.onboard.messages import Parameters
+from retrim.onboard.parameter_receiver import ParameterReceiver
 from retrim.onboard.pilot import LivePilot
 
 EACH = 1000
@@ -20,7 +20,7 @@ def test_mutated_parameters_and_random_bytes_are_refused(backend):
     for writer, reader in two_ends(backend, room):
         pilot = LivePilot(source)
         pilot.reset(np.concatenate([np.zeros(3), np.eye(3).ravel(), np.zeros(3)]))
-        intake, version = Intake(pilot, reader, source.base, 0.02), 0
+        intake, version = ParameterReceiver(pilot, reader, source.base, 0.02), 0
         for i in range(2 * EACH):
             data = _mutated(whole, rng) if i % 2 else rng.bytes(int(rng.integers(0, 2000)))
             writer.publish("parameters.policy", data)

@@ -15,7 +15,6 @@ import pytest
 
 from live_helpers import HIGH, LOW, TOPICS
 from live_processes import DT, HOME, level, moved
-from retrim.onboard.accounts import accounted, summary
 from retrim.onboard.control_process import PATIENCE, Schedule
 from retrim.onboard.guard import G, Limits, Mode
 from retrim.onboard.launch import launch
@@ -31,9 +30,10 @@ from retrim.onboard.messages import (
     last_note,
     pack_note,
 )
-from retrim.onboard.realtime import Lifeline, cores_of
+from retrim.onboard.realtime import ParentWatch, cores_of
 from retrim.onboard.recorder import Recorder, RecorderPlan, read_log, record
-from retrim.onboard.shares import MARGIN, PHASE, ROOM, SHARE
+from retrim.onboard.tick_budget import MARGIN, PHASE, ROOM, SHARE
+from retrim.onboard.timing_stats import accounted, summary
 from retrim.onboard.watchdog import Watchdog, WatchdogPlan
 from retrim.transport.in_process import InProcessBus
 from retrim.transport.shared_memory import SharedMemoryBus
@@ -346,7 +346,7 @@ def test_a_log_on_a_full_disk_goes_on_in_the_first_temporary_folder_with_room(tm
 
 def test_a_lifeline_tells_at_once():
     process = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
-    line = Lifeline(process.pid)
+    line = ParentWatch(process.pid)
     assert not line.gone()
     os.kill(process.pid, signal.SIGKILL)
     assert line.gone(5.0)

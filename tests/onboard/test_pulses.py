@@ -4,7 +4,7 @@ import time
 
 import pytest
 
-from retrim.onboard.heart import EVERY, Heart, Pacemaker
+from retrim.onboard.heartbeat import EVERY, Heart, Pacemaker
 from retrim.onboard.messages import last_note
 from retrim.onboard.pulses import LOOK, SILENCE, Pulses
 from retrim.transport.in_process import InProcessBus

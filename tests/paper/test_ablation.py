@@ -5,7 +5,7 @@ import pytest
 from retrim.config import Setup, changed
 from retrim.config import named_presets as presets
 from retrim.config.methods import find_method
-from retrim_paper.levers import CONTROL, OFF, ON
+from retrim_paper.ablation_options import CONTROL, OFF, ON
 
 
 @pytest.mark.parametrize(("task", "kind"), [(task, kind) for task in OFF for kind in ("retrim", "paper")])

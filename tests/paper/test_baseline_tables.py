@@ -18,7 +18,7 @@ from helpers import brief_preset, random_command, random_state, tiny_preset
 from retrim import ConfigError, PlantError, Setup
 from retrim.config import load, named_presets
 from retrim.config.baselines import BASELINES
-from retrim.evaluation import effort
+from retrim.evaluation import compute_cost as effort
 from retrim.runkit import Run, provenance
 from retrim.runkit.reporter import Silent
 from retrim_paper import design, tables
@@ -295,7 +295,7 @@ def test_what_each_method_costs_by_its_command(tmp_path, monkeypatch):
     monkeypatch.setattr(effort, "DECISIONS", 3)
     monkeypatch.setattr(effort, "RUNS", 2)
     monkeypatch.setattr(efficiency_table, "BASELINES", {"indi": BASELINES["indi"]})
-    monkeypatch.setattr(efficiency_table, "trained_datt", lambda *_, **__: {})
+    monkeypatch.setattr(efficiency_table, "train_datt", lambda *_, **__: {})
     words = "--presets", "hover/fast", "--datt-steps", "1"
     out = retrim("reproduce", "efficiency", *words, "--out", "e", cwd=tmp_path)
     rows = {row["method"]: row for row in json.loads((tmp_path / "e" / "efficiency.json").read_text())["rows"]}

@@ -204,7 +204,7 @@ def test_costs_are_laid_out_as_they_were_measured(tmp_path, presets, monkeypatch
     monkeypatch.setattr(efficiency, "train", train)
     monkeypatch.setattr(efficiency, "updates", updates)
     monkeypatch.setattr(efficiency, "decision_s", lambda setup, controller: 0.0125)
-    monkeypatch.setattr(efficiency, "trained_datt", datt)
+    monkeypatch.setattr(efficiency, "train_datt", datt)
     monkeypatch.setattr(efficiency, "datt_of", lambda setup, net: net)
     efficiency.efficiency(Run("test", tmp_path), Silent(), presets=("hover/fast", "hover/paper"), datt_steps=16_384)
     small = brief_preset()

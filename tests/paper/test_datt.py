@@ -12,7 +12,7 @@ from retrim.estimation.l1 import L1Estimator
 from retrim.estimation.prediction import Prediction
 from retrim.physics import Command, CommandPath, State, small
 from retrim.testing import check_controller
-from retrim_paper.datt.controller import SIZE, Datt, DattNet, _along, datt_command, datt_observation
+from retrim_paper.datt.controller import SIZE, DattController, DattNet, _along, datt_command, datt_observation
 from retrim_paper.datt.ppo import PpoSettings, PpoState, ppo
 from retrim_paper.datt.problem import KNOWN, DattProblem, reference_bank, ticks_of
 
@@ -88,7 +88,7 @@ def test_it_learns_and_is_a_controller(key):
     for before, after in zip(jax.tree.leaves(fresh), jax.tree.leaves(net), strict=True):
         assert not eqx.is_array(before) or (not np.array_equal(before, after) and np.isfinite(after).all())
     estimator = L1Estimator(jnp.array(-0.2), jnp.array(0.95), DT)
-    flown = Datt(
+    flown = DattController(
         net,
         hover_task(),
         Prediction.of(CommandPath.of(DT, first_order(TAU)), DT),

@@ -9,11 +9,11 @@ import pytest
 from commands import results
 from helpers import brief_preset
 from retrim import ConfigError, PlantError, Scenario
-from retrim.evaluation.gathering import Flights
+from retrim.evaluation.executor import Flights
 from retrim.runkit import Run
 from retrim.runkit.document import Document
 from retrim.runkit.reporter import Silent
-from retrim_paper.levers import CONTROL, OFF, ON
+from retrim_paper.ablation_options import CONTROL, OFF, ON
 
 # The package has functions of these names.
 NAMES = ("ablation", "gauntlet", "levels", "plants", "reversing")

@@ -20,8 +20,8 @@ from retrim.config import named_presets as presets
 from retrim.config.disturbances import DISTURBANCES
 from retrim.config.loading import dump, with_vehicle
 from retrim.config.presets import Adapt
-from retrim.evaluation.kept import files_behind, named_by, named_in
-from retrim.evaluation.lots import LOT
+from retrim.evaluation.batches import LOT
+from retrim.evaluation.section_store import file_digests, named_by, named_in
 from retrim.evaluation.study import Study, fly_all, refuse_misfits, train_all
 from retrim.runkit import Run, provenance
 from retrim.runkit.document import Document, TableSection
@@ -158,7 +158,7 @@ def test_a_section_is_made_again_for_every_thing_that_it_follows_from(tmp_path, 
     assert [fly(seeds=(1,)), fly(starts=2), fly(seconds=2.0), fly(datt_steps=2)] == [1] * 4
     assert fly(dataclasses.replace(base, methods=("indi", "geometric")), datt_steps=2) == 0  # nobody there is trained
     assert fly() == 0
-    monkeypatch.setattr(levels, "files_behind", lambda *names: {"my_wind:breeze": "changed"})
+    monkeypatch.setattr(levels, "file_digests", lambda *names: {"my_wind:breeze": "changed"})
     assert fly() == 1
 
 
@@ -167,8 +167,8 @@ def test_a_vehicle_of_a_file_or_a_module_is_one_of_the_things(tmp_path, monkeypa
     monkeypatch.syspath_prepend(str(tmp_path))
     Path("my_quad.py").write_text("from retrim.physics.vehicle import small as make\n")
     preset = with_vehicle(load("hover/retrim"), "my_quad:make")
-    assert set(files_behind(*named_in(preset))) == set(files_behind(*named_by(Scenario(vehicle="my_quad:make"))))
-    assert set(files_behind(*named_in(preset))) == {"my_quad:make"}
+    assert set(file_digests(*named_in(preset))) == set(file_digests(*named_by(Scenario(vehicle="my_quad:make"))))
+    assert set(file_digests(*named_in(preset))) == {"my_quad:make"}
     text = (Path(__file__).parents[2] / "examples" / "extensions" / "vehicle.toml").read_text()
     Path("my.toml").write_text(text)
     before = dump(with_vehicle(preset, "my.toml"))
@@ -207,10 +207,10 @@ def test_a_section_follows_from_the_files_behind_its_names(tmp_path, monkeypatch
     Path("lap.csv").write_text("t,x,y,z\n")
     DISTURBANCES.find("my_wind:breeze")
     names = "my_wind:breeze=3+none", "lap.csv:laps", "bem", None
-    before = files_behind(*names)
+    before = file_digests(*names)
     assert set(before) == {"my_wind:breeze=3", "lap.csv:laps"}
     Path("lap.csv").write_text("t,x,y,z,yaw\n")
-    after = files_behind(*names)
+    after = file_digests(*names)
     assert [after[name] == before[name] for name in sorted(before)] == [False, True]
 
 
@@ -227,20 +227,20 @@ def test_datt_is_trained_once_for_a_folder(tmp_path, monkeypatch):
     reporter = Silent()
     reporter.say = said.append
     run, preset = Run("test", tmp_path), load("hover/retrim")
-    first = rivals.trained_datt(preset, [0, 1], run, reporter, steps=1)
-    again = rivals.trained_datt(preset, [0], run, reporter, steps=1)
+    first = rivals.train_datt(preset, [0, 1], run, reporter, steps=1)
+    again = rivals.train_datt(preset, [0], run, reporter, steps=1)
     jax.tree.map(np.testing.assert_array_equal, first[0], again[0])
     assert any(np.any(a != b) for a, b in zip(jax.tree.leaves(first[0]), jax.tree.leaves(first[1]), strict=True))
     (file,) = tmp_path.glob("datt_*_seed0.safetensors")
     file.write_bytes(file.read_bytes()[:-100])
-    other = rivals.trained_datt(preset, [0], run, reporter, steps=1)
+    other = rivals.train_datt(preset, [0], run, reporter, steps=1)
     assert "trained again" in said[0]
     jax.tree.map(np.testing.assert_array_equal, first[0], other[0])
     monkeypatch.setattr(provenance, "code", lambda: "changed")
-    rivals.trained_datt(preset, [0], run, reporter, steps=1)
+    rivals.train_datt(preset, [0], run, reporter, steps=1)
     assert len(list(tmp_path.glob("datt_*_seed0.safetensors"))) == 2
     with pytest.raises(ConfigError, match=r"DATT looks ahead in steps of 0\.06 s, which must be whole control periods"):
-        rivals.check_rival(changed(preset, dt=0.025))
+        rivals.check_period(changed(preset, dt=0.025))
 
 
 @pytest.mark.usefixtures("small_datt")
@@ -252,7 +252,7 @@ def test_a_training_of_datt_that_is_cut_goes_on_where_it_was(tmp_path):
         run = Run("test", tmp_path / name)
         watching = Watching(lambda share: share > stops_at and run.stop.set())
         watching.say = said.append
-        nets = rivals.trained_datt(preset, [0], run, watching, steps=4 * size)
+        nets = rivals.train_datt(preset, [0], run, watching, steps=4 * size)
         return nets, [round(4 * share) for share in watching.shares]
 
     (whole, shares), (nothing, first) = train("whole"), train("cut", stops_at=0.4)
@@ -289,7 +289,7 @@ def test_a_network_of_datt_is_of_its_vehicle_its_lag_its_steps_and_its_seed(tmp_
         return jax.tree.leaves(eqx.filter(net, eqx.is_array))
 
     def train(preset=preset, seeds=(0,), steps=2 * size):
-        return rivals.trained_datt(preset, seeds, Run("test", tmp_path), watching, steps=steps)
+        return rivals.train_datt(preset, seeds, Run("test", tmp_path), watching, steps=steps)
 
     nets = train(seeds=(0, 3))
     assert [said for _, *said in watching.told] == [[0.5, "reward 0.000"], [1.0, "reward 1.000"]] * 2
@@ -309,9 +309,9 @@ def test_a_network_of_datt_is_of_its_vehicle_its_lag_its_steps_and_its_seed(tmp_
     assert len(asked) == before
     for one, other in zip(weights(again[3]), weights(nets[3]), strict=True):
         np.testing.assert_array_equal(one, other)
-    assert rivals.steps_made(1) == size
-    assert rivals.steps_made(2 * size) == 2 * size
-    assert rivals.steps_made(2 * size + 1) == 3 * size
+    assert rivals.rounded_steps(1) == size
+    assert rivals.rounded_steps(2 * size) == 2 * size
+    assert rivals.rounded_steps(2 * size + 1) == 3 * size
 
 
 @pytest.mark.usefixtures("small_datt")
@@ -334,7 +334,7 @@ def test_a_table_of_fast_flight_flies_a_file_too(tmp_path, monkeypatch):
     preset = brief_preset("track/fast", track={"reference": "circle=8", "felt_copies": 0})
     setup = Setup.from_preset(preset, str(line))
     assert setup.limits_exceeded() is None
-    speeds = np.linalg.norm(at(setup.flown.reference, np.linspace(3.0, 10.0, 50)).v, axis=1)
+    speeds = np.linalg.norm(at(setup.flight_task.reference, np.linspace(3.0, 10.0, 50)).v, axis=1)
     assert 8.0 < max(speeds) < 12.0
     monkeypatch.setattr(levels, "train_all", untrained)
     section = dataclasses.replace(fast._section(preset, str(line), "simple", ("base",)), stem="race")

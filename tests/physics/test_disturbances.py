@@ -22,7 +22,7 @@ from retrim.physics import (
     RotorState,
     State,
     SteadyWind,
-    Together,
+    SumOfDisturbances,
     Turbulence,
     WeakRotor,
     small,
@@ -77,13 +77,13 @@ def test_together_adds_and_gains_multiply(key):
         WeakRotor.of(0, 0.5),
         Constant(jnp.array([1.0, 0.0, 0.0])),
     )
-    both = Together(parts)(t, x)
+    both = SumOfDisturbances(parts)(t, x)
     np.testing.assert_allclose(both.push, [2.0, 2.0, 3.0])
     np.testing.assert_allclose(both.wind, [3.0, 0.0, 0.0])
     np.testing.assert_allclose(both.gain, [0.45, 1.0, 1.0, 1.0])
     np.testing.assert_allclose(both.inertia, payload_inertia(0.07))
-    same(Together(parts[::-1])(t, x), both)
-    same(Together(())(t, x), ExternalEffects.calm(x.p.dtype))
+    same(SumOfDisturbances(parts[::-1])(t, x), both)
+    same(SumOfDisturbances(())(t, x), ExternalEffects.calm(x.p.dtype))
 
 
 def test_push_lifts_a_function(key):

@@ -17,7 +17,7 @@ from retrim.plants.bridges.betaflight_wire import (
     sticks_packet,
     throttle_of,
 )
-from retrim.plants.bridges.betaflight_world import Ears
+from retrim.plants.bridges.betaflight_world import MotorListener
 
 
 def test_a_state_has_the_gyro_in_its_axes_and_a_time_that_stands():
@@ -52,7 +52,7 @@ def test_throttle_is_the_inverse_of_what_the_mixer_does():
 
 def test_noise_is_no_packet_of_motors():
     """2,000 random and truncated packets of somebody else: none gets through, and the board is heard all the same."""
-    rng, ears = np.random.default_rng(0), Ears(0)
+    rng, ears = np.random.default_rng(0), MotorListener(0)
     board, stranger = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
     try:
         board.sendto(struct.pack("<4f", 0.1, 0.2, 0.3, 0.4), ("127.0.0.1", ears.port))
@@ -65,7 +65,7 @@ def test_noise_is_no_packet_of_motors():
         board.sendto(struct.pack("<4f", 0.5, 0.5, 0.5, 0.5), ("127.0.0.1", ears.port))
         np.testing.assert_allclose(ears.hear(motors), 0.5)
         with pytest.raises(PlantError, match="is taken"):
-            Ears(ears.port)
+            MotorListener(ears.port)
     finally:
         for each in (ears, board, stranger):
             each.close()

@@ -14,9 +14,9 @@ import pytest
 
 from helpers import random_state
 from retrim import ConfigError, PlantError, load
+from retrim.cli.arguments import FlightArguments
 from retrim.config import PRESETS, Scenario, Setup
 from retrim.control import AbstractController
-from retrim.evaluation.asked import Where
 from retrim.physics import Command, Constant, Payload, State, small, so3
 from retrim.plants import Plant, crazyflow
 from retrim.plants.crazyflow import CrazyflowPlant
@@ -322,19 +322,19 @@ def test_missing_extra_names_the_command_that_installs_it(name, monkeypatch):
 def test_missing_extra_is_named_before_anything_is_trained(name, monkeypatch):
     monkeypatch.setitem(sys.modules, "pymavlink" if name == "mavlink" else name, None)
     with pytest.raises(PlantError, match=rf"plant '{name}' needs the package .*`uv pip install -e '\.\[{name}\]'`"):
-        Where(plant=name, disturbance="none").scenario(load("hover/retrim"))
+        FlightArguments(plant=name, disturbance="none").scenario(load("hover/retrim"))
 
 
 def test_missing_ros_is_named_before_anything_is_trained(monkeypatch):
     monkeypatch.setitem(sys.modules, "rospy", None)
     with pytest.raises(ConfigError, match="ROS 1 needs rospy from the system: apt install python3-rospy"):
-        Where(plant="ros").scenario(load("hover/retrim"))
+        FlightArguments(plant="ros").scenario(load("hover/retrim"))
 
 
 def test_missing_firmware_is_named_before_anything_is_trained(monkeypatch):
     monkeypatch.setenv("RETRIM_BETAFLIGHT", "/nowhere")
     with pytest.raises(PlantError, match="RETRIM_BETAFLIGHT=/nowhere: no program"):
-        Where(plant="betaflight").scenario(load("hover/retrim"))
+        FlightArguments(plant="betaflight").scenario(load("hover/retrim"))
 
 
 def python(code):

@@ -20,8 +20,8 @@ from retrim.io.logs import read_flight_log, read_map
 from retrim.io.trained import save_policy
 from retrim.replay import identification
 from retrim.replay.adaptation import Adapted, adapt_to
-from retrim.replay.foretelling import Protocol, foretell
 from retrim.replay.identification import Estimate, Identified
+from retrim.replay.prediction import Protocol, predict_log
 from retrim.replay.predictors import learnt, mean_of, ridge, yardsticks
 from retrim.replay.replay import Replay, replay
 from retrim.replay.rows import rows_of
@@ -60,7 +60,7 @@ def test_the_residual_of_a_push_is_the_push(log):
 
 
 def test_a_push_is_foretold_and_zero_misses_all_of_it(log):
-    found = {each.name: each for each in foretell(rows_of(log), log.dt, yardsticks(log.dt), SHORT)}
+    found = {each.name: each for each in predict_log(rows_of(log), log.dt, yardsticks(log.dt), SHORT)}
     assert found["zero"].rmse == pytest.approx(np.linalg.norm(PUSH), rel=1e-2)
     for name in ("last second", "mean of the buffer", "ridge"):
         assert found[name].rmse < 0.02
@@ -72,7 +72,7 @@ def test_a_push_is_foretold_and_zero_misses_all_of_it(log):
 def test_residual_models_foretell_a_push(log, name):
     preset = load("hover/retrim")
     begin = learnt(name, preset, make_vehicle("small"), 0, window=100, fit_every=1.0, fit_steps=100)
-    (found,) = foretell(rows_of(log), log.dt, {name: begin}, SHORT)
+    (found,) = predict_log(rows_of(log), log.dt, {name: begin}, SHORT)
     assert found.rmse < 0.35
 
 
@@ -81,13 +81,13 @@ def test_only_valid_rows_count(log):
     spoilt = jnp.arange(rows.valid.shape[0]) % 7 == 0
     damaged = type(rows)(rows.x, rows.u, jnp.where(spoilt[:, None], 99.0, rows.a_res), rows.omega, rows.valid & ~spoilt)
     for name, begin in (("mean", lambda: mean_of), ("ridge", lambda: ridge)):
-        (a,) = foretell(damaged, log.dt, {name: begin}, SHORT)
+        (a,) = predict_log(damaged, log.dt, {name: begin}, SHORT)
         assert a.rmse < 0.02
 
 
 def test_a_log_that_is_too_short_says_what_to_choose(log):
     with pytest.raises(LogError, match="choose a shorter --buffer or --horizon"):
-        list(foretell(rows_of(log), log.dt, yardsticks(log.dt), Protocol(10.0, 10.0)))
+        list(predict_log(rows_of(log), log.dt, yardsticks(log.dt), Protocol(10.0, 10.0)))
 
 
 @pytest.mark.parametrize(
@@ -140,7 +140,7 @@ def test_a_buffer_that_holds_too_few_samples_is_named(files, tmp_path, monkeypat
         replay(path, Replay(map=str(chosen), buffer=0.2, horizon=1.0), Run("replay", tmp_path), Silent())
     assert "\n" not in str(error.value)
     made = []
-    monkeypatch.setattr(replays, "foretell", lambda rows, dt, predictors, protocol: made.extend(predictors) or ())
+    monkeypatch.setattr(replays, "predict_log", lambda rows, dt, predictors, protocol: made.extend(predictors) or ())
     replay(path, Replay(map=str(chosen), buffer=0.26, horizon=1.0), Run("replay", tmp_path), Silent())
     assert "regression" in made
 

@@ -9,7 +9,7 @@ from jax import random
 from helpers import CheapModel
 from retrim.config import Setup, changed, load
 from retrim.config.faults import measurement_fault
-from retrim.io.trained import load_learnt, save_learnt
+from retrim.io.trained import load_learner_state, save_learner_state
 from retrim.physics import Push
 from retrim.plants import SensorModel, SimPlant
 from retrim.runtime import fly
@@ -83,7 +83,7 @@ def test_the_residual_has_found_the_push(flights):
 def test_what_was_learnt_is_kept(flights, trained, tmp_path):
     setup, _ = trained
     _, _, pilot = flights["full"]
-    save_learnt(tmp_path / "learnt.safetensors", pilot.state, setup.preset)
-    state, preset = load_learnt(tmp_path / "learnt.safetensors")
+    save_learner_state(tmp_path / "learner_state.safetensors", pilot.state, setup.preset)
+    state, preset = load_learner_state(tmp_path / "learner_state.safetensors")
     assert preset == setup.preset
     jax.tree.map(np.testing.assert_array_equal, state, pilot.state)

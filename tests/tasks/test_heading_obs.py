@@ -12,7 +12,7 @@ from helpers import random_command, random_state
 from retrim.config import Setup, changed, load
 from retrim.errors import ConfigError
 from retrim.physics import State, so3
-from retrim.physics.felt_frame import FeltFrame
+from retrim.physics.effective_gravity import EffectiveGravityFrame
 from retrim.tasks import StateObs
 from retrim.tasks.heading_obs import HeadingObs
 
@@ -59,7 +59,7 @@ def test_lengths_heights_and_tilt_are_kept(observation, key):
 
 def test_the_law_holds_in_another_frame(observation, key):
     """There the vertical is the thrust that balances a disturbance."""
-    frame = FeltFrame.of(jnp.array([1.0, -2.0, 0.5]))
+    frame = EffectiveGravityFrame.of(jnp.array([1.0, -2.0, 0.5]))
     other, a, b = observation.in_frame(frame), *random.split(key)
     x, u = random_state(a), random_command(b)
     same = turned(x, 1.2, frame.vector(observation.origin))

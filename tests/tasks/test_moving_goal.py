@@ -14,7 +14,7 @@ from retrim.control import PolicyController
 from retrim.control.resting import RestingController
 from retrim.errors import FrameError
 from retrim.physics import Command, State
-from retrim.physics.felt_frame import FeltFrame
+from retrim.physics.effective_gravity import EffectiveGravityFrame
 from retrim.tasks import AbstractTask, L2Hover, StateObs
 from retrim.tasks.moving_goal import MovingGoal
 from retrim.testing import check_task
@@ -106,7 +106,7 @@ def test_starts_are_near_the_moving_target(key):
 
 def test_frames(key):
     """The task in a frame: the same target, and the same error up to the scale of the frame for built-in hover."""
-    frame, t = FeltFrame.of(PUSH), jnp.array(4.0)
+    frame, t = EffectiveGravityFrame.of(PUSH), jnp.array(4.0)
     x, u = random_state(key), Command.of(jnp.array([10.0, 0.1, 0.2, -0.1]))
     task = moving()
     turned = task.in_frame(frame)
@@ -135,7 +135,7 @@ def test_only_a_policy_whose_task_rests_is_shifted_at_rest():
         for task in ("hover", "orbit-family"):
             setup = Setup.from_preset(changed(load("hover/any"), task=task, pretrain={"hidden_sizes": (8, 8)}))
             policy = setup.new_policy(random.key(0))
-            kinds.append(type(policy_controller(setup.preset, setup.flown, policy).inner))
+            kinds.append(type(policy_controller(setup.preset, setup.flight_task, policy).inner))
         assert kinds == [RestingController, PolicyController]
     finally:
         del TASKS._known["orbit-family"]

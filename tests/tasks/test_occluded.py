@@ -9,7 +9,7 @@ from jax import random
 
 from helpers import GOAL, replaced, stacked
 from retrim.physics import Command, PointMass, State, small, so3
-from retrim.physics.felt_frame import FeltFrame
+from retrim.physics.effective_gravity import EffectiveGravityFrame
 from retrim.tasks import Keypoints, L2Hover, OccludedKeypoints
 from retrim.tasks.view import ViewHover
 
@@ -182,7 +182,7 @@ def test_it_is_for_flight(place):
 @pytest.mark.parametrize("d", [(0.0, 0.0, 0.0), (1.0, -0.5, 1.5)])
 def test_in_a_frame_the_camera_sees_level_ground(d):
     """A camera in the world, with a pose estimate that is right, shows what one in the frame would: in all frames."""
-    frame, before = FeltFrame.of(jnp.array(d)), near()
+    frame, before = EffectiveGravityFrame.of(jnp.array(d)), near()
     x = step(before, Command.hover())
     inside = full().in_frame(frame)
     hovering = frame.command(Command.hover())

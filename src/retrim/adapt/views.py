@@ -6,7 +6,7 @@ import dataclasses
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from ..control.gravity_frame import Capped, capped
+from ..control.gravity_frame import NormLimited, capped
 from ..learn.env import Env
 from ..learn.residuals.model import FittedResidual
 from ..learn.residuals.rates import RateFit
@@ -45,7 +45,7 @@ class GravityView(AbstractView):
     def __call__(self, env: Env, residual: Residual) -> Env:
         """Add the residual to the model; the controller compensates it with the frame, and also a bias of the rates."""
         env = with_lag(env, turning_of(residual))
-        return dataclasses.replace(env.with_residual(residual), felt=Capped(residual, self.limit))
+        return dataclasses.replace(env.with_residual(residual), felt=NormLimited(residual, self.limit))
 
 
 class RestView(AbstractView):

@@ -21,7 +21,7 @@ from ..physics.vehicle import small
 from ..plants.sim import SimPlant
 from ..runtime.batch import batch_flight
 from ..runtime.batched import stacked
-from .flown import learner_in_flight
+from .flight import learner_in_flight
 from .timing import compiled, timed
 
 FLEET = 8  # number of vehicles
@@ -31,7 +31,7 @@ Update = Callable[[Key[Array, ""]], tuple[PolicyState, Verdict]]
 def eight_flights() -> dict[str, Any]:
     """Time eight flights of 30 s on bem; plant and policy are one program; two threads run four flights each."""
     setup = Setup.from_preset("hover/fast")
-    controller = PolicyController(setup.flown.observation_in_flight, setup.new_policy(random.key(0)))
+    controller = PolicyController(setup.flight_task.observation_in_flight, setup.new_policy(random.key(0)))
     simulation = SimPlant(BemQuadrotor.of(small(), 0.02), disturbance("none")).simulation
     starts = setup.flight_starts(8)
     halves = [stacked(starts[i : i + 4]) for i in (0, 4)]

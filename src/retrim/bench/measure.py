@@ -14,7 +14,7 @@ from ..runkit.document import Document, TableSection
 from ..runkit.reporter import Reporter
 from ..runkit.run import Run
 from .machine import UNIT_FLOP
-from .works import WORKS
+from .workloads import WORKS
 
 CORES = ("one", "all") if hasattr(os, "sched_setaffinity") and len(os.sched_getaffinity(0)) > 1 else ("all",)
 COLUMNS = (
@@ -104,7 +104,7 @@ def _process(name: str, cores: str, environment: dict[str, str]) -> dict[str, An
     inherited = {key: value for key, value in os.environ.items() if key != "JAX_COMPILATION_CACHE_DIR"}
     inherited |= {"JAX_PLATFORMS": "cpu"} if cores == "one" else {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
     ran = subprocess.run(
-        [*PYTHON, "retrim.bench.works", name, cores],
+        [*PYTHON, "retrim.bench.workloads", name, cores],
         env=inherited | environment,
         capture_output=True,
         text=True,

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from ..bench.measure import bench as measure
-from ..bench.works import WORKS
+from ..bench.workloads import WORKS
 from ..runkit.run import Run
 from .console import RichReporter, show_paths, started
 

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from rich.table import Table
 
-from ..evaluation.known_fault import wrong_rows
+from ..evaluation.jax_bug_check import wrong_rows
 from ..runkit.provenance import commit, describe_hardware, versions
 from .console import console
 

@@ -10,16 +10,16 @@ from ..config.loading import overlaid
 from ..config.scenario import Scenario
 from ..config.setup import Latency, Setup
 from ..errors import ConfigError
-from ..evaluation.asked import Where, loaded, same_policy, with_residual
+from ..evaluation.executor import report_progress
 from ..evaluation.figures import picture
 from ..evaluation.fleet import Fleet
-from ..evaluation.gathering import told_by
 from ..evaluation.metrics import cell, notes, rows
 from ..runkit.document import TableSection
 from ..runkit.flights import Flight
 from ..runkit.interrupts import interrupts_only_set
 from ..runkit.outlet import Outlet
 from ..runkit.run import INTERRUPTED, Run
+from .arguments import FlightArguments, loaded, same_policy, with_residual
 from .console import RichReporter, Trust, console, refuse, show_paths, show_table, started
 from .flight_vehicle import check_vehicle_file, save_flight_vehicle
 
@@ -28,7 +28,7 @@ def fly(
     policy: Path | None = None,
     resume: Path | None = None,
     delta: Path | None = None,
-    where: tyro.conf.OmitArgPrefixes[Where] = Where(),  # noqa: B008
+    where: tyro.conf.OmitArgPrefixes[FlightArguments] = FlightArguments(),  # noqa: B008
     adapt: str = "full",
     residual: str | None = None,
     config: Path | None = None,
@@ -44,8 +44,7 @@ def fly(
 
     Args:
         policy: A policy.safetensors, or the folder that holds one.
-        resume: Instead of a policy: learnt.safetensors of an earlier flight (policy, residual, optimiser states),
-            from which to continue.
+        resume: Instead of a policy: learner_state.safetensors of an earlier flight, from which to continue.
         delta: A low-rank delta.safetensors of an earlier flight, to add to the policy.
         where: Plant, vehicle and disturbances of the flight.
         adapt: full, lora: re-train in flight, all weights or a few; base-i: integral action; base-do: observer; none:
@@ -95,7 +94,7 @@ def _fly(fleet: Fleet, setup: Setup, scenario: Scenario, run: Run, vehicle_file:
     flights = list[Flight]()  # a Ctrl-C may come before the first flight ends
     with run.interruptible(), RichReporter().progress("flying") as advance:
         advance(0.0, "compiling the programs of a flight (kept in a cache for the next time)")
-        flights = fleet.run(stop=run.stop, progress=told_by(advance)).flown
+        flights = fleet.run(stop=run.stop, progress=report_progress(advance)).flown
     if not flights:
         console.print("interrupted before the first flight was over; nothing was saved")
         return INTERRUPTED

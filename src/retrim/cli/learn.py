@@ -8,7 +8,7 @@ from pathlib import Path
 import tyro
 
 from ..errors import printable
-from ..live.ground import learn_for
+from ..live.learner_server import learn_for
 from ..signals import ending_signals
 from ..transport.remote import flights_at
 from .console import RichReporter, Trust, console

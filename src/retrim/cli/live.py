@@ -12,7 +12,6 @@ from rich.table import Table
 from ..config.loading import load_for
 from ..config.setup import Setup
 from ..errors import ConfigError
-from ..evaluation.asked import Where, loaded, with_residual
 from ..evaluation.figures import picture
 from ..evaluation.limits import check_seeds
 from ..io.logs.viewers import check_recording
@@ -29,6 +28,7 @@ from ..runkit.run import INTERRUPTED, Run
 from ..runkit.training import train
 from ..runtime.events import Event
 from ..transport.remote import LOOPBACK
+from .arguments import FlightArguments, loaded, with_residual
 from .console import RichReporter, Trust, console, refuse, show_paths, show_table, started
 from .flight_vehicle import check_vehicle_file, save_flight_vehicle
 
@@ -39,7 +39,7 @@ def live(
     policy: Path | None = None,
     resume: Path | None = None,
     preset: str = "hover/retrim",
-    where: tyro.conf.OmitArgPrefixes[Where] = Where(),  # noqa: B008
+    where: tyro.conf.OmitArgPrefixes[FlightArguments] = FlightArguments(),  # noqa: B008
     adapt: str = "full",
     residual: str | None = None,
     seconds: float | None = None,
@@ -63,7 +63,7 @@ def live(
 
     Args:
         policy: A policy.safetensors, or the folder that holds one; without one, a policy is trained first.
-        resume: A learnt.safetensors of an earlier flight, from which to continue.
+        resume: A learner_state.safetensors of an earlier flight, from which to continue.
         preset: Preset to train with if there is neither --policy nor --resume.
         where: Plant, vehicle and disturbances of the flight.
         adapt: full, lora: learn in flight; base-i, base-do, none: fly without learning; or module:name.

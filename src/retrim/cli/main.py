@@ -105,7 +105,7 @@ def _command(name: str, about: str, module: str, words: list[str], stop: threadi
 
     import tyro
 
-    from ..config.registry import told_of_own_module
+    from ..config.registry import describe_user_error
     from ..errors import RetrimError
     from ..runkit.compile_flags import compile_for
     from .console import console, refuse
@@ -131,7 +131,7 @@ def _command(name: str, about: str, module: str, words: list[str], stop: threadi
     except MemoryError:
         return refuse("out of memory; use fewer --starts, smaller networks or a shorter horizon")
     except Exception as error:
-        own = told_of_own_module(error, words)
+        own = describe_user_error(error, words)
         if own is None:
             raise
         return refuse(own)

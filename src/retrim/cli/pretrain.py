@@ -9,11 +9,11 @@ import tyro
 from ..config.presets import Preset
 from ..config.setup import Setup
 from ..errors import CheckpointError
-from ..evaluation.asked import asked_preset
 from ..evaluation.limits import check_seeds
 from ..runkit.outputs import write_trained
 from ..runkit.run import INTERRUPTED, Run
 from ..runkit.training import nominal_error, train
+from .arguments import training_preset
 from .console import RichReporter, Trust, console, show_paths, started
 
 
@@ -48,7 +48,7 @@ def pretrain(
 
     def ordered(stop: threading.Event) -> int:
         check_seeds([seed])
-        chosen = asked_preset(
+        chosen = training_preset(
             task, preset, config=config, vehicle=vehicle, reference=reference, residual=residual,
             num_updates=updates, num_envs=envs, trust=trust,
         )  # fmt: skip

@@ -13,9 +13,9 @@ from jax import random
 from jaxtyping import Array, Key
 
 from ..control.controller import AbstractController
-from ..control.geometric import Gains, Geometric
-from ..control.indi import Incremental
-from ..control.mppi import Mppi
+from ..control.geometric import Gains, GeometricController
+from ..control.indi import IndiController
+from ..control.mppi import MppiController
 from ..estimation.l1 import L1Estimator
 from ..estimation.prediction import Prediction
 from ..physics.actuator_response import ActuatorResponse
@@ -56,7 +56,7 @@ class Baseline:
 
     def settings_for(self, setup: "Setup") -> Settings:
         """Return the settings for the observation of the set-up: a measured state, or keypoints."""
-        seen = isinstance(setup.flown.observation_in_flight, OccludedKeypoints)
+        seen = isinstance(setup.flight_task.observation_in_flight, OccludedKeypoints)
         return self.settings_from_keypoints if seen else self.settings
 
 
@@ -82,10 +82,10 @@ def _gains(setup: "Setup", s: Settings) -> Gains:
     return Gains(*(jnp.array(value) for value in values))
 
 
-def _geometric(setup: "Setup", s: Settings, key: Key[Array, ""]) -> Geometric:
+def _geometric(setup: "Setup", s: Settings, key: Key[Array, ""]) -> GeometricController:
     vehicle = setup.vehicle
-    return Geometric(
-        setup.flown,
+    return GeometricController(
+        setup.flight_task,
         _gains(setup, s),
         prediction_of(setup),
         jnp.array(INTEGRAL_LIMIT),
@@ -94,10 +94,10 @@ def _geometric(setup: "Setup", s: Settings, key: Key[Array, ""]) -> Geometric:
     )
 
 
-def _indi(setup: "Setup", s: Settings, key: Key[Array, ""]) -> Incremental:
+def _indi(setup: "Setup", s: Settings, key: Key[Array, ""]) -> IndiController:
     vehicle = setup.vehicle
-    return Incremental(
-        setup.flown,
+    return IndiController(
+        setup.flight_task,
         _gains(setup, s),
         prediction_of(setup),
         jnp.array(slowness(setup) * s["filter"]),
@@ -106,12 +106,12 @@ def _indi(setup: "Setup", s: Settings, key: Key[Array, ""]) -> Incremental:
     )
 
 
-def _mppi(setup: "Setup", s: Settings, key: Key[Array, ""]) -> Mppi:
+def _mppi(setup: "Setup", s: Settings, key: Key[Array, ""]) -> MppiController:
     estimator, dt = None, setup.preset.dt
     if "estimator" in s:
         estimator = L1Estimator(jnp.array(L1_POLE), jnp.exp(jnp.array(-dt / s["estimator"])), dt)
-    return Mppi(
-        setup.flown,
+    return MppiController(
+        setup.flight_task,
         prediction_of(setup),
         setup.vehicle.command_min,
         setup.vehicle.command_max,

@@ -7,7 +7,7 @@ from jax import random
 from jaxtyping import Array, Key
 
 from ..errors import ConfigError
-from ..physics.disturbance import Constant, Disturbance, Kick, RandomWalk, Reversing, Step, Together
+from ..physics.disturbance import Constant, Disturbance, Kick, RandomWalk, Reversing, Step, SumOfDisturbances
 from ..physics.faults import BatterySag, Payload, WeakRotor
 from ..physics.wind import Dryden, Fan, SteadyWind
 from .registry import Registry
@@ -44,7 +44,7 @@ def disturbance(names: str, seed: int = 0) -> Disturbance:
         if not callable(made):
             raise ConfigError(f"disturbance {part!r} gives a {type(made).__name__}, expected a retrim.Disturbance")
         parts.append(made)
-    return parts[0] if len(parts) == 1 else Together(tuple(parts))
+    return parts[0] if len(parts) == 1 else SumOfDisturbances(tuple(parts))
 
 
 def _bounded(size: float | None, default: float, low: float, high: float, unit: str) -> float:

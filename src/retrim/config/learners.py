@@ -16,7 +16,7 @@ from ..adapt.trim import RestTrim, Untrimmed
 from ..adapt.vehicles import IdentifiedVehicle, OwnVehicle
 from ..adapt.views import AbstractView, GravityView, RestView, WorldView
 from ..control.controller import AbstractController, PolicyController
-from ..control.gravity_frame import GravityFrame, SeenFrame
+from ..control.gravity_frame import GravityFrame, PoseFrame
 from ..errors import ConfigError, FrameError
 from ..estimation.command_path import PathEstimator
 from ..estimation.disturbance_observer import DisturbanceObserver
@@ -24,7 +24,7 @@ from ..learn.env import Env
 from ..learn.residuals.model import FittedResidual
 from ..physics.actuators import Lagged
 from ..physics.dynamics import AbstractDynamics, PointMass
-from ..physics.felt_frame import FeltFrame
+from ..physics.effective_gravity import EffectiveGravityFrame
 from ..physics.vehicle import Vehicle
 from ..tasks.keypoints import Keypoints
 from ..tasks.occluded import OccludedKeypoints
@@ -110,14 +110,14 @@ def check_frame(preset: Preset, task: AbstractTask) -> None:
             "filter, which [vision] occlusion = true has"
         )
     try:
-        eqx.filter_eval_shape(lambda: task.in_frame(FeltFrame.of(jnp.zeros(3))))
+        eqx.filter_eval_shape(lambda: task.in_frame(EffectiveGravityFrame.of(jnp.zeros(3))))
     except FrameError as error:
         raise ConfigError(f"task {preset.task!r} has no frame of felt gravity: {error}") from error
 
 
-def felt_frame(
+def effective_gravity_frame(
     controller: AbstractController[Any], preset: Preset, vehicle: Vehicle, known: FittedResidual | None = None
-) -> GravityFrame | SeenFrame:
+) -> GravityFrame | PoseFrame:
     """Return a controller in the frame of effective gravity, from a disturbance observer or from its own pose filter.
 
     Args:
@@ -129,7 +129,7 @@ def felt_frame(
     """
     limit = jnp.array(TILT_LIMIT)
     if isinstance(controller, PolicyController) and isinstance(controller.observation, OccludedKeypoints):
-        return SeenFrame(controller, limit)
+        return PoseFrame(controller, limit)
     observer = DisturbanceObserver(
         PointMass(preset.dt),
         jnp.array(OBSERVER_TAU),

@@ -107,7 +107,7 @@ def parse(text: str | bytes, *, source: str) -> Preset:
     return validated(Preset, text, source=source)
 
 
-def defaults_taken(preset: Preset, text: str | bytes) -> dict[str, Any]:
+def missing_defaults(preset: Preset, text: str | bytes) -> dict[str, Any]:
     """Return the values of a preset that are missing in its JSON, and so are defaults of this release, by dotted name.
 
     Args:

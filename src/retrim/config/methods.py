@@ -14,7 +14,7 @@ from ..control.controller import AbstractController
 from ..control.integral import IntegralAction
 from ..control.lora import LoraPolicy
 from ..control.policy import AbstractPolicy
-from ..control.seen_pose import SeenPose
+from ..control.pose_filtered import PoseFilteredController
 from ..errors import ConfigError
 from ..plants.plant import Plant
 from ..runtime.pilot import ControllerPilot, Pilot
@@ -22,7 +22,7 @@ from ..tasks.keypoints import Keypoints
 from ..tasks.occluded import OccludedKeypoints
 from .baselines import BASELINES, Baseline
 from .families import identify_vehicle, policy_controller, track_actuators
-from .learners import check_frame, felt_frame
+from .learners import check_frame, effective_gravity_frame
 from .registry import Registry
 
 if TYPE_CHECKING:
@@ -44,16 +44,18 @@ class MethodRequest:
 
     def controller(self) -> AbstractController[Any]:
         """Return the policy with the observation used in flight."""
-        return policy_controller(self.setup.preset, self.setup.flown, self.policy.merged())
+        return policy_controller(self.setup.preset, self.setup.flight_task, self.policy.merged())
 
-    def in_felt_frame(self) -> AbstractController[Any]:
+    def in_effective_gravity_frame(self) -> AbstractController[Any]:
         """Return the policy in the frame of effective gravity.
 
         Raises:
             ConfigError: The task cannot be rotated into this frame.
         """
         check_frame(self.setup.preset, self.setup.env.task)
-        return track_actuators(felt_frame(self.controller(), self.setup.preset, self.setup.vehicle), self.setup.preset)
+        return track_actuators(
+            effective_gravity_frame(self.controller(), self.setup.preset, self.setup.vehicle), self.setup.preset
+        )
 
     def by_state(self, controller: AbstractController[Any], called: str | None = None) -> AbstractController[Any]:
         """Return a state-feedback controller that suits the observation: with a pose filter if it observes keypoints.
@@ -65,9 +67,9 @@ class MethodRequest:
         Raises:
             ConfigError: The policy observes keypoints, and the preset has no pose filter.
         """
-        seen = self.setup.flown.observation_in_flight
+        seen = self.setup.flight_task.observation_in_flight
         if isinstance(seen, OccludedKeypoints):
-            return SeenPose(seen, controller)
+            return PoseFilteredController(seen, controller)
         if isinstance(seen, Keypoints):
             name = called or type(controller).__name__
             raise ConfigError(
@@ -157,16 +159,18 @@ def _base(request: MethodRequest) -> Pilot:
 def _integral(request: MethodRequest) -> Pilot:
     if isinstance(request.setup.env.task.observation, Keypoints):
         raise ConfigError("method 'base-i' shifts the measured position; a policy that sees keypoints is shown none")
-    integral = IntegralAction(request.controller(), request.setup.flown, gain=jnp.array(0.8), limit=jnp.array(2.0))
+    integral = IntegralAction(
+        request.controller(), request.setup.flight_task, gain=jnp.array(0.8), limit=jnp.array(2.0)
+    )
     return ControllerPilot(track_actuators(integral, request.setup.preset))
 
 
 def _gravity_frame(request: MethodRequest) -> Pilot:
-    return ControllerPilot(request.in_felt_frame())
+    return ControllerPilot(request.in_effective_gravity_frame())
 
 
 def _identified(request: MethodRequest) -> Pilot:
-    return ControllerPilot(identify_vehicle(request.in_felt_frame(), request.setup.preset))
+    return ControllerPilot(identify_vehicle(request.in_effective_gravity_frame(), request.setup.preset))
 
 
 def _without_policy(name: str, baseline: Baseline, request: MethodRequest) -> Pilot:

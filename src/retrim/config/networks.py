@@ -13,7 +13,7 @@ from ..control.network_policy import NetworkPolicy
 from ..control.policy import AbstractPolicy
 from ..errors import ConfigError
 from ..physics.vehicle import Vehicle
-from .fresh import untrained
+from .initialisers import untrained
 from .presets import Preset
 from .registry import Registry
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..errors import ConfigError
-from ..physics.felt_frame import FeltFrame
+from ..physics.effective_gravity import EffectiveGravityFrame
 from ..tasks.reference import Reference, joined
 from ..tasks.shapes import AT_SPEED, FASTEST
 from ..tasks.shapes import REFERENCES as BUILT_IN
@@ -77,7 +77,11 @@ def _family(plain: Sequence[Reference], copies: int, push: float) -> Reference:
     directions = draw.normal(size=(len(plain), copies, 3))
     sizes = push * draw.uniform(size=(len(plain), copies, 1)) ** (1.0 / 3.0)  # uniform in a ball
     pushes = sizes * directions / np.linalg.norm(directions, axis=2, keepdims=True)
-    felt = [r.in_frame(FeltFrame.of(jnp.asarray(d))) for r, many in zip(plain, pushes, strict=True) for d in many]
+    felt = [
+        r.in_frame(EffectiveGravityFrame.of(jnp.asarray(d)))
+        for r, many in zip(plain, pushes, strict=True)
+        for d in many
+    ]
     return joined([*plain, *felt])
 
 

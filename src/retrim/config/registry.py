@@ -86,7 +86,7 @@ class Registry(Mapping[str, T], Generic[T]):
         return len(self._known)
 
 
-def told_of_own_module(error: Exception, words: Sequence[str]) -> str | None:
+def describe_user_error(error: Exception, words: Sequence[str]) -> str | None:
     """Return a one-line message for an error that involves a module of the user, or None for other errors.
 
     The author of the module needs the mistake, not a stack trace of retrim.

@@ -39,8 +39,8 @@ from ..tasks.reference import Reference
 from ..tasks.task import AbstractTask
 from .command_paths import delayed, longest_delay, model_path
 from .families import identify_vehicle, make_family, policy_controller, track_actuators
-from .fresh import flight_starts, low_rank
-from .learners import felt_frame, nominal_model, pretraining_optimiser
+from .initialisers import flight_starts, low_rank
+from .learners import effective_gravity_frame, nominal_model, pretraining_optimiser
 from .loading import load
 from .networks import NetworkRequest, find_network, make_policy
 from .online_learners import LearnerRequest, make_learner
@@ -64,10 +64,10 @@ class Setup:
     """Vehicle of training."""
     env: Env
     """Training environment: nominal model, task, delay."""
-    flown: AbstractTask
+    flight_task: AbstractTask
     """Task of the flight: the training task, with the reference of the flight."""
     learner: OnlineLearner
-    """In-flight learner; it re-trains on ``flown``."""
+    """In-flight learner; it re-trains on ``flight_task``."""
     optimiser: optax.GradientTransformation
     """Pretraining optimiser: gradient clipping, then Adam with a cosine schedule."""
 
@@ -106,10 +106,10 @@ class Setup:
             reference = table.reference
         try:
             task = make_task(TaskRequest(preset, vehicle, trained_on))
-            flown = task
+            flight_task = task
             if reference is not None:
                 followed = make_reference(reference) if isinstance(reference, str) else reference
-                flown = make_task(TaskRequest(preset, vehicle, followed))
+                flight_task = make_task(TaskRequest(preset, vehicle, followed))
             nominal = nominal_model(preset, vehicle)
             jumps = jnp.array(preset.jump_cost) if preset.jump_cost else None
             path = model_path(preset, vehicle)
@@ -122,12 +122,12 @@ class Setup:
                 longest_delay=longest_delay(preset),
             )
             model = residual_model or make_residual(ResidualRequest(preset, vehicle))
-            learner = make_learner(LearnerRequest(preset, model, dataclasses.replace(env, task=flown)))
+            learner = make_learner(LearnerRequest(preset, model, dataclasses.replace(env, task=flight_task)))
         except (TypeError, ValueError) as error:
             raise (
                 error if isinstance(error, ConfigError) else ConfigError(f"preset {preset.name!r}: {error}")
             ) from error
-        return cls(preset, vehicle, env, flown, learner, pretraining_optimiser(preset.pretrain))
+        return cls(preset, vehicle, env, flight_task, learner, pretraining_optimiser(preset.pretrain))
 
     def on(self, reference: AbstractReference) -> "Setup":
         """Return the same set-up with another reference for the flight and its learner.
@@ -139,16 +139,16 @@ class Setup:
         def other(part: Any) -> Any:
             return reference if isinstance(part, Reference) else part
 
-        flown, learner = (
+        flight_task, learner = (
             jax.tree.map(other, part, is_leaf=lambda part: isinstance(part, Reference))
-            for part in (self.flown, self.learner)
+            for part in (self.flight_task, self.learner)
         )
-        return dataclasses.replace(self, flown=flown, learner=learner)
+        return dataclasses.replace(self, flight_task=flight_task, learner=learner)
 
     @property
     def followed(self) -> Reference | None:
         """Reference of the flight; None if the task has no tabulated reference."""
-        followed = getattr(self.flown, "reference", None)
+        followed = getattr(self.flight_task, "reference", None)
         return followed if isinstance(followed, Reference) else None
 
     def new_policy(self, key: Key[Array, ""]) -> AbstractPolicy:
@@ -224,14 +224,14 @@ class Setup:
 
         In the frame of effective gravity, a monitor steps back from learned parameters if they make the flight worse.
         """
-        plain = policy_controller(self.preset, self.flown, state.policy.policy.merged())
+        plain = policy_controller(self.preset, self.flight_task, state.policy.policy.merged())
         if self.preset.adapt.frame == "world":
             return track_actuators(plain, self.preset)
         known = FittedResidual(self.learner.residual_model, state.residual)
-        frame = felt_frame(plain, self.preset, self.vehicle, known)
+        frame = effective_gravity_frame(plain, self.preset, self.vehicle, known)
         if not isinstance(frame, GravityFrame):
             return frame
-        monitor = track_actuators(Monitor(frame, self.flown), self.preset)
+        monitor = track_actuators(Monitor(frame, self.flight_task), self.preset)
         return monitor if self.preset.family is None else identify_vehicle(monitor, self.preset)
 
     def low_rank(self, policy: AbstractPolicy | LoraPolicy, key: Key[Array, ""]) -> LoraPolicy:
@@ -267,7 +267,7 @@ class Setup:
 
         They depend only on the seed and the home, so that all presets of a task use the same starts.
         """
-        return flight_starts(self.flown.home(), n, seed)
+        return flight_starts(self.flight_task.home(), n, seed)
 
     def limits_exceeded(self, vehicle: Vehicle | None = None) -> str | None:
         """Return the limits of a vehicle that the reference of the flight exceeds, as text; None if there are none.

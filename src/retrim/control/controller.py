@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from ..errors import FrameError
 from ..physics.actuator_response import ActuatorState
-from ..physics.felt_frame import FeltFrame
+from ..physics.effective_gravity import EffectiveGravityFrame
 from ..physics.path_family import Member
 from ..physics.state import Command, State
 from ..tasks.observation import AbstractObservation
@@ -103,7 +103,7 @@ class AbstractController(eqx.Module, Generic[M]):
         del memory
         return None
 
-    def in_frame(self, frame: FeltFrame) -> "AbstractController[M]":
+    def in_frame(self, frame: EffectiveGravityFrame) -> "AbstractController[M]":
         """Return the same controller for states and commands of ``frame``.
 
         Raises:
@@ -143,6 +143,6 @@ class PolicyController(AbstractController[tuple[Any, Command]]):
         """Return the same policy with the observation of a vehicle whose thrust and rates are known."""
         return dataclasses.replace(self, observation=self.observation.with_actuators(actuators))
 
-    def in_frame(self, frame: FeltFrame) -> "PolicyController":
+    def in_frame(self, frame: EffectiveGravityFrame) -> "PolicyController":
         """Return the same policy with the observation in ``frame``."""
         return dataclasses.replace(self, observation=self.observation.in_frame(frame))

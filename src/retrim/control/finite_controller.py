@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ..physics.actuator_response import ActuatorState
-from ..physics.felt_frame import FeltFrame
+from ..physics.effective_gravity import EffectiveGravityFrame
 from ..physics.path_family import Member
 from ..physics.state import Command, State
 from .controller import AbstractController
@@ -78,7 +78,7 @@ class FiniteController(AbstractController[FiniteMemory[Any]]):
         """Return the same for a tick in which thrust and body rates are known."""
         return FiniteController(self.base.with_actuators(actuators))
 
-    def in_frame(self, frame: FeltFrame) -> "FiniteController":
+    def in_frame(self, frame: EffectiveGravityFrame) -> "FiniteController":
         """Return the same for states and commands of ``frame``."""
         return FiniteController(self.base.in_frame(frame))
 

@@ -50,7 +50,7 @@ class GeometricState(eqx.Module):
     """Integral of the position error [m s]."""
 
 
-class Geometric(AbstractController[GeometricState]):
+class GeometricController(AbstractController[GeometricState]):
     """Geometric tracking, with integral action if its gain is not zero."""
 
     task: AbstractTask
@@ -64,7 +64,7 @@ class Geometric(AbstractController[GeometricState]):
     high: Command
     """Largest command that the vehicle accepts."""
 
-    def with_age(self, age: float | Float[Array, ""]) -> "Geometric":
+    def with_age(self, age: float | Float[Array, ""]) -> "GeometricController":
         """Return the same for measurements that are ``age`` old [s]."""
         return dataclasses.replace(self, prediction=self.prediction.with_age(age))
 

@@ -1,8 +1,8 @@
 """Fly an unchanged controller in the frame of the effective gravity.
 
-A constant disturbance tilts and scales gravity (:mod:`retrim.physics.felt_frame`). In the frame of this effective
-gravity the vehicle is undisturbed, so a controller performs its task under a constant push without further inputs or
-training. A disturbance that changes with state and command is treated as if its present value were constant.
+A constant disturbance tilts and scales gravity (:mod:`retrim.physics.effective_gravity`). In the frame of this
+effective gravity the vehicle is undisturbed, so a controller performs its task under a constant push without further
+inputs or training. A disturbance that changes with state and command is treated as if its present value were constant.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ from ..estimation.latency import ahead
 from ..physics.actuator_response import ActuatorState
 from ..physics.command_path import CommandQueue
 from ..physics.dynamics import Hybrid, Residual
-from ..physics.felt_frame import FeltFrame
+from ..physics.effective_gravity import EffectiveGravityFrame
 from ..physics.path_family import Member
 from ..physics.state import Command, State
 from ..tasks.occluded import OccludedMemory
@@ -33,7 +33,7 @@ class GravityFrameState(eqx.Module):
 
     observer: ObserverState
     inner: Any
-    frame: FeltFrame
+    frame: EffectiveGravityFrame
     """Frame of the last command."""
 
 
@@ -86,18 +86,18 @@ class GravityFrame(AbstractController[GravityFrameState]):
         told = Command(hover.c, hover.omega - self._bias(x.p.dtype))
         rows = jax.tree.map(lambda leaf, new: jnp.broadcast_to(new, leaf.shape), observed.commands, CommandQueue(told))
         observed = dataclasses.replace(observed, commands=rows)
-        return GravityFrameState(observed, self.inner.init(x), FeltFrame.of(observed.d_hat))
+        return GravityFrameState(observed, self.inner.init(x), EffectiveGravityFrame.of(observed.d_hat))
 
     def __call__(self, memory: GravityFrameState, t: Float[Array, ""], x: State) -> tuple[Command, GravityFrameState]:
         """Return the command of the controller inside, in the frame of the present effective gravity."""
         observer, felt = self.observer, jnp.zeros_like(x.p)
         if self.known is not None:
-            unsteady = Unsteady(self.known, self.trust_known)
+            unsteady = StateDependentResidual(self.known, self.trust_known)
             felt = unsteady(x, memory.observer.commands.newest)
             observer = dataclasses.replace(observer, nominal=Hybrid(observer.nominal, unsteady))
         observed = observer(memory.observer, t, x)
         felt = self.trust_estimate.astype(x.p.dtype) * (observed.d_hat + felt) + self.steady.astype(x.p.dtype)
-        frame = FeltFrame.of(capped(felt, observer.limit))
+        frame = EffectiveGravityFrame.of(capped(felt, observer.limit))
         bias, last = self._bias(x.p.dtype), observer.arrival(memory.observer)
         acting, flying = Command(last.c, last.omega + bias), self.inner
         if self.actuators is not None:
@@ -118,7 +118,7 @@ class GravityFrame(AbstractController[GravityFrameState]):
         return (self.trust_known * self.rate_bias).astype(dtype)
 
 
-class SeenFrame(AbstractController[tuple[OccludedMemory, Command]]):
+class PoseFrame(AbstractController[tuple[OccludedMemory, Command]]):
     """A policy with :class:`OccludedKeypoints`, in the frame of the effective gravity that its pose filter estimates.
 
     It does not need the measured state.
@@ -137,7 +137,7 @@ class SeenFrame(AbstractController[tuple[OccludedMemory, Command]]):
     ) -> tuple[Command, tuple[OccludedMemory, Command]]:
         """Return the command of the controller inside, in the frame of the effective gravity one tick ago."""
         seen, last = memory
-        frame = FeltFrame.of(capped(seen.pose.d, self.limit))
+        frame = EffectiveGravityFrame.of(capped(seen.pose.d, self.limit))
         u, (seen, _) = self.inner.in_frame(frame)((seen, frame.command(last)), t, frame.state(x))
         u = frame.world_command(u)
         return u, (seen, u)
@@ -147,7 +147,7 @@ class SeenFrame(AbstractController[tuple[OccludedMemory, Command]]):
         return memory[0], u
 
 
-class Unsteady(eqx.Module):
+class StateDependentResidual(eqx.Module):
     """Part of a residual beyond its value at rest; this part depends on state and command."""
 
     residual: Residual
@@ -160,7 +160,7 @@ class Unsteady(eqx.Module):
         return self.share.astype(x.p.dtype) * rest
 
 
-class Capped(eqx.Module):
+class NormLimited(eqx.Module):
     """A residual with a limited norm, so that the frame of the effective gravity is defined."""
 
     residual: Residual

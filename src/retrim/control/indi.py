@@ -34,7 +34,7 @@ class IncrementalState(eqx.Module):
     """Time of the last measurement [s]; minus infinity before the first measurement."""
 
 
-class Incremental(AbstractController[IncrementalState]):
+class IndiController(AbstractController[IncrementalState]):
     """INDI at the level of the thrust vector."""
 
     task: AbstractTask
@@ -52,11 +52,11 @@ class Incremental(AbstractController[IncrementalState]):
     a: Float[Array, "3"] | None = None
     """Measured acceleration, the mean over the last tick, world [m/s^2]; None for that of the measured velocities."""
 
-    def with_age(self, age: float | Float[Array, ""]) -> "Incremental":
+    def with_age(self, age: float | Float[Array, ""]) -> "IndiController":
         """Return the same for measurements that are ``age`` old [s]."""
         return dataclasses.replace(self, prediction=self.prediction.with_age(age))
 
-    def with_inertial(self, omega: Float[Array, "3"], a: Float[Array, "3"]) -> "Incremental":
+    def with_inertial(self, omega: Float[Array, "3"], a: Float[Array, "3"]) -> "IndiController":
         """Return the same for a tick in which body rates and acceleration were measured."""
         return dataclasses.replace(self, omega=omega, a=a)
 

@@ -38,7 +38,7 @@ class MppiState(eqx.Module):
     tick: Int[Array, ""]
 
 
-class Mppi(AbstractController[MppiState]):
+class MppiController(AbstractController[MppiState]):
     """MPPI over commands, in the nominal model with actuator lag."""
 
     task: AbstractTask
@@ -68,7 +68,7 @@ class Mppi(AbstractController[MppiState]):
     horizon: int = eqx.field(static=True, default=40)
     """Length of a sequence [ticks]."""
 
-    def with_age(self, age: float | Float[Array, ""]) -> "Mppi":
+    def with_age(self, age: float | Float[Array, ""]) -> "MppiController":
         """Return the same for measurements that are ``age`` old [s]."""
         return dataclasses.replace(self, prediction=self.prediction.with_age(age))
 

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..physics.actuator_response import ActuatorState
-from ..physics.felt_frame import FeltFrame
+from ..physics.effective_gravity import EffectiveGravityFrame
 from ..physics.path_family import Member
 from ..physics.state import Command, State
 from ..tasks.task import AbstractTask
@@ -51,6 +51,6 @@ class NearTarget(AbstractController[Any]):
         """Return the same for a tick in which thrust and body rates are known."""
         return NearTarget(self.inner.with_actuators(actuators), self.task, self.reach)
 
-    def in_frame(self, frame: FeltFrame) -> "NearTarget":
+    def in_frame(self, frame: EffectiveGravityFrame) -> "NearTarget":
         """Return the same for states and commands of ``frame``."""
         return NearTarget(self.inner.in_frame(frame), self.task.in_frame(frame), self.reach)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..physics import so3
-from ..physics.felt_frame import FeltFrame
+from ..physics.effective_gravity import EffectiveGravityFrame
 from ..physics.state import Command, State
 from .controller import PolicyController
 
@@ -32,6 +32,6 @@ class RestingController(PolicyController):
         shifted = PolicyController(self.observation, self.policy.shifted(-self.policy.output(o)))
         return shifted(memory, t, x)
 
-    def in_frame(self, frame: FeltFrame) -> "RestingController":
+    def in_frame(self, frame: EffectiveGravityFrame) -> "RestingController":
         """Return the same policy with observation and home in ``frame``."""
         return dataclasses.replace(self, observation=self.observation.in_frame(frame), home=frame.vector(self.home))

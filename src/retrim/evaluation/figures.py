@@ -60,7 +60,7 @@ def picture(
     colours = _colours(methods)
     groups = [plots.Group(names[method], [_track(f) for f in by[method]], colours[method]) for method in methods]
     seconds = max(float(track.t[-1]) for group in groups for track in group.tracks)
-    task, preset = setup.flown, setup.preset
+    task, preset = setup.flight_task, setup.preset
     where = f"{shown[0].vehicle} on plant {scenario.plant!r}"
     kind = preset.task if ":" in preset.task else preset.task.capitalize()
     title = title or f"{kind}: {where}, disturbance {scenario.disturbance!r}, preset {preset.name!r}"

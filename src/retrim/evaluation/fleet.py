@@ -18,11 +18,11 @@ from ..errors import ConfigError
 from ..plants.plant import Measurement
 from ..runkit.compile_cache import release_programs
 from ..runkit.flights import Flight, FlightSpec
-from ..runkit.flying import fly_lot, fly_one, plant_of, program_of
-from .gathering import Flights, Progress, Submit, gathered
+from ..runkit.flying import fly_batch, fly_one, plant_of, program_of
+from .batches import FlightBatch, in_batches, lanes
+from .executor import Flights, Progress, Submit, gathered
 from .jobs import Job, fly_job
 from .limits import check_flights, check_seeds
-from .lots import Lot, in_lots, lanes
 
 COMPILED_AFTER = 1.0  # [s] of flight: all programs of a batch have run by then
 
@@ -74,7 +74,7 @@ class Fleet:
                 for scenario in scenarios:
                     plant_of(self.setups[scenario.reference], FlightSpec(scenario, method, 0))
         first = next(iter(self.setups.values()))
-        self.seconds = first.flown.flight_seconds if seconds is None else seconds
+        self.seconds = first.flight_task.flight_seconds if seconds is None else seconds
         self._latency, self._state, self._id = latency, state, secrets.token_hex(8)
         self._starts = {
             (name, seed): setup.flight_starts(starts, seed)
@@ -89,7 +89,7 @@ class Fleet:
             for start in range(starts)
         ]
 
-    def lots(self, specs: Sequence[FlightSpec]) -> list[Lot]:
+    def lots(self, specs: Sequence[FlightSpec]) -> list[FlightBatch]:
         """Return specifications in batches; flights that cannot share a program run individually."""
         groups: dict[Hashable, list[FlightSpec]] = {}
         for spec in specs:
@@ -99,7 +99,7 @@ class Fleet:
             setup, policy = self.setups[group[0].scenario.reference], self.policies[group[0].seed]
             return program_of(setup, policy, group) if self._latency == "fixed" else None
 
-        return in_lots(groups.values(), program)
+        return in_batches(groups.values(), program)
 
     def warm_up(self, specs: Sequence[FlightSpec] | None = None) -> None:
         """Compile the programs of single flights before their take-off, in this process.
@@ -154,12 +154,12 @@ class Fleet:
         stop = stop or threading.Event()
         specs = self.specs if only is None else list(only)
         if isinstance(executor, ThreadPoolExecutor):
-            lots = [Lot([spec], None) for spec in specs]
+            lots = [FlightBatch([spec], None) for spec in specs]
             return gathered(
                 specs, lots, self._here(executor, stop), progress=progress, landed=landed, stop=stop, forget=forget
             )
         if executor is not None:
-            lots = self.lots(specs) if by_lot else [Lot([spec], None) for spec in specs]
+            lots = self.lots(specs) if by_lot else [FlightBatch([spec], None) for spec in specs]
             submit = self._away(executor, learnt=not forget)
             return gathered(
                 specs, lots, submit, progress=progress, landed=landed, stop=stop, outlive=True, forget=forget
@@ -179,7 +179,7 @@ class Fleet:
         """Return a function that submits batches to an executor with other processes."""
         return lambda lot, aloft: executor.submit(fly_job, self._job(lot.specs, learnt))
 
-    def _fly(self, lot: Lot, aloft: Callable[[float], None], stop: threading.Event) -> list[Flight]:
+    def _fly(self, lot: FlightBatch, aloft: Callable[[float], None], stop: threading.Event) -> list[Flight]:
         """Fly a batch in this process; ``aloft`` receives the completed share."""
         first = lot.specs[0]
         setup = self.setups[first.scenario.reference]
@@ -203,7 +203,7 @@ class Fleet:
                 release_programs()
             else:
                 compiled.wait()
-            return fly_lot(
+            return fly_batch(
                 setup, policies, lot.specs, starts, seconds, state=state, progress=told, stop=stop, cold=cold
             )
         finally:

@@ -10,7 +10,7 @@ from ..config.setup import Latency, Setup
 from ..physics.state import State
 from ..runkit.compile_cache import release_programs
 from ..runkit.flights import Flight, FlightSpec
-from ..runkit.flying import fly_lot, fly_one
+from ..runkit.flying import fly_batch, fly_one
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ def fly_job(job: Job) -> list[Flight]:
     setup: Setup = setup_for(job.preset, job.specs[0].scenario.reference, job.fleet)
     if len(job.specs) > 1:
         release_programs()
-        flights = fly_lot(setup, job.policies, job.specs, job.starts, job.seconds, state=job.state, cold=True)
+        flights = fly_batch(setup, job.policies, job.specs, job.starts, job.seconds, state=job.state, cold=True)
     else:
         (policy,), (spec,), (x0,) = job.policies, job.specs, job.starts
         flights = [fly_one(setup, policy, spec, x0, job.seconds, latency=job.latency, state=job.state)]

@@ -15,11 +15,11 @@ from ..errors import JobError
 from ..runkit.reporter import Reporter
 from ..runkit.run import Run
 from ..runkit.training import nominal_error
+from .executor import Flights, report_progress
 from .fleet import Fleet
-from .gathering import Flights, told_by
-from .kept_flights import KeptFlights
-from .kept_policies import trained_policies
+from .flight_store import FlightStore
 from .limits import check_flights, check_seeds
+from .policy_store import trained_policies
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ def fly_all(
     if not study.policies or run.interrupted:
         return Flights([], interrupted=True)
     fleet = Fleet(study.preset, study.policies, scenarios, methods=methods, starts=starts, seconds=seconds)
-    kept = KeptFlights(run, fleet) if keep else None
+    kept = FlightStore(run, fleet) if keep else None
     earlier = {} if kept is None else kept.earlier
     left = [spec for spec in fleet.specs if spec not in earlier]
     if earlier:
@@ -118,7 +118,7 @@ def fly_all(
             advance(0.0, "compiling the programs of a flight (kept in a cache for the next time)")
             landed = None if kept is None else kept.landed
             flights = fleet.run(
-                run.executor, stop=run.stop, progress=told_by(advance), landed=landed, only=left, by_lot=True
+                run.executor, stop=run.stop, progress=report_progress(advance), landed=landed, only=left, by_lot=True
             )
     if flights.failed:
         why = next(iter(flights.failed.values()))

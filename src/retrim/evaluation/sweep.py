@@ -26,12 +26,12 @@ from ..runkit.reporter import Reporter
 from ..runkit.run import Run
 from ..viz.panels import bars
 from ..viz.plots import save
+from .executor import report_progress
 from .fleet import Fleet
-from .gathering import told_by
-from .kept import files_behind, named_by, named_in
-from .kept_policies import trained_policies
 from .limits import check_seeds
 from .metrics import EFFORT, Rows, cell, failed_record, metres, record, summary
+from .policy_store import trained_policies
+from .section_store import file_digests, named_by, named_in
 
 STRICT = ConfigDict(extra="forbid")
 GROUP = ("preset", "plant", "vehicle", "sensors", "reference", "disturbance", "method")
@@ -122,7 +122,7 @@ def run_sweep(sweep: Sweep, run: Run, reporter: Reporter) -> Rows:
         if run.interrupted:
             break
     every = [key for of_fleet in keys for key in of_fleet.values()]
-    run.taken_over += len(kept.earlier.intersection(every))
+    run.reused += len(kept.earlier.intersection(every))
     return _report(sweep, [kept.rows[key] for key in every if key in kept.rows], run, reporter)
 
 
@@ -147,11 +147,17 @@ def _fly(fleet: Fleet, keys: Mapping[FlightSpec, str], kept: "_Kept", run: Run, 
     with reporter.progress(f"flying {fleet.preset.name}") as advance:
         advance(0.0, "compiling the programs of a flight")
         flights = fleet.run(
-            run.executor, stop=run.stop, only=missing, landed=keep, progress=told_by(advance), by_lot=True, forget=True
+            run.executor,
+            stop=run.stop,
+            only=missing,
+            landed=keep,
+            progress=report_progress(advance),
+            by_lot=True,
+            forget=True,
         )
     for spec, why in flights.failed.items():
         vehicle = spec.scenario.vehicle_name(fleet.preset.vehicle)
-        row = failed_record(spec, vehicle, fleet.setups[spec.scenario.reference].flown.metric, why)
+        row = failed_record(spec, vehicle, fleet.setups[spec.scenario.reference].flight_task.metric, why)
         kept.add({keys[spec]: {"preset": fleet.preset.name, **row}})
     if flights.failed:
         run.failed = True
@@ -188,7 +194,7 @@ def _is_record(row: Any) -> bool:
 
 
 def _key(preset: Preset, spec: FlightSpec, seconds: float) -> str:
-    files = files_behind(spec.method, *named_in(preset), *named_by(spec.scenario))
+    files = file_digests(spec.method, *named_in(preset), *named_by(spec.scenario))
     return section_key(preset=dump(preset), spec=repr(spec), seconds=seconds, files=files)
 
 

@@ -13,7 +13,7 @@ from jax import random
 from jaxtyping import Array, Float
 
 from ..adapt.learner_state import LearnerState
-from ..config.loading import defaults_taken, dump, parse
+from ..config.loading import dump, missing_defaults, parse
 from ..config.presets import Preset
 from ..config.setup import Setup
 from ..config.trust import check_trust
@@ -64,7 +64,7 @@ def load_policy(path: str | Path, *, trust: Collection[str] = ()) -> tuple[Abstr
     return policy, setup.preset
 
 
-def save_learnt(path: str | Path, state: LearnerState, preset: Preset) -> None:
+def save_learner_state(path: str | Path, state: LearnerState, preset: Preset) -> None:
     """Write the learned state of a flight: policy, residual and optimiser states, with the preset.
 
     Args:
@@ -82,7 +82,7 @@ def save_learnt(path: str | Path, state: LearnerState, preset: Preset) -> None:
     write_whole(Path(path), wire.pack(state, kind="learnt", about=about))
 
 
-def load_learnt(path: str | Path, *, trust: Collection[str] = ()) -> tuple[LearnerState, Preset]:
+def load_learner_state(path: str | Path, *, trust: Collection[str] = ()) -> tuple[LearnerState, Preset]:
     """Read the learned state of a flight, to continue from it.
 
     Args:
@@ -94,7 +94,7 @@ def load_learnt(path: str | Path, *, trust: Collection[str] = ()) -> tuple[Learn
             not fit the learned state, or names Python code that is not trusted.
     """
     path = Path(path)
-    data = read_bounded(path, "`retrim fly --out DIR` makes a learnt.safetensors")
+    data = read_bounded(path, "`retrim fly --out DIR` makes a learner_state.safetensors")
     try:
         header = wire.describe(data, kind="learnt", source=str(path))
         setup = _setup(header, header.get("architecture", ""), str(path), trust)
@@ -105,7 +105,7 @@ def load_learnt(path: str | Path, *, trust: Collection[str] = ()) -> tuple[Learn
         raise CheckpointError(str(error)) from error
     check_size(state, source=str(path), largest=MOST)
     check_policy(state.policy.policy.merged(), source=str(path), observation=np.asarray(_seen_at_rest(setup)))
-    if not np.isfinite(np.asarray(_command_at_rest(setup.controller(state), setup.flown.home()))).all():
+    if not np.isfinite(np.asarray(_command_at_rest(setup.controller(state), setup.flight_task.home()))).all():
         raise CheckpointError(f"{path}: its command at hover is not finite; what was learnt cannot be flown")
     return state, setup.preset
 
@@ -141,7 +141,7 @@ def _setup(header: dict[str, str], sizes: str, source: str, trust: Collection[st
                 f"{error}"
             ) from error
         raise CheckpointError(str(error)) from error
-    if absent := defaults_taken(preset, header["preset"]):
+    if absent := missing_defaults(preset, header["preset"]):
         shown = ", ".join(f"{name} = {value!r}" for name, value in absent.items())
         LOG.warning(one_line(f"{source}: written by an earlier release; defaults are taken for what it lacks: {shown}"))
     expected = "-".join(map(str, (setup.env.task.observation.size, *preset.pretrain.hidden_sizes, 4)))

@@ -13,9 +13,9 @@ from ..control.lora import LoraPolicy
 from ..control.policy import AbstractPolicy, Inputs, Perturbations, Policy
 from ..tasks.task import Start
 from . import weight_gradients
-from .both_layouts import both_layouts
 from .env import Env
 from .rollout import Trajectory, perturbed_rollout, rollout
+from .transposed_layers import with_transposed_copy
 
 
 class PolicyState(eqx.Module):
@@ -27,7 +27,7 @@ class PolicyState(eqx.Module):
 
 def policy_loss(policy: AbstractPolicy, env: Env, x0: Start) -> Float[Array, ""]:
     """Return minus the reward, averaged over ticks and over the batch of starts ``x0`` (leading axis)."""
-    flying, laid = both_layouts((policy, env))
+    flying, laid = with_transposed_copy((policy, env))
 
     def fly(start: Start) -> Trajectory:
         return rollout(laid, flying, start)
@@ -51,7 +51,7 @@ def policy_gradient(policy: AbstractPolicy, env: Env, x0: Start) -> tuple[Float[
 
 
 def _perceptron_gradient(policy: Policy, env: Env, x0: Start) -> tuple[Float[Array, ""], Any]:
-    flying, laid = both_layouts((policy, env))
+    flying, laid = with_transposed_copy((policy, env))
 
     def loss(zeros: Perturbations) -> tuple[Float[Array, ""], Inputs]:
         def fly(start: Start, z: Perturbations) -> tuple[Trajectory, Inputs]:

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Key
 from ..physics.actuators import with_response
 from ..physics.command_path import LONGEST_DELAY, CommandPath, check_delay
 from ..physics.dynamics import AbstractDynamics, Hybrid, Residual
-from ..physics.felt_frame import FeltFrame
+from ..physics.effective_gravity import EffectiveGravityFrame
 from ..physics.path_family import PathFamily
 from ..physics.state import Command, State
 from ..tasks.task import AbstractTask, Start
@@ -64,14 +64,14 @@ class Env(eqx.Module):
         k_start, k_member = random.split(key)
         return dataclasses.replace(self.task.reset(k_start), member=self.family.draw(k_member))
 
-    def frame(self, x: State, last: Command) -> FeltFrame | None:
+    def frame(self, x: State, last: Command) -> EffectiveGravityFrame | None:
         """Return the frame in which the policy observes, without gradients through it; None for the world frame.
 
         Args:
             x: State.
             last: Command issued one tick ago.
         """
-        return None if self.felt is None else FeltFrame.of(lax.stop_gradient(self.felt(x, last)))
+        return None if self.felt is None else EffectiveGravityFrame.of(lax.stop_gradient(self.felt(x, last)))
 
     def cost_of_jump(self, before: Command, after: Command) -> Float[Array, ""]:
         """Return the cost of the change of the policy's command from ``before`` to ``after`` in one tick."""

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..control.policy import AbstractPolicy, Inputs, Perturbations, Policy
 from ..physics.command_path import CommandQueue
-from ..physics.felt_frame import FeltFrame
+from ..physics.effective_gravity import EffectiveGravityFrame
 from ..physics.state import Command, State, where
 from ..tasks.task import AbstractTask, Start
 from .env import Env
@@ -78,7 +78,7 @@ def _scan(
     commands = CommandQueue.of(hover, task.dt, longest=env.longest_delay)
     shares = commands.weights(env.delay, task.dt)  # the same in every tick
 
-    def framed(x: State, issued: Command) -> tuple[FeltFrame | None, AbstractTask, State]:
+    def framed(x: State, issued: Command) -> tuple[EffectiveGravityFrame | None, AbstractTask, State]:
         """Return the frame of the policy, and task and state in this frame."""
         frame = env.frame(x, issued)
         return (None, task, x) if frame is None else (frame, task.in_frame(frame), frame.state(x))

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 
-from ..onboard.heart import Pacemaker
+from ..onboard.heartbeat import Pacemaker
 from ..onboard.messages import pack_note
-from ..onboard.realtime import Lifeline
+from ..onboard.realtime import ParentWatch
 from ..onboard.topics import INTO, MOST, OUT, SLOWLY
 from ..transport.bridge import Bridge
 from ..transport.bus import Bus
@@ -39,7 +39,7 @@ def carry(plan: BridgePlan) -> None:
     Without a supervisor it returns when the flight is over.
     """
     signal.signal(signal.SIGTERM, _ended)  # so that the network is closed properly in this case, too
-    bus, parent = SharedMemoryBus(plan.folder), Lifeline(plan.parent)
+    bus, parent = SharedMemoryBus(plan.folder), ParentWatch(plan.parent)
     network = plan.address.join(dict.fromkeys((*OUT, *INTO), MOST), listen=True, writes=OUT)
     try:
         bridge = Bridge(bus, network, out=OUT, into=INTO, slowly=SLOWLY)

@@ -27,7 +27,7 @@ from ..physics.state import Command, State
 from ..transport import wire
 
 
-def flown(policy: AbstractPolicy, residual: Any) -> dict[str, Any]:
+def parameter_groups(policy: AbstractPolicy, residual: Any) -> dict[str, Any]:
     """Return the parameters of a learning controller, by group: ``policy`` and ``residual``."""
     return {"policy": eqx.filter(policy, eqx.is_array), "residual": eqx.filter(residual, eqx.is_array)}
 
@@ -101,12 +101,12 @@ def vehicle_half(setup: Setup, controller: AbstractController[Any]) -> dict[str,
         raise ConfigError(
             "family.excitation: a live flight does not excite its vehicle; remove the key or set it to false"
         )
-    first = PathEstimator.of(setup.preset.dt).init(State.at(setup.flown.home()))
+    first = PathEstimator.of(setup.preset.dt).init(State.at(setup.flight_task.home()))
     return {VEHICLE: vehicle_estimate(family, first.estimate)}
 
 
 def _source(setup: Setup, controller: Any, predicted: Any, parameters: dict[str, Any]) -> ControllerSource:
-    x, u = State.at(setup.flown.home()), Command.hover(setup.flown.home().dtype)
+    x, u = State.at(setup.flight_task.home()), Command.hover(setup.flight_task.home().dtype)
     t = jnp.zeros_like(x.p[0])
 
     def init(parameters: Any, x: State) -> Any:
@@ -128,7 +128,7 @@ def _source(setup: Setup, controller: Any, predicted: Any, parameters: dict[str,
         "init": numpy_program(init, parameters, x),
         "decide": numpy_program(decide, parameters, (memory, t, t, x)),
         "accepted": numpy_program(accepted, parameters, (memory, u)),
-        "target": numpy_program(lambda parameters, t: _on(setup, parameters).flown.target(t), parameters, t),
+        "target": numpy_program(lambda parameters, t: _on(setup, parameters).flight_task.target(t), parameters, t),
         "predicted": numpy_program(predicted, parameters, (x, u)),
     }
     # sorted, since JAX flattens dictionaries in the order of their keys

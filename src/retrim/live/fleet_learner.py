@@ -72,7 +72,7 @@ class FleetLearner:
                 if (kind, n, len(loops) > 1) in self._compiled:
                     continue
                 some = [loops[i % len(loops)] for i in range(n)]
-                workers, windows = [loop.new_worker() for loop in some], [loop.made_up_window() for loop in some]
+                workers, windows = [loop.new_worker() for loop in some], [loop.dummy_window() for loop in some]
                 learn_together(workers, windows)
                 if (low_rank := _low_rank(workers)) and len(loops) > 1:
                     base = shared_base(low_rank[0].learner, low_rank[0].state)
@@ -107,7 +107,7 @@ class FleetLearner:
         low_rank = _low_rank(workers)
         if not low_rank or len(members) < 2:
             return learn_together(workers, windows)
-        backs = sum(member.loop.taken_back for member in members)
+        backs = sum(member.loop.rolled_back for member in members)
         if backs != self._taken_back.get(kind, backs):
             self._bases.pop(kind, None)  # control has rolled back a policy: continue from the policy in flight
         self._taken_back[kind] = backs

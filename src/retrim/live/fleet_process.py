@@ -16,7 +16,7 @@ from ..errors import RetrimError
 from ..io.files import write_whole
 from ..onboard.launch import launch
 from ..onboard.messages import pack_note
-from ..onboard.realtime import Lifeline
+from ..onboard.realtime import ParentWatch
 from ..runkit.compile_cache import enable_compile_cache
 from ..transport.shared_memory import SharedMemoryBus
 from .fleet_learner import FleetLearner
@@ -40,7 +40,7 @@ def learn_for_all(plan: FleetPlan) -> None:
     with contextlib.suppress(OSError, AttributeError):
         os.nice(NICE)
     enable_compile_cache()
-    fleet, parent, looked, done = FleetLearner(), Lifeline(plan.parent), 0.0, set[str]()
+    fleet, parent, looked, done = FleetLearner(), ParentWatch(plan.parent), 0.0, set[str]()
     while not parent.gone():
         if time.monotonic() - looked > LOOK_EVERY:
             looked = time.monotonic()
@@ -96,12 +96,12 @@ class FleetProcess:
     count: int = 0
     lock: threading.Lock = field(default_factory=threading.Lock)
 
-    def start(self, layer: str, plan: LearnerPlan, complaints: Path) -> "Seat":
+    def start(self, layer: str, plan: LearnerPlan, complaints: Path) -> "FleetSlot":
         """Start learning for a vehicle and layer. This method may be called from any thread."""
         with self.lock:
             return self._start(layer, plan, complaints)
 
-    def _start(self, layer: str, plan: LearnerPlan, complaints: Path) -> "Seat":
+    def _start(self, layer: str, plan: LearnerPlan, complaints: Path) -> "FleetSlot":
         if self.process is None or self.process.poll() is not None:
             main, fleet = "retrim.live.fleet_process:learn_for_all", FleetPlan(self.folder, os.getpid())
             self.process = launch(main, fleet, self.folder / "learners.log", self.cores)
@@ -110,7 +110,7 @@ class FleetProcess:
         write_whole(path, pickle.dumps(plan))
         complaints.unlink(missing_ok=True)
         complaints.symlink_to(self.folder / "learners.log")
-        return Seat(self.process, path)
+        return FleetSlot(self.process, path)
 
     def close(self) -> None:
         """Kill the process."""
@@ -120,7 +120,7 @@ class FleetProcess:
 
 
 @dataclass(frozen=True)
-class Seat:
+class FleetSlot:
     """One vehicle and layer in the shared process; for a ground station it has the interface of a separate process."""
 
     process: "subprocess.Popen[bytes]"

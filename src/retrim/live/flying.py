@@ -20,19 +20,19 @@ from ..onboard.log_file import log_path
 from ..onboard.messages import ACCOUNTS, COMMAND, MEASURED, TRUE
 from ..runkit.flights import Flight
 from ..runkit.outlet import Outlet
-from ..runkit.outputs import clear_outputs, write_events, write_learnt, write_state
+from ..runkit.outputs import clear_outputs, write_events, write_learner_state, write_state
 from ..runkit.reporter import Reporter
 from ..runkit.run import Run
 from ..runtime.events import Event
 from ..tasks.transition import spliced
+from .child_processes import watched
 from .events import LiveEvents
+from .operator_requests import OperatorRequests
 from .page_access import page_url
 from .report import complaints, flight_of, histograms, learnt_in, missing, results
 from .session import LiveRequest, live_spec
 from .status import Status
 from .supervisor import Supervisor
-from .watching import watched
-from .wishes import Wishes
 
 Display = Callable[[LiveEvents], AbstractContextManager[Callable[[Status, list[Event]], None]]]
 """Function from all events so far to a context manager; its value is called with the status and the new events."""
@@ -87,7 +87,7 @@ def fly_live(
             if request.page is not None and page is not None and supervisor.page_port is not None:
                 opened(page_url(request.page[0], supervisor.page_port, page.token))
             show = screen.enter_context(display(events))
-            with closing(Wishes(request, supervisor)) as wishes:
+            with closing(OperatorRequests(request, supervisor)) as wishes:
                 status = watched(supervisor, request.seconds, events, show, run.stop, wishes)
             if request.until_stopped and status.ended == "landed":
                 run.stop.clear()  # this is the intended end
@@ -116,7 +116,7 @@ def _written(
     outlet.faults += missing(rows, status, preset.dt)
     if log.parent != run.folder:
         outlet.faults.append(status.log_moved or f"flight.csv cannot be written to {run.folder}; it is in {log.parent}")
-    outlet.write("what was learnt", partial(write_learnt, [flight], preset))
+    outlet.write("what was learnt", partial(write_learner_state, [flight], preset))
     outlet.write("events.jsonl", partial(write_events, [flight]))
     recorded = _recorded(request, rows, events, outlet)
     found = results(request, flight, rows, status, events)
@@ -132,7 +132,7 @@ def _written(
 
 def _recorded(request: LiveRequest, rows: np.ndarray, events: LiveEvents, outlet: Outlet) -> list[Path]:
     """Write the flight, including the landing, as NPZ and for viewers; return the path of the requested recording."""
-    target = np.asarray(jax.jit(jax.vmap(request.setup.flown.target))(rows[:, 1]), dtype=float)
+    target = np.asarray(jax.jit(jax.vmap(request.setup.flight_task.target))(rows[:, 1]), dtype=float)
     recording = Recording(
         rows[:, 1], rows[:, MEASURED], rows[:, TRUE], rows[:, 2], rows[:, COMMAND],
         np.linalg.norm(rows[:, TRUE][:, :3] - target, axis=1), target,

@@ -20,10 +20,10 @@ from ..control.vehicle_report import REPORTS, VehicleEstimate, VehicleReport
 from ..errors import ConfigError, MessageError
 from ..estimation.command_path import PathEstimator
 from ..estimation.command_path import PathState as EstimatorState
-from ..io.trained import load_learnt
-from ..onboard.heart import Pacemaker
+from ..io.trained import load_learner_state
+from ..onboard.heartbeat import Pacemaker
 from ..onboard.messages import COLUMNS, COMMAND, MEASURED, FlightRows, Parameters, pack_note
-from ..onboard.realtime import Lifeline
+from ..onboard.realtime import ParentWatch
 from ..onboard.topics import VEHICLE
 from ..physics.path_family import PathFamily
 from ..physics.state import Command, State
@@ -160,8 +160,8 @@ def _vehicle(family: PathFamily, s: EstimatorState) -> VehicleEstimate:
 def identify(plan: IdentifierPlan) -> None:
     """Run the main function of the process: identify until the flight is over."""
     enable_compile_cache()
-    bus, parent = SharedMemoryBus(plan.folder), Lifeline(plan.parent)
-    _, preset = load_learnt(plan.start, trust=plan.trust)
+    bus, parent = SharedMemoryBus(plan.folder), ParentWatch(plan.parent)
+    _, preset = load_learner_state(plan.start, trust=plan.trust)
     loop = IdentifierLoop(preset, plan.base, bus)
     loop.warm_up()
     bus.publish("ready.identifier", pack_note("ready", base=plan.base))

@@ -23,11 +23,11 @@ from ..adapt.workers import make_worker
 from ..config.presets import Preset
 from ..config.setup import Setup
 from ..errors import MessageError
-from ..io.trained import load_learnt
+from ..io.trained import load_learner_state
 from ..learn.window import Window
-from ..onboard.heart import Pacemaker
+from ..onboard.heartbeat import Pacemaker
 from ..onboard.messages import COMMAND, MEASURED, FlightRows, Parameters, last_note, pack_note
-from ..onboard.realtime import Lifeline
+from ..onboard.realtime import ParentWatch
 from ..onboard.topics import REFERENCE
 from ..physics.state import Command, State
 from ..runkit.compile_cache import enable_compile_cache
@@ -36,8 +36,8 @@ from ..runkit.outputs import write_state
 from ..transport import wire
 from ..transport.bus import Bus
 from ..transport.shared_memory import SharedMemoryBus
-from .controllers import flown
-from .published import flown_update, keep, learnt_from, newest_update
+from .controllers import parameter_groups
+from .published_updates import active_update, keep, learnt_from, newest_update
 from .states import state_of
 
 CHECK_EVERY = 0.005  # [s]
@@ -86,7 +86,7 @@ class LearnerLoop:
             clock: Function that returns the time [s].
             setup_of: Function that returns a set-up; loops of several vehicles may share one.
         """
-        state, preset = load_learnt(plan.start, trust=plan.trust)
+        state, preset = load_learner_state(plan.start, trust=plan.trust)
         self.plan, self.bus, self.state, self._clock = plan, bus, state, clock
         self.setup = setup_of(preset, plan.reference)
         self.every = preset.adapt.fit_every if plan.layer == "residual" else preset.adapt.update_every
@@ -96,7 +96,7 @@ class LearnerLoop:
         self._last_tick, self._new_ticks, self._began = -1, 0, float("-inf")
         self._known: dict[str, int] = {}
         self._learnt = 0
-        self.taken_back = 0
+        self.rolled_back = 0
         """Number of times that control rolled back a policy."""
         self._pending: tuple[int, PolicyUpdate, float] | None = None
         self._flown: list[tuple[int, Update]] = []
@@ -107,12 +107,12 @@ class LearnerLoop:
 
     def warm_up(self) -> None:
         """Compile the programs of the flight on a synthetic window and discard the result."""
-        self.worker.learn(self.made_up_window())
+        self.worker.learn(self.dummy_window())
         self.worker = self.new_worker()
 
-    def made_up_window(self) -> Window:
+    def dummy_window(self) -> Window:
         """Return a synthetic window with the shapes of a flight window and one tick of hover."""
-        x, buffer = State.at(self.setup.flown.home()), RollingBuffer(self.setup.preset.adapt.window)
+        x, buffer = State.at(self.setup.flight_task.home()), RollingBuffer(self.setup.preset.adapt.window)
         buffer.push(0.0, x, Command.hover(x.p.dtype))
         return buffer.window()
 
@@ -121,7 +121,7 @@ class LearnerLoop:
         self._take_residual()
         if (
             self.plan.layer == "policy"
-            and (found := flown_update(self.bus, self.state, "policy", self._status())) is not None
+            and (found := active_update(self.bus, self.state, "policy", self._status())) is not None
             and found[0] > self.plan.floor
         ):
             self._flown = [found]
@@ -169,7 +169,7 @@ class LearnerLoop:
             rows = FlightRows.unpack(message).rows
         except MessageError:
             return
-        dtype = np.asarray(self.setup.flown.home()).dtype
+        dtype = np.asarray(self.setup.flight_task.home()).dtype
         for row in rows[rows[:, 0] > self._last_tick]:
             state, u = state_of(row[MEASURED], dtype), jnp.asarray(row[COMMAND], dtype)
             self._buffer.push(float(row[1]), state, Command.of(u), float(row[2]))
@@ -197,7 +197,7 @@ class LearnerLoop:
         version = max(0 if before is None else before.version, known) + 1
         parent = self._flown[-1][0] if self._flown else 0
         whole = self._learnt_by(update)
-        arrays = wire.names(flown(whole.policy.policy.merged(), whole.residual)[layer])
+        arrays = wire.names(parameter_groups(whole.policy.policy.merged(), whole.residual)[layer])
         keep(self.bus, layer, version, update, self._status())
         found = Parameters(layer, version, self.plan.base, update.computed_from, arrays, parent)
         self.bus.publish(topic, found.pack())
@@ -220,7 +220,7 @@ class LearnerLoop:
             self._flown.pop()
             back = True
         if back:
-            self.taken_back += 1
+            self.rolled_back += 1
             self.worker.receive(self._flown[-1][1] if self._flown else _start(self.state))
         if self._pending is None:
             return back
@@ -278,7 +278,7 @@ def learn(plan: LearnerPlan) -> None:
     with contextlib.suppress(OSError, AttributeError):
         os.nice(NICE)  # so that a browser or terminal on the same machine responds before the next update is complete
     enable_compile_cache()
-    bus, parent = SharedMemoryBus(plan.folder), Lifeline(plan.parent)
+    bus, parent = SharedMemoryBus(plan.folder), ParentWatch(plan.parent)
     loop = LearnerLoop(plan, bus)
     loop.warm_up()
     loop.catch_up()

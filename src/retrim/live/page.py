@@ -16,14 +16,14 @@ import numpy as np
 from ..control.condition import describe_condition
 from ..errors import ConfigError, MessageError, excerpt
 from ..learn.screening import describe_counts
-from ..onboard.heart import Heart
+from ..onboard.heartbeat import Heart
 from ..onboard.messages import Sample, last_note, last_sent, pack_note
 from ..onboard.note_fields import FIELDS, plain, read_fields, shown
-from ..onboard.realtime import Lifeline
+from ..onboard.realtime import ParentWatch
 from ..transport.bus import Bus
 from ..transport.remote import LOOPBACK
 from ..transport.shared_memory import SharedMemoryBus
-from .knobs import Knobs
+from .manual_disturbance import ManualDisturbance
 from .page_access import only_for
 from .page_input import take_values_only
 from .panel import Panel
@@ -108,7 +108,7 @@ def show(plan: PagePlan) -> None:
     """Run the main function of the process: show the flight until the process is terminated."""
     import viser
 
-    bus, parent, spec = SharedMemoryBus(plan.folder), Lifeline(plan.parent), plan.page
+    bus, parent, spec = SharedMemoryBus(plan.folder), ParentWatch(plan.parent), plan.page
     # viser prints its address, and so does retrim: discard the output of viser.
     with contextlib.redirect_stdout(io.StringIO()), only_for(spec.token, spec.host):
         server = viser.ViserServer(host=spec.host, port=spec.port, label=f"retrim: {spec.name}", verbose=False)
@@ -186,12 +186,12 @@ class _Page:
         found = {layer: last_note(self._bus, f"learner.{layer}") for layer in ("residual", "policy")}
         return {layer: note for layer, note in found.items() if note}
 
-    def _knobs(self) -> Knobs:
+    def _knobs(self) -> ManualDisturbance:
         """Return the positions of the knobs."""
         message = self._bus.latest("knobs")
         with contextlib.suppress(MessageError):
-            return Knobs() if message is None else Knobs.unpack(message.data)
-        return Knobs()
+            return ManualDisturbance() if message is None else ManualDisturbance.unpack(message.data)
+        return ManualDisturbance()
 
     def refuse(self, why: str) -> None:
         """Count a refused input and publish the count with the reason."""
@@ -199,7 +199,7 @@ class _Page:
         with contextlib.suppress(MessageError):
             self._bus.publish(PAGE, pack_note(PAGE, count=self._refused, last=plain(why)))
 
-    def _turn(self, turned: Callable[[Knobs], Knobs]) -> Knobs | None:
+    def _turn(self, turned: Callable[[ManualDisturbance], ManualDisturbance]) -> ManualDisturbance | None:
         """Set knobs relative to their present positions, from any thread; return these positions if that fails."""
         with self._lock:
             before = self._knobs()

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from .knobs import LOAD, PUSH, WEAKEST, WIND, Knobs
+from .manual_disturbance import LOAD, PUSH, WEAKEST, WIND, ManualDisturbance
 
 HISTORY_S = 60.0  # [s]
 KICKS = {"+x": (8.0, 0.0, 0.0), "-x": (-8.0, 0.0, 0.0), "+y": (0.0, 8.0, 0.0), "-y": (0.0, -8.0, 0.0)}  # [m/s^2]
@@ -19,9 +19,9 @@ class Panel:
     def __init__(
         self,
         server: Any,
-        turn: Callable[[Callable[[Knobs], Knobs]], Knobs | None],
+        turn: Callable[[Callable[[ManualDisturbance], ManualDisturbance]], ManualDisturbance | None],
         wish: Callable[..., Mapping[str, Any]],
-        knobs: Knobs,
+        knobs: ManualDisturbance,
         wishes: dict[str, Any],
         methods: tuple[str, ...],
         references: tuple[str, ...],
@@ -131,9 +131,9 @@ class Panel:
         if self._setting:
             return
 
-        def turned(before: Knobs) -> Knobs:
+        def turned(before: ManualDisturbance) -> ManualDisturbance:
             push = np.clip(np.asarray(self._push.value, dtype=float) + self._pull, -PUSH, PUSH)
-            return Knobs(
+            return ManualDisturbance(
                 (float(push[0]), float(push[1]), float(push[2])),
                 self._wind.value,
                 self._load.value,
@@ -151,7 +151,7 @@ class Panel:
     def _calm(self) -> None:
         still = (0.0, 0.0, 0.0)
         self._set((self._push, still), (self._wind, still), (self._load, 0.0), (self._rotor, 1.0))
-        self._tell(lambda before: Knobs(kick=before.kick, kicks=before.kicks))
+        self._tell(lambda before: ManualDisturbance(kick=before.kick, kicks=before.kicks))
 
 
 def _vector(gui: Any, name: str, value: tuple[float, float, float], bound: float, step: float) -> Any:

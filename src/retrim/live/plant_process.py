@@ -12,17 +12,17 @@ import numpy as np
 
 from ..config.scenario import Scenario
 from ..errors import MessageError, PlantError
+from ..onboard.commands import wait_for_take_off
 from ..onboard.messages import Sample, Setpoint, pack_note
-from ..onboard.orders import wait_for_take_off
-from ..onboard.realtime import Lifeline, be_punctual, sleep_until
-from ..onboard.shares import SHARE
+from ..onboard.realtime import ParentWatch, be_punctual, sleep_until
+from ..onboard.tick_budget import SHARE
 from ..physics.state import Command
 from ..plants.plant import Measurement, as_numpy
 from ..runkit.compile_cache import enable_compile_cache
 from ..runkit.flying import FLOOR
 from ..transport.bus import Bus
 from ..transport.shared_memory import SharedMemoryBus
-from .knobs import KnobbedPlant, Knobs
+from .manual_disturbance import KnobbedPlant, ManualDisturbance
 from .states import state_of, vector_of
 
 ALONE = 5.0  # [s] without a command until a plant without a supervisor ends
@@ -51,17 +51,17 @@ def simulate(plan: PlantPlan) -> None:
     """Run the main function of the process: simulate until the vehicle has landed."""
     jax.config.update("jax_cpu_enable_async_dispatch", False)  # compute each tick synchronously, without a thread pool
     enable_compile_cache()
-    bus, parent = SharedMemoryBus(plan.folder), Lifeline(plan.parent)
+    bus, parent = SharedMemoryBus(plan.folder), ParentWatch(plan.parent)
     x0 = state_of(plan.x0, jnp.zeros(0).dtype)
     try:
         with plan.scenario.make(plan.vehicle, dt=plan.dt, seed=plan.seed) as plant:
             knobbed = KnobbedPlant(plant, plan.scenario, plan.seed)
             for load in (0.0, 0.01):  # compile and run every program
                 plant.reset(x0)
-                knobbed.turn(Knobs(load=load))
+                knobbed.turn(ManualDisturbance(load=load))
                 for _ in range(5):
                     knobbed.step(Command.hover(x0.p.dtype))
-            knobbed.turn(Knobs())
+            knobbed.turn(ManualDisturbance())
             measurement = plant.reset(x0)
             refused = be_punctual(plan.priority, set(plan.cores))
             bus.publish("ready.plant", pack_note("ready", refused=refused))
@@ -75,7 +75,7 @@ def simulate(plan: PlantPlan) -> None:
 
 
 def _flown(
-    plan: PlantPlan, plant: KnobbedPlant, bus: Bus, parent: Lifeline, measurement: Measurement, epoch: float
+    plan: PlantPlan, plant: KnobbedPlant, bus: Bus, parent: ParentWatch, measurement: Measurement, epoch: float
 ) -> str:
     """Simulate the flight; return the reason for its end."""
     tick, late, held, unanswered, turned = 0, 0, 0, 0, 0
@@ -108,7 +108,7 @@ def _flown(
         if (asked := bus.latest("knobs", turned)) is not None:
             turned = asked.version
             with contextlib.suppress(MessageError):
-                plant.turn(Knobs.unpack(asked.data))
+                plant.turn(ManualDisturbance.unpack(asked.data))
         dtype = measurement.x.p.dtype
         measurement, taken = plant.step(Command(jnp.asarray(u[0], dtype), jnp.asarray(u[1:], dtype)))
         accepted, tick = as_numpy(taken).astype(float), tick + 1

@@ -6,7 +6,7 @@ from pathlib import Path
 from ..onboard.messages import last_note
 from ..transport.bus import Bus
 from ..transport.network import DISTRUST, FAREWELL
-from .mission import Mission
+from .learner_mission import LearnerMission
 from .refused_notes import NETWORK
 from .spec import LiveSpec
 from .topics import topics
@@ -29,7 +29,9 @@ class RemoteLearners:
         s, self._missions = self._spec, self._missions + 1
         message = self._bus.latest("parameters.policy")
         floor = 0 if message is None else message.version
-        mission = Mission.of(self._missions, s.reference, s.seed, s.controller.base, s.layers, floor, topics(s), start)
+        mission = LearnerMission.of(
+            self._missions, s.reference, s.seed, s.controller.base, s.layers, floor, topics(s), start
+        )
         self._bus.publish("mission", mission.pack())
 
     def alive(self) -> dict[str, bool]:

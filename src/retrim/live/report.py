@@ -8,12 +8,12 @@ import numpy as np
 
 from ..adapt.learner_state import LearnerState
 from ..errors import PlantError
-from ..io.trained import load_learnt
-from ..onboard.accounts import EDGES_MS, accounted, measured, summary
+from ..io.trained import load_learner_state
 from ..onboard.guard import HOVER, Mode
 from ..onboard.messages import ACCOUNTS, COMMAND, MEASURED, STOPPED, TRUE
 from ..onboard.recorder import read_log
 from ..onboard.stalls import lost_in
+from ..onboard.timing_stats import EDGES_MS, accounted, measured, summary
 from ..runkit.flights import Flight
 from ..runkit.flying import scored, until_terminated
 from ..runkit.recovery import change_times, recoveries
@@ -22,7 +22,7 @@ from ..runtime.flight import Log, States
 from ..transport.bus import Bus
 from .events import LiveEvents
 from .plant_process import CRASHED
-from .published import learnt_from
+from .published_updates import learnt_from
 from .session import LiveRequest
 from .status import Status
 
@@ -63,7 +63,7 @@ def flight_of(
         tuple(events),
         shown[:, 2],
     )
-    return scored(request.setup, request.flight, until_terminated(request.setup.flown, log), learnt), rows
+    return scored(request.setup, request.flight, until_terminated(request.setup.flight_task, log), learnt), rows
 
 
 def results(
@@ -80,7 +80,7 @@ def results(
     """
     scenario, log = request.scenario, flight.log
     end = float(log.t[-1])
-    changes = change_times(scenario.disturbance, request.setup.flown.home(), end)
+    changes = change_times(scenario.disturbance, request.setup.flight_task.home(), end)
     # The log may lack the state of a crash.
     lost = (status.ended or "").startswith((CRASHED, STOPPED)) and status.control.get("reason") != "landing"
     crashed = log.terminated or lost
@@ -104,7 +104,7 @@ def results(
         "simulation_lost_s": status.world.get("lost"),
         "restarts": sum(status.restarts.values()),
         "refused_messages": sum(status.control.get("refused", {}).values()) + status.refused_notes,
-        "taken_back": len(given_up),
+        "rolled_back": len(given_up),
         "fallback_ticks": int(np.sum(flown[:, -1] != Mode.POLICY)),
     }
     about = {"scenario": scenario.disturbance, "method": request.method, "plant": scenario.plant, "n": 1,
@@ -165,7 +165,7 @@ def learnt_in(bus: Bus, status: Status, start: Path, trust: Collection[str] = ()
         start: File with the initial state of the learners.
         trust: Python names that the file may contain.
     """
-    return learnt_from(bus, load_learnt(start, trust=trust)[0], status.control)
+    return learnt_from(bus, load_learner_state(start, trust=trust)[0], status.control)
 
 
 def complaints(folder: Path) -> list[Path]:

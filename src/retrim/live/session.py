@@ -21,7 +21,7 @@ from ..config.setup import Setup
 from ..config.trust import python_names
 from ..control.policy import AbstractPolicy
 from ..errors import ConfigError
-from ..io.trained import save_learnt
+from ..io.trained import save_learner_state
 from ..onboard.guard import Limits
 from ..onboard.messages import MOST_TICKS
 from ..physics.state import State
@@ -30,8 +30,8 @@ from ..runkit.flights import FlightSpec
 from ..runtime.pilot import ControllerPilot
 from ..transport.remote import Address
 from ..transport.shared_key import read_key
-from .choices import choices, paths
 from .controllers import adaptive_source, plain_source
+from .live_options import choices, paths
 from .page import free_port
 from .spec import MAINS, VEHICLE, LiveSpec, PageSpec
 from .states import vector_of
@@ -130,13 +130,13 @@ def live_spec(request: LiveRequest) -> LiveSpec:
     if learns:
         state = request.state or learner_state(request, request.policy, request.method)
         controller = adaptive_source(setup, state)
-        save_learnt(start, state, preset)
+        save_learner_state(start, state, preset)
     else:
         pilot = setup.pilot(request.policy, request.method, request.flight.key())
         if not isinstance(pilot, ControllerPilot):
             raise ConfigError(f"method {request.method!r} must learn or return a ControllerPilot to fly live")
         controller = plain_source(setup, pilot.controller)
-        save_learnt(start, learner_state(request, request.policy, "full"), preset)
+        save_learner_state(start, learner_state(request, request.policy, "full"), preset)
     # Makes the hash unique: parameters and learners of another flight must not match, even for the same controller.
     controller = replace(controller, base=f"{controller.base}-{secrets.token_hex(4)}")
     return LiveSpec(
@@ -147,9 +147,9 @@ def live_spec(request: LiveRequest) -> LiveSpec:
         scenario=request.scenario,
         vehicle=preset.vehicle,
         x0=vector_of(
-            State.at(setup.flown.target(jnp.array(0.0))) if vehicle else setup.flight_starts(1, request.seed)[0]
+            State.at(setup.flight_task.target(jnp.array(0.0))) if vehicle else setup.flight_starts(1, request.seed)[0]
         ),
-        home=np.asarray(setup.flown.home(), dtype=float),
+        home=np.asarray(setup.flight_task.home(), dtype=float),
         limits=_limits(request),
         dt=preset.dt,
         delay_ticks=preset.plant_delay_ticks,
@@ -259,4 +259,4 @@ def _places(request: LiveRequest, seconds: float) -> np.ndarray:
     """Return positions along the reference, world [m], (n, 3)."""
     setup = request.setup
     times = jnp.arange(0.0, max(seconds, setup.preset.dt), STEP)
-    return np.asarray(jax.jit(jax.vmap(setup.flown.target))(times), dtype=float)
+    return np.asarray(jax.jit(jax.vmap(setup.flight_task.target))(times), dtype=float)

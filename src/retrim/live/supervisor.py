@@ -11,7 +11,7 @@ from subprocess import Popen, TimeoutExpired
 from typing import Any
 
 from ..errors import MessageError, PlantError
-from ..onboard.heart import Heart
+from ..onboard.heartbeat import Heart
 from ..onboard.launch import last_words, launch
 from ..onboard.messages import STOPPED, last_height, last_note, last_sent, pack_note, ticks_of
 from ..onboard.note_fields import plain

@@ -11,8 +11,8 @@ import numpy as np
 from ..errors import PlantError
 from ..onboard.guard import HOVER, Limits
 from ..onboard.messages import Sample, last_note, pack_note
-from ..onboard.realtime import Lifeline, be_punctual
-from ..onboard.shares import SHARE
+from ..onboard.realtime import ParentWatch, be_punctual
+from ..onboard.tick_budget import SHARE
 from ..plants.bridges.frames import heading_of
 from ..plants.bridges.vehicle_plant import VehiclePlant
 from ..plants.bridges.vehicle_state import VehicleState
@@ -26,7 +26,7 @@ HOLD_S = 0.05  # [s] between two reads of the orders while the autopilot holds
 def fly(plan: PlantPlan) -> None:
     """Run the main function of the process: take off, transfer until landing, and return control to the autopilot."""
     signal.signal(signal.SIGTERM, _ended)  # so that control returns to the autopilot in this case, too
-    bus, parent = SharedMemoryBus(plan.folder), Lifeline(plan.parent)
+    bus, parent = SharedMemoryBus(plan.folder), ParentWatch(plan.parent)
 
     def wanted() -> bool:
         return not parent.gone() and last_note(bus, "order").get("order") != "land"
@@ -57,7 +57,7 @@ def fly(plan: PlantPlan) -> None:
     bus.publish("ended", pack_note("ended", reason=reason))
 
 
-def _carried(plan: PlantPlan, plant: VehiclePlant, bus: Bus, parent: Lifeline, epoch: float) -> str:
+def _carried(plan: PlantPlan, plant: VehiclePlant, bus: Bus, parent: ParentWatch, epoch: float) -> str:
     """Transfer samples and commands; return the reason for the end."""
     tick, late, held, unanswered = 0, 0, 0, 0
     accepted = HOVER

@@ -9,13 +9,13 @@ import numpy as np
 
 from ..errors import MessageError, PlantError
 from ..transport.bus import Bus
-from .accounts import blind_row
 from .guard import OVER, UP, Fallback, G, GeometricHover, Mode
-from .intake import Intake
 from .messages import ACCOUNTS, COMMAND, FlightRows, Sample, Setpoint, Stamp, pack_note, unpack_note
+from .parameter_receiver import ParameterReceiver
 from .pilot import LivePilot
 from .plan import ControlPlan
-from .shares import PHASE, ROOM
+from .tick_budget import PHASE, ROOM
+from .timing_stats import blind_row
 
 REPORT_EVERY = 5  # ticks
 GAPS = 100  # the newest gaps are kept
@@ -30,7 +30,7 @@ class ControlLoop:
     def __init__(self, plan: ControlPlan, bus: Bus) -> None:
         self.plan, self.bus = plan, bus
         self.pilot = LivePilot(plan.controller)
-        self.intake = Intake(self.pilot, bus, plan.controller.base, plan.dt)
+        self.intake = ParameterReceiver(self.pilot, bus, plan.controller.base, plan.dt)
         self.mode, self.reason = Mode.POLICY, ""
         self.rows: deque[np.ndarray] = deque(maxlen=plan.window)
         self.sample: Sample | None = None

@@ -4,13 +4,13 @@ import math
 import time
 
 from ..transport.shared_memory import SharedMemoryBus
+from .commands import wait_for_take_off
 from .control import ControlLoop
 from .messages import Stamp, pack_note
-from .orders import wait_for_take_off
 from .plan import ControlPlan
 from .pulses import Pulses
-from .realtime import Lifeline, be_punctual, sleep_until, wait_until
-from .shares import PHASE, ROOM
+from .realtime import ParentWatch, be_punctual, sleep_until, wait_until
+from .tick_budget import PHASE, ROOM
 
 PATIENCE = ROOM  # of a tick: longest wait for a late sample; after it the sender still waits for the answer
 ALONE = 5.0  # [s] without a heartbeat of the supervisor, which shares its cores with the learners
@@ -59,7 +59,7 @@ def _ready(loop: ControlLoop, due: float, ahead: float) -> float:
 def fly(plan: ControlPlan) -> None:
     """Run the control loop until the vehicle has landed; main function of the process."""
     refused = be_punctual(plan.priority, set(plan.cores))
-    bus, parent = SharedMemoryBus(plan.folder), Lifeline(plan.parent)
+    bus, parent = SharedMemoryBus(plan.folder), ParentWatch(plan.parent)
     loop = ControlLoop(plan, bus)
     loop.warm_up()
     bus.publish("ready.control", pack_note("ready", refused=refused))

@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable, Iterable
 
 from ..transport.bus import Bus
-from .heart import beat_topic
+from .heartbeat import beat_topic
 
 SILENCE = 2.0  # [s] without a heartbeat, after which a process hangs
 LOOK = 0.25  # [s] that one check counts at most, because a stall of the machine is not a silence of the process

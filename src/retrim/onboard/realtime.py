@@ -80,7 +80,7 @@ def wait_until(instant: float) -> float:
     return now
 
 
-class Lifeline:
+class ParentWatch:
     """Detects the end of another process, immediately and without its cooperation."""
 
     def __init__(self, pid: int) -> None:

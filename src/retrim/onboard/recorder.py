@@ -15,12 +15,12 @@ import numpy as np
 from ..errors import MessageError
 from ..transport.bus import Bus
 from ..transport.shared_memory import SharedMemoryBus
-from .accounts import accounted
 from .guard import OVER, Mode
-from .heart import Heart
+from .heartbeat import Heart
 from .log_file import HEADER, LogFile, log_path
 from .messages import ACCOUNTS, COLUMNS, FlightRows, last_note, pack_note
-from .realtime import Lifeline
+from .realtime import ParentWatch
+from .timing_stats import accounted
 
 SILENCE = 2.0  # [s] without a tick, after which a flight without a supervisor is over
 ENDS = tuple(mode.name.lower() for mode in OVER)
@@ -171,7 +171,7 @@ def record(plan: RecorderPlan) -> None:
     bus = SharedMemoryBus(plan.folder)
     recorder = Recorder(plan.path, bus, plan.spare)
     recorder.tell()
-    parent, heard, left, heart = Lifeline(plan.parent), time.monotonic(), LINGER, Heart(bus, "recorder")
+    parent, heard, left, heart = ParentWatch(plan.parent), time.monotonic(), LINGER, Heart(bus, "recorder")
     while left and not (parent.gone() and time.monotonic() > heard + SILENCE):
         if recorder.step() or (bus.latest("sample") is None and not parent.gone()):
             heard = time.monotonic()

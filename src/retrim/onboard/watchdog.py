@@ -10,12 +10,12 @@ import numpy as np
 from ..errors import MessageError
 from ..transport.bus import Bus
 from ..transport.shared_memory import SharedMemoryBus
-from .accounts import blind_row
 from .guard import OVER, Fallback, GeometricHover, Limits, Mode
-from .heart import Heart
+from .heartbeat import Heart
 from .messages import COMMAND, FlightRows, Sample, Setpoint, Stamp, pack_note
-from .realtime import Lifeline, be_punctual
+from .realtime import ParentWatch, be_punctual
 from .stalls import Stalls
+from .timing_stats import blind_row
 
 PATIENCE = 1.6  # ticks without a command
 CHECK_EVERY = 0.002  # [s]
@@ -132,7 +132,7 @@ def watch(plan: WatchdogPlan) -> None:
     """Watch until the flight is over; main function of the process."""
     refused = be_punctual(plan.priority, set(plan.cores))
     bus = SharedMemoryBus(plan.folder)
-    watchdog, control, parent = Watchdog(plan, bus), Lifeline(plan.control), Lifeline(plan.parent)
+    watchdog, control, parent = Watchdog(plan, bus), ParentWatch(plan.control), ParentWatch(plan.parent)
     bus.publish("ready.watchdog", pack_note("ready", refused=refused))
     # Without real-time priority the process also waits for other processes, which is not a stall of the machine.
     stalls = None if refused else Stalls(CHECK_EVERY)

@@ -13,7 +13,7 @@ from .disturbance import Disturbance as Disturbance
 from .disturbance import Push as Push
 from .disturbance import RandomWalk as RandomWalk
 from .disturbance import Reversing as Reversing
-from .disturbance import Together as Together
+from .disturbance import SumOfDisturbances as SumOfDisturbances
 from .dynamics import AbstractDynamics as AbstractDynamics
 from .dynamics import Hybrid as Hybrid
 from .dynamics import PointMass as PointMass

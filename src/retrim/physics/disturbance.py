@@ -43,7 +43,7 @@ class Push(eqx.Module):
         return ExternalEffects.of(x.p.dtype, push=self.a_ext(t, x))
 
 
-class Together(eqx.Module):
+class SumOfDisturbances(eqx.Module):
     """Several disturbances at once."""
 
     parts: tuple[Disturbance, ...]
@@ -53,7 +53,7 @@ class Together(eqx.Module):
         return sum((part(t, x) for part in self.parts), start=ExternalEffects.calm(x.p.dtype))
 
 
-class Held(eqx.Module):
+class HeldEffects(eqx.Module):
     """Constant effects of any kind; the owner may replace them with others in flight."""
 
     effects: ExternalEffects

@@ -21,10 +21,10 @@ from ..runkit.outputs import write_state
 from ..runkit.reporter import Reporter
 from ..runkit.run import Run
 from .adaptation import adapt_to
-from .foretelling import Foretold, Protocol, foretell
 from .identification import identify
+from .prediction import PredictionScore, Protocol, predict_log
 from .predictors import learnt, yardsticks
-from .report import agreement_section, foretold_section, identified_section, picture, residual_section, warning_of
+from .report import agreement_section, identified_section, picture, prediction_section, residual_section, warning_of
 from .rows import rows_of
 from .vehicle import vehicle_toml
 
@@ -122,7 +122,7 @@ def replay(path: Path, asked: Replay, run: Run, reporter: Reporter) -> Document:
     found = _foretold(asked, protocol, setup, log, rows, reporter, run)
     if found:
         drawn = picture(log, rows, found, protocol, run.folder)[0]
-        section = dataclasses.replace(foretold_section(found, protocol), picture=drawn)
+        section = dataclasses.replace(prediction_section(found, protocol), picture=drawn)
         document.add(section, [dataclasses.asdict(each) for each in found])
     if asked.identify and not run.interrupted:
         with reporter.progress("identifying") as advance:
@@ -141,8 +141,8 @@ def replay(path: Path, asked: Replay, run: Run, reporter: Reporter) -> Document:
 
 def _foretold(
     asked: Replay, protocol: Protocol, setup: Setup, log: FlightLog, rows: Targets, reporter: Reporter, run: Run
-) -> list[Foretold]:
-    found = list[Foretold]()
+) -> list[PredictionScore]:
+    found = list[PredictionScore]()
     home = np.mean(log.p[log.valid], axis=0)
     goal = tuple(float(x) for x in home)
     preset = changed(setup.preset, goal=goal, dt=min(max(0.001, round(log.dt, 3)), SLOWEST))
@@ -154,7 +154,7 @@ def _foretold(
         predictors[name] = learnt(name, preset, setup.vehicle, asked.seed, **adapt, **more)
     with reporter.progress("foretelling") as advance, run.interruptible():
         advance(0.0, next(iter(predictors)))
-        for each in foretell(rows, log.dt, predictors, protocol):
+        for each in predict_log(rows, log.dt, predictors, protocol):
             found.append(each)
             advance(len(found) / len(predictors), f"{each.name}: {each.rmse:.3f} m/s^2")
     return found

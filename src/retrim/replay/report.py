@@ -9,8 +9,8 @@ from ..io.logs import FlightLog
 from ..io.logs.plausibility import DOUBTFUL
 from ..learn.residuals.targets import Targets
 from ..runkit.document import TableSection
-from .foretelling import Foretold, Protocol
 from .identification import Estimate, Identified
+from .prediction import PredictionScore, Protocol
 
 SMOOTH = 0.3  # averaging time of the curves in the picture [s]
 WORDS = {
@@ -60,7 +60,7 @@ def residual_section(log: FlightLog, rows: Targets) -> TableSection:
     return TableSection(("residual [m/s^2]", "x", "y", "z", "all"), lines, "What the point mass missed", about + said)
 
 
-def foretold_section(found: Sequence[Foretold], protocol: Protocol) -> TableSection:
+def prediction_section(found: Sequence[PredictionScore], protocol: Protocol) -> TableSection:
     """Return the table of prediction errors over the next seconds."""
     least = min(each.rmse for each in found)
     none = next((each.rmse for each in found if each.name == "zero"), None)
@@ -104,7 +104,9 @@ def identified_section(found: Identified) -> TableSection:
     return TableSection(("", "estimate"), lines, "What the vehicle is", about)
 
 
-def picture(log: FlightLog, rows: Targets, found: Sequence[Foretold], protocol: Protocol, folder: Path) -> list[Path]:
+def picture(
+    log: FlightLog, rows: Targets, found: Sequence[PredictionScore], protocol: Protocol, folder: Path
+) -> list[Path]:
     """Draw the residual over time, and the errors of the predictions."""
     from ..viz.panels import Curve, Panel, panel_figure
     from ..viz.plots import save

@@ -96,8 +96,8 @@ class Document:
         head += [f"{describe_code()}; {describe_hardware()}{trained}.", ""]
         body = [line for section in self.sections for line in section.markdown()]
         foot = self.run.watch.sentence() + (" Interrupted: incomplete." if self.run.interrupted else "")
-        if self.run.taken_over:
-            foot += f" An earlier run had made {self.run.taken_over} of the parts; its time is not counted."
+        if self.run.reused:
+            foot += f" An earlier run had made {self.run.reused} of the parts; its time is not counted."
         self.run.write_results(self._rows, seeds=self.seeds, name=self.data or self.name, **self.more)
         page = self.run.write_text(f"{self.name}.md", "\n".join([*head, *body, foot, ""]))
         if page not in self.run.pages:

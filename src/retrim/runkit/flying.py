@@ -68,7 +68,7 @@ def fly_one(
         PlantError: The plant refused.
         FlightStopped: ``stop`` was set.
     """
-    preset, task = setup.preset, setup.flown
+    preset, task = setup.preset, setup.flight_task
     pilot = setup.pilot(policy, spec.method, spec.key(), latency=latency, state=state)
     plant = plant_of(setup, spec)
 
@@ -98,7 +98,7 @@ def program_of(setup: Setup, policy: Any, specs: Sequence[FlightSpec]) -> Hashab
     return specs[0].method, jax.tree.structure([plant.simulation for plant in plants if isinstance(plant, SimPlant)])
 
 
-def fly_lot(
+def fly_batch(
     setup: Setup,
     policies: Sequence[Any],
     specs: Sequence[FlightSpec],
@@ -136,7 +136,7 @@ def fly_lot(
     ticks = round(seconds / preset.dt)
     logs = fly_together(simulated, pilots, starts, ticks=ticks, progress=progress, stop=stop, cold=cold)
     return [
-        scored(setup, spec, until_terminated(setup.flown, log), learnt_by(pilot))
+        scored(setup, spec, until_terminated(setup.flight_task, log), learnt_by(pilot))
         for spec, log, pilot in zip(specs, logs, pilots, strict=True)
     ]
 
@@ -161,7 +161,7 @@ def learnt_by(pilot: Pilot) -> LearnerState | None:
 
 def scored(setup: Setup, spec: FlightSpec, log: Log, learnt: LearnerState | None = None) -> Flight:
     """Return a flight with its errors, and the reason if it was terminated."""
-    task = setup.flown
+    task = setup.flight_task
     error, cross, target = _errors(task, log.t, log.true.as_state())
     if log.terminated:
         why = Event(float(log.t[-1]), "terminated", _why(log, float(error[-1])))

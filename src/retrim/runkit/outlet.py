@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 from ..config.presets import Preset
 from .flights import Flight
-from .outputs import clear_outputs, write_events, write_learnt, write_logs
+from .outputs import clear_outputs, write_events, write_learner_state, write_logs
 from .run import Run
 
 T = TypeVar("T")
@@ -79,6 +79,6 @@ class Outlet:
         """Write the learned parameters, events and logs of flights, and remove those of earlier flights."""
         with contextlib.suppress(OSError):
             clear_outputs(self.folder)
-        self.write("what was learnt", partial(write_learnt, flights, preset))
+        self.write("what was learnt", partial(write_learner_state, flights, preset))
         self.write("events.jsonl", partial(write_events, flights))
         self.write("the logs", partial(write_logs, flights))

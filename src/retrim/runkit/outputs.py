@@ -16,7 +16,7 @@ from ..io.checkpoint import save_delta
 from ..io.files import write_whole
 from ..io.logs.recording import Recording, write_npz
 from ..io.logs.viewers import can_record, record
-from ..io.trained import save_learnt, save_policy
+from ..io.trained import save_learner_state, save_policy
 from .flights import Flight
 from .interrupts import interrupts_only_set
 from .run import Run
@@ -56,12 +56,12 @@ def write_flights(flights: Sequence[Flight], preset: Preset, folder: Path) -> No
     clear_outputs(folder)
     write_events(flights, folder)
     write_logs(flights, folder)
-    write_learnt(flights, preset, folder)
+    write_learner_state(flights, preset, folder)
 
 
 def clear_outputs(folder: Path) -> None:
     """Remove the flight files of an earlier command from a folder, before new ones are written."""
-    for name in ("learnt.safetensors", "adapted.safetensors", "delta.safetensors", "events.jsonl"):
+    for name in ("learner_state.safetensors", "adapted.safetensors", "delta.safetensors", "events.jsonl"):
         (folder / name).unlink(missing_ok=True)
     for log in (folder / "logs").glob("*"):
         if log.suffix in (".npz", ".mcap"):
@@ -118,11 +118,11 @@ def recording_of(flight: Flight) -> Recording:
     )
 
 
-def write_learnt(flights: Sequence[Flight], preset: Preset, folder: Path) -> None:
+def write_learner_state(flights: Sequence[Flight], preset: Preset, folder: Path) -> None:
     """Write the learner state of the first adapting flight that was not terminated.
 
-    ``learnt.safetensors`` (to resume from), and ``adapted.safetensors`` (a policy) or ``delta.safetensors`` (for a
-    low-rank policy).
+    ``learner_state.safetensors`` (to resume from), and ``adapted.safetensors`` (a policy) or ``delta.safetensors``
+    (for a low-rank policy).
     """
     learnt = next((f.learnt for f in flights if f.learnt is not None and not f.log.terminated), None)
     if learnt is not None:
@@ -131,7 +131,7 @@ def write_learnt(flights: Sequence[Flight], preset: Preset, folder: Path) -> Non
 
 def write_state(learnt: LearnerState, preset: Preset, folder: Path) -> None:
     """Write a learner state, to resume from, and its policy or low-rank delta."""
-    save_learnt(folder / "learnt.safetensors", learnt, preset)
+    save_learner_state(folder / "learner_state.safetensors", learnt, preset)
     policy = learnt.policy.policy
     if isinstance(policy, LoraPolicy):
         save_delta(folder / "delta.safetensors", policy)

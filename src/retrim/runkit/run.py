@@ -55,7 +55,7 @@ class Run:
         self.executor, self.failed = executor, False
         self.pages: list[Path] = []  # pages that its documents have written
         self.watch = Stopwatch()
-        self.taken_over = 0
+        self.reused = 0
         """Number of parts and groups of flights that were taken from an earlier run."""
         self.stop = stop or threading.Event()
         commit(), code()  # cached now, since the files may change during a run of hours

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..physics import so3
-from ..physics.felt_frame import FeltFrame
+from ..physics.effective_gravity import EffectiveGravityFrame
 from ..physics.state import STANDARD_GRAVITY
 from .flatness import flat_command
 
@@ -57,7 +57,7 @@ class AbstractReference(eqx.Module):
         """Return the cross-track error: from ``p`` to the nearest point of the lap, or of the whole trajectory [m]."""
 
     @abc.abstractmethod
-    def in_frame(self, frame: FeltFrame) -> "AbstractReference":
+    def in_frame(self, frame: EffectiveGravityFrame) -> "AbstractReference":
         """Return the same trajectory in the coordinates of ``frame``."""
 
 
@@ -65,7 +65,7 @@ class TurnedReference(AbstractReference):
     """A reference in the frame of the effective gravity; its command follows from flatness in this frame."""
 
     reference: AbstractReference
-    frame: FeltFrame
+    frame: EffectiveGravityFrame
 
     @property
     def lap(self) -> Float[Array, "2"]:
@@ -89,6 +89,6 @@ class TurnedReference(AbstractReference):
         """Return the cross-track error in metres of the frame."""
         return self.frame.scale * self.reference.distance(so3.act(self.frame.Q.T, p) / self.frame.scale)
 
-    def in_frame(self, frame: FeltFrame) -> "TurnedReference":
+    def in_frame(self, frame: EffectiveGravityFrame) -> "TurnedReference":
         """Return the reference in another frame on top of this one."""
         return TurnedReference(self, frame)

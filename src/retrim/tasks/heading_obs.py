@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..physics import so3
-from ..physics.felt_frame import FeltFrame
+from ..physics.effective_gravity import EffectiveGravityFrame
 from ..physics.state import Command, State
 from .observation import AbstractObservation
 
@@ -41,7 +41,7 @@ class HeadingObs(AbstractObservation[M]):
         """Return the observation of the turned state."""
         return self.inner(memory, t, self._turned(x), last)
 
-    def in_frame(self, frame: FeltFrame) -> "HeadingObs[M]":
+    def in_frame(self, frame: EffectiveGravityFrame) -> "HeadingObs[M]":
         """Return the observation about the vertical of another frame."""
         turned: AbstractObservation[Any] = self.inner.in_frame(frame)
         return dataclasses.replace(self, inner=turned, origin=frame.vector(self.origin))

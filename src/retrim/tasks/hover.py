@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Key
 
 from ..errors import FrameError
 from ..physics import so3
-from ..physics.felt_frame import FeltFrame
+from ..physics.effective_gravity import EffectiveGravityFrame
 from ..physics.state import Command, State
 from .observation import AbstractObservation
 from .task import TILT, AbstractTask, Start, huber, within
@@ -73,7 +73,7 @@ class AbstractHover(AbstractTask):
         """Return the distance from the goal [m]."""
         return jnp.sqrt(jnp.sum((x.p - self.target(t)) ** 2))
 
-    def in_frame(self, frame: FeltFrame) -> "AbstractHover":
+    def in_frame(self, frame: EffectiveGravityFrame) -> "AbstractHover":
         """Return hover at the same goal.
 
         Raises:

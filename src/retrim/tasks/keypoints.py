@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Key
 
 from ..estimation.camera import Camera, in_camera
 from ..physics import so3
-from ..physics.felt_frame import FeltFrame
+from ..physics.effective_gravity import EffectiveGravityFrame
 from ..physics.state import STANDARD_GRAVITY, Command, State
 from .motions import NEAR
 from .observation import AbstractObservation
@@ -116,7 +116,7 @@ class Keypoints(AbstractObservation[KeypointMemory]):
         """Return the observation at rest, without noise."""
         return AbstractObservation.at_rest(dataclasses.replace(self, noise=jnp.zeros_like(self.noise)), x)
 
-    def in_frame(self, frame: FeltFrame) -> "Keypoints":
+    def in_frame(self, frame: EffectiveGravityFrame) -> "Keypoints":
         """Return the observation of a camera in ``frame``, in which the ground is level."""
         return dataclasses.replace(self, goal=frame.vector(self.goal))
 

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Key
 
 from ..errors import FrameError
 from ..physics.actuator_response import ActuatorState
-from ..physics.felt_frame import FeltFrame
+from ..physics.effective_gravity import EffectiveGravityFrame
 from ..physics.path_family import PathBelief
 from ..physics.state import STANDARD_GRAVITY, Command, State
 from .abstract_reference import Point
@@ -32,7 +32,7 @@ class GoalObs(AbstractObservation[M]):
     inner: AbstractObservation[M]
     """Observation of a hover task at the origin."""
     path: GoalPath = eqx.field(static=True)
-    frame: FeltFrame | None = None
+    frame: EffectiveGravityFrame | None = None
     """Frame of the states; None for the world."""
 
     @property
@@ -56,7 +56,7 @@ class GoalObs(AbstractObservation[M]):
         """Return the same observation with the present thrust and body rates."""
         return dataclasses.replace(self, inner=self.inner.with_actuators(actuators))
 
-    def in_frame(self, frame: FeltFrame) -> "GoalObs[M]":
+    def in_frame(self, frame: EffectiveGravityFrame) -> "GoalObs[M]":
         """Return the observation for states of ``frame``."""
         return GoalObs(self.inner.in_frame(frame), self.path, _only(self.frame, frame))
 
@@ -71,7 +71,7 @@ class MovingGoal(AbstractTask):
     inner: AbstractHover
     """Hover task whose goal is the origin."""
     path: GoalPath = eqx.field(static=True)
-    frame: FeltFrame | None = None
+    frame: EffectiveGravityFrame | None = None
     """Frame of the states; None for the world."""
 
     @property
@@ -140,7 +140,7 @@ class MovingGoal(AbstractTask):
         """Return the distance from the goal [m]."""
         return self.inner.error(t, self._relative(t, x))
 
-    def in_frame(self, frame: FeltFrame) -> "MovingGoal":
+    def in_frame(self, frame: EffectiveGravityFrame) -> "MovingGoal":
         """Return the same task for states and commands of ``frame``."""
         return MovingGoal(self.inner.in_frame(frame), self.path, _only(self.frame, frame))
 
@@ -148,7 +148,7 @@ class MovingGoal(AbstractTask):
         return relative_state(self.path, self.frame, t, x)
 
 
-def relative_state(path: GoalPath, frame: FeltFrame | None, t: Float[Array, ""], x: State) -> State:
+def relative_state(path: GoalPath, frame: EffectiveGravityFrame | None, t: Float[Array, ""], x: State) -> State:
     """Return a state relative to a moving goal.
 
     Args:
@@ -163,7 +163,7 @@ def relative_state(path: GoalPath, frame: FeltFrame | None, t: Float[Array, ""],
     return State(x.p - p, x.R, x.v - v)
 
 
-def _only(before: FeltFrame | None, frame: FeltFrame) -> FeltFrame:
+def _only(before: EffectiveGravityFrame | None, frame: EffectiveGravityFrame) -> EffectiveGravityFrame:
     if before is not None:
         raise FrameError("a moving goal cannot be transformed into a frame twice")
     return frame

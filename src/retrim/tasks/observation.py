@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from ..errors import FrameError
 from ..physics.actuator_response import ActuatorState
-from ..physics.felt_frame import FeltFrame
+from ..physics.effective_gravity import EffectiveGravityFrame
 from ..physics.path_family import PathBelief
 from ..physics.state import STANDARD_GRAVITY, Command, State
 
@@ -68,7 +68,7 @@ class AbstractObservation(eqx.Module, Generic[M]):
         del actuators
         return self
 
-    def in_frame(self, frame: FeltFrame) -> "AbstractObservation[M]":
+    def in_frame(self, frame: EffectiveGravityFrame) -> "AbstractObservation[M]":
         """Return the same observation for states and commands of ``frame``.
 
         Raises:
@@ -106,6 +106,6 @@ class StateObs(AbstractObservation[Float[Array, "history 4"]]):
         state = jnp.concatenate([(x.p - self.origin) / POSITION_SCALE, x.R.reshape(9), x.v / VELOCITY_SCALE])
         return jnp.concatenate([state, memory.reshape(-1)]), memory
 
-    def in_frame(self, frame: FeltFrame) -> "StateObs":
+    def in_frame(self, frame: EffectiveGravityFrame) -> "StateObs":
         """Return the observation about the same origin."""
         return StateObs(frame.vector(self.origin), self.omega_max, self.history)

@@ -10,7 +10,7 @@ from jax import lax, random
 from jaxtyping import Array, Float, Key
 
 from ..estimation.pose_filter import PoseFilter
-from ..physics.felt_frame import FeltFrame
+from ..physics.effective_gravity import EffectiveGravityFrame
 from ..physics.state import Command, State
 from .keypoints import COMMANDS, Keypoints, key_of
 from .observation import AbstractObservation
@@ -45,7 +45,7 @@ class OccludedKeypoints(AbstractObservation[OccludedMemory]):
     """Probability that a visible point is missed in a frame."""
     lag: Command | None = None
     """Time constants of the actuators in the filter [s]; None for actuators without lag."""
-    frame: FeltFrame | None = None
+    frame: EffectiveGravityFrame | None = None
     """Frame of the image of the observation; the filter and ``full`` remain in the world."""
     delay_ticks: int = eqx.field(static=True, default=0)
     """Declared command delay of the plant [ticks]; the filter predicts with the command that acted."""
@@ -60,7 +60,7 @@ class OccludedKeypoints(AbstractObservation[OccludedMemory]):
         """Length of the observation: 89."""
         return self.full.size
 
-    def in_frame(self, frame: FeltFrame) -> "OccludedKeypoints":
+    def in_frame(self, frame: EffectiveGravityFrame) -> "OccludedKeypoints":
         """Return the observation of a camera in ``frame``, in which the ground is level."""
         return dataclasses.replace(self, frame=frame)
 

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..physics.felt_frame import FeltFrame
+from ..physics.effective_gravity import EffectiveGravityFrame
 from ..physics.state import STANDARD_GRAVITY, Command, State
 from .abstract_reference import AbstractReference
 from .observation import VELOCITY_SCALE, AbstractObservation
@@ -60,6 +60,6 @@ class Preview(AbstractObservation[Float[Array, "history 4"]]):
         ]
         return jnp.concatenate(seen), memory
 
-    def in_frame(self, frame: FeltFrame) -> "Preview":
+    def in_frame(self, frame: EffectiveGravityFrame) -> "Preview":
         """Return the observation of the reference in ``frame``."""
         return Preview(self.reference.in_frame(frame), self.omega_max, self.history, self.accelerations)

@@ -14,7 +14,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from ..physics.felt_frame import FeltFrame
+from ..physics.effective_gravity import EffectiveGravityFrame
 from ..physics.state import STANDARD_GRAVITY
 from ..physics.vehicle import Vehicle
 from .abstract_reference import AbstractReference, Point, TurnedReference
@@ -97,7 +97,7 @@ class Reference(AbstractReference):
         away = jnp.sqrt(jnp.sum((nearest - p[None]) ** 2, axis=1))
         return jnp.min(jnp.where(on_lap, away, jnp.inf))
 
-    def in_frame(self, frame: FeltFrame) -> TurnedReference:
+    def in_frame(self, frame: EffectiveGravityFrame) -> TurnedReference:
         """Return the trajectory in the coordinates of ``frame``."""
         return TurnedReference(self, frame)
 

@@ -11,7 +11,7 @@ from jax import random
 from jaxtyping import Array, Bool, Float, Key
 
 from ..physics import so3
-from ..physics.felt_frame import FeltFrame
+from ..physics.effective_gravity import EffectiveGravityFrame
 from ..physics.path_family import Member
 from ..physics.state import STANDARD_GRAVITY, Command, State
 from .abstract_reference import Point
@@ -146,7 +146,7 @@ class AbstractTask(eqx.Module):
         """Return the error of a state, by default the distance from the target position [m]."""
         return jnp.sqrt(jnp.sum((x.p - self.target(t)) ** 2))
 
-    def in_frame(self, frame: FeltFrame) -> "AbstractTask":
+    def in_frame(self, frame: EffectiveGravityFrame) -> "AbstractTask":
         """Return the same task for states and commands of ``frame``.
 
         By default, reward, bounds and error are those of the state in the world and of the command in the frame, in
@@ -169,7 +169,7 @@ class FramedTask(AbstractTask):
     """Task in the world."""
     observation: AbstractObservation[Any]
     """Observation of states of the frame."""
-    frame: FeltFrame
+    frame: EffectiveGravityFrame
     dt: float = eqx.field(static=True)
     horizon: int = eqx.field(static=True)
 

@@ -10,7 +10,7 @@ from jax import random
 from jaxtyping import Array, Bool, Float, Key
 
 from ..physics import so3
-from ..physics.felt_frame import FeltFrame
+from ..physics.effective_gravity import EffectiveGravityFrame
 from ..physics.state import Command, State
 from .abstract_reference import AbstractReference, Point
 from .observation import AbstractObservation
@@ -85,7 +85,7 @@ class AbstractTrack(AbstractTask):
         """Return the distance from the nearest point of the reference's lap [m]."""
         return self.reference.distance(x.p)
 
-    def in_frame(self, frame: FeltFrame) -> "AbstractTrack":
+    def in_frame(self, frame: EffectiveGravityFrame) -> "AbstractTrack":
         """Return the task with the reference in ``frame``."""
         observation = self.observation.in_frame(frame)
         return dataclasses.replace(self, reference=self.reference.in_frame(frame), observation=observation)

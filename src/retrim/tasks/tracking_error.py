@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..physics.felt_frame import FeltFrame
+from ..physics.effective_gravity import EffectiveGravityFrame
 from ..physics.state import Command, State
 from .abstract_reference import AbstractReference
 from .observation import POSITION_SCALE, VELOCITY_SCALE, AbstractObservation, StateObs
@@ -45,7 +45,7 @@ class RelativeObs(AbstractObservation[Float[Array, "history 4"]]):
         """Observation of the state in axes that move with the reference."""
         return StateObs(jnp.zeros_like(self.omega_max), self.omega_max, self.history)
 
-    def in_frame(self, frame: FeltFrame) -> "RelativeObs":
+    def in_frame(self, frame: EffectiveGravityFrame) -> "RelativeObs":
         """Return the observation relative to the reference in ``frame``."""
         return RelativeObs(self.reference.in_frame(frame), self.omega_max, self.history)
 
@@ -77,6 +77,6 @@ class StateAndErrorObs(AbstractObservation[Float[Array, "history 4"]]):
         seen, memory = self.state(memory, t, x, last)
         return jnp.concatenate([seen, (x.p - here.p) / POSITION_SCALE, (x.v - here.v) / VELOCITY_SCALE]), memory
 
-    def in_frame(self, frame: FeltFrame) -> "StateAndErrorObs":
+    def in_frame(self, frame: EffectiveGravityFrame) -> "StateAndErrorObs":
         """Return the observation of the reference in ``frame``."""
         return StateAndErrorObs(self.reference.in_frame(frame), self.state.in_frame(frame))

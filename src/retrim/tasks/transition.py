@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..physics.felt_frame import FeltFrame
+from ..physics.effective_gravity import EffectiveGravityFrame
 from ..physics.state import STANDARD_GRAVITY
 from ..physics.vehicle import Vehicle
 from .abstract_reference import AbstractReference, Point, TurnedReference
@@ -71,7 +71,7 @@ class Spliced(AbstractReference):
         """Return the distance from ``p`` to the nearest lap of all pieces [m]."""
         return jnp.min(jax.vmap(lambda piece: piece.distance(p))(self.pieces))
 
-    def in_frame(self, frame: FeltFrame) -> TurnedReference:
+    def in_frame(self, frame: EffectiveGravityFrame) -> TurnedReference:
         """Return the same reference in the coordinates of ``frame``."""
         return TurnedReference(self, frame)
 

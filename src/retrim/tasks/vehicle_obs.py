@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..physics.actuator_response import ActuatorState
-from ..physics.felt_frame import FeltFrame
+from ..physics.effective_gravity import EffectiveGravityFrame
 from ..physics.path_family import COORDINATES, PathBelief
 from ..physics.state import STANDARD_GRAVITY, Command, State
 from .observation import AbstractObservation
@@ -74,7 +74,7 @@ class VehicleObs(AbstractObservation[M]):
         still = self.with_actuators(ActuatorState.at(hover))
         return still(self.init(x), jnp.zeros_like(x.p[0]), x, hover)[0]
 
-    def in_frame(self, frame: FeltFrame) -> "VehicleObs[M]":
+    def in_frame(self, frame: EffectiveGravityFrame) -> "VehicleObs[M]":
         """Return the observation in ``frame``; its actuators must also be in that frame."""
         turned: AbstractObservation[Any] = self.inner.in_frame(frame)
         return dataclasses.replace(self, inner=turned)

@@ -103,7 +103,7 @@ class DattState(eqx.Module):
     """State measured one tick ago."""
 
 
-class Datt(AbstractController[DattState]):
+class DattController(AbstractController[DattState]):
     """The trained policy in flight, with the disturbance from an L1 estimator."""
 
     net: DattNet
@@ -116,7 +116,7 @@ class Datt(AbstractController[DattState]):
     low: Command
     high: Command
 
-    def with_age(self, age: float | Float[Array, ""]) -> "Datt":
+    def with_age(self, age: float | Float[Array, ""]) -> "DattController":
         """Return the same for measurements that are ``age`` old [s]."""
         return dataclasses.replace(self, prediction=self.prediction.with_age(age))
 

@@ -9,18 +9,24 @@ from retrim.errors import ConfigError
 from retrim.estimation.l1 import L1Estimator
 from retrim.runtime.pilot import ControllerPilot, Pilot
 
-from .controller import Datt, DattNet
+from .controller import DattController, DattNet
 from .problem import KNOWN
 
 ESTIMATOR = 0.5  # [s]: time constant of the filter; the DATT authors use 2 s
 
 
-def datt_of(setup: Setup, net: DattNet) -> Datt:
+def datt_of(setup: Setup, net: DattNet) -> DattController:
     """Return the controller of a trained DATT network."""
     dt, vehicle = setup.preset.dt, setup.vehicle
     estimator = L1Estimator(jnp.array(L1_POLE), jnp.exp(jnp.array(-dt / ESTIMATOR)), dt)
-    return Datt(
-        net, setup.flown, prediction_of(setup), estimator, jnp.array(KNOWN), vehicle.command_min, vehicle.command_max
+    return DattController(
+        net,
+        setup.flight_task,
+        prediction_of(setup),
+        estimator,
+        jnp.array(KNOWN),
+        vehicle.command_min,
+        vehicle.command_max,
     )
 
 

@@ -13,7 +13,7 @@ from retrim.config.baselines import prediction_of
 from retrim.config.presets import Preset
 from retrim.config.setup import Setup
 from retrim.errors import ConfigError
-from retrim.evaluation.kept_trees import keep_tree, kept_tree
+from retrim.evaluation.tree_store import load_tree, save_tree
 from retrim.runkit.provenance import section_key
 from retrim.runkit.reporter import Reporter
 from retrim.runkit.run import Run
@@ -41,7 +41,7 @@ def check_steps(steps: int) -> None:
         raise ConfigError(f"--datt-steps {steps} must be between 1 and 10,000,000,000")
 
 
-def check_rival(preset: Preset) -> None:
+def check_period(preset: Preset) -> None:
     """Check that the control period of a preset divides DATT's look-ahead step and is at most 20 ms.
 
     Raises:
@@ -55,13 +55,13 @@ def check_rival(preset: Preset) -> None:
         )
 
 
-def steps_made(steps: int) -> int:
+def rounded_steps(steps: int) -> int:
     """Return the number of training steps for a request of ``steps``, rounded up to whole updates."""
     settings = PpoSettings(**DATT_PPO)
     return settings.updates(steps) * settings.envs * settings.steps
 
 
-def trained_datt(
+def train_datt(
     preset: Preset, seeds: Sequence[int], run: Run, reporter: Reporter, *, steps: int = DATT_STEPS
 ) -> dict[int, DattNet]:
     """Return a network for each seed; those that ``run.trained`` has are not trained again.
@@ -85,7 +85,7 @@ def trained_datt(
         key = random.fold_in(random.key(seed), DATT_TAG)
         k_net, k_learn = random.split(key)
         net: DattNet = eqx.filter_jit(DattNet.of)(key=k_net)
-        if (kept := kept_tree(path, net, kind="datt", reporter=reporter)) is not None:
+        if (kept := load_tree(path, net, kind="datt", reporter=reporter)) is not None:
             nets[seed] = kept
             continue
         low, high = setup.vehicle.command_min, setup.vehicle.command_max
@@ -94,7 +94,7 @@ def trained_datt(
         state = _trained(problem, PpoState.of(problem, net, k_learn, settings), settings, steps, path, run, reporter)
         if state is None:
             break
-        keep_tree(path, state.net, kind="datt", about=about)
+        save_tree(path, state.net, kind="datt", about=about)
         path.with_suffix(PARTLY).unlink(missing_ok=True)
         nets[seed] = state.net
     return nets
@@ -109,7 +109,7 @@ def _trained(
     """
     partly, updates = path.with_suffix(PARTLY), settings.updates(steps)
     title = f"DATT, seed {path.stem.rpartition('_seed')[2]}"
-    if (kept := kept_tree(partly, state, kind="ppo", reporter=reporter)) is not None:
+    if (kept := load_tree(partly, state, kind="ppo", reporter=reporter)) is not None:
         state = kept
         reporter.say(f"{title}: goes on after {int(state.made)} of {updates} updates")
     with run.interruptible(), reporter.progress(f"{title}, {steps:,} steps") as advance:
@@ -120,13 +120,13 @@ def _trained(
             if run.interrupted:
                 break
             if time.monotonic() - written > KEEP_EVERY:
-                keep_tree(partly, state, kind="ppo")
+                save_tree(partly, state, kind="ppo")
                 written = time.monotonic()
     if run.interrupted:
-        keep_tree(partly, state, kind="ppo")
+        save_tree(partly, state, kind="ppo")
         return None
     return state
 
 
-RIVALS = {"datt": trained_datt}
+RIVALS = {"datt": train_datt}
 """Training functions by method: they return the networks for a preset and seeds, which replace the policies."""

@@ -11,7 +11,7 @@ from retrim.plants.sim import SimPlant
 from retrim.runtime.pilot import ControllerPilot, Pilot
 from retrim.tasks.keypoints import Keypoints
 
-from .passive import Passive
+from .passive import HoverController
 from .plant import RaptorNet, RaptorQuadrotor
 
 
@@ -28,7 +28,7 @@ def add_raptor(setup: Setup, plant: Plant) -> SimPlant:
         raise ConfigError(
             "method 'raptor' reads the state on board, without noise or delay: fly it with sensors 'ideal'"
         )
-    model = RaptorQuadrotor(plant.simulation.model, RaptorNet.load(), setup.flown.wanted)
+    model = RaptorQuadrotor(plant.simulation.model, RaptorNet.load(), setup.flight_task.wanted)
     plant.simulation = dataclasses.replace(plant.simulation, model=model)
     return plant
 
@@ -36,7 +36,7 @@ def add_raptor(setup: Setup, plant: Plant) -> SimPlant:
 def _pilot(request: MethodRequest) -> Pilot:
     if isinstance(request.setup.env.task.observation, Keypoints):
         raise ConfigError("method 'raptor' needs the measured state; a policy that sees keypoints is shown none")
-    return ControllerPilot(Passive())
+    return ControllerPilot(HoverController())
 
 
 entry = MethodEntry(_pilot, "RAPTOR", on_board=add_raptor)

@@ -3,11 +3,11 @@
 from jaxtyping import Array, Float
 
 from retrim.control.controller import AbstractController
-from retrim.physics.felt_frame import FeltFrame
+from retrim.physics.effective_gravity import EffectiveGravityFrame
 from retrim.physics.state import Command, State
 
 
-class Passive(AbstractController[tuple[()]]):
+class HoverController(AbstractController[tuple[()]]):
     """Commands hover for every state, since the vehicle has its own controller on board."""
 
     def init(self, x: State) -> tuple[()]:
@@ -18,6 +18,6 @@ class Passive(AbstractController[tuple[()]]):
         """Return u_hover."""
         return Command.hover(x.p.dtype), memory
 
-    def in_frame(self, frame: FeltFrame) -> "Passive":
+    def in_frame(self, frame: EffectiveGravityFrame) -> "HoverController":
         """Return itself, since hover is the same in every frame."""
         return self

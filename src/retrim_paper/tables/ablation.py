@@ -9,10 +9,10 @@ import numpy as np
 from retrim.config.loading import changed, dump, load
 from retrim.config.presets import Adapt, Preset
 from retrim.config.scenario import Scenario
-from retrim.evaluation.kept import keep, kept
-from retrim.evaluation.kept_flights import forget_flights
+from retrim.evaluation.flight_store import clear_flights
 from retrim.evaluation.limits import check_flights, check_seeds
 from retrim.evaluation.metrics import cell
+from retrim.evaluation.section_store import keep, kept
 from retrim.evaluation.study import Study, fly_all, train_all
 from retrim.runkit.document import Document, TableSection
 from retrim.runkit.flights import Flight
@@ -20,7 +20,7 @@ from retrim.runkit.provenance import section_key
 from retrim.runkit.reporter import Reporter
 from retrim.runkit.run import Run
 
-from ..levers import CONTROL, OFF, ON, Lever
+from ..ablation_options import CONTROL, OFF, ON, Lever
 
 Task = Literal["hover", "track"]
 DISTURBANCES = {"hover": ("none", "large", "step", "gusts", "pickup"), "track": ("none", "large", "gusts")}
@@ -73,7 +73,7 @@ def ablation(
                 made = _flown(preset, lever, task, studies, document, starts=starts, seconds=seconds)
                 if not run.interrupted:
                     keep(run, key, *made)
-                    forget_flights(run)
+                    clear_flights(run)
             if not run.interrupted:
                 lines += made[0].rows
             found += made[1]

@@ -80,7 +80,7 @@ def design(
                 made = retrained(setup, policy, logs, random.key(seed), choice, epochs=epochs)
                 spec = FlightSpec(Scenario(PUSH, PLANT), "base", 0, seed)
                 landed = fly_as_it_is(setup, made.policy, starts, SCORED_S, seed)
-                flights = [scored(setup, spec, until_terminated(setup.flown, log)) for log in landed]
+                flights = [scored(setup, spec, until_terminated(setup.flight_task, log)) for log in landed]
                 rows.append({
                     "model": name, "seed": seed, "order": i, "compile_s": made.compile_s, "epoch_s": made.epoch_s,
                     "residual_rms": made.residual_rms, "errors": [flight.steady for flight in flights],

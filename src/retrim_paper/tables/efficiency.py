@@ -9,7 +9,7 @@ from jax import random
 from retrim.config.baselines import BASELINES
 from retrim.config.setup import Setup
 from retrim.errors import ConfigError
-from retrim.evaluation.effort import decision_s, updates
+from retrim.evaluation.compute_cost import decision_s, updates
 from retrim.evaluation.study import table_presets
 from retrim.runkit.document import Document, TableSection
 from retrim.runkit.reporter import Reporter
@@ -19,7 +19,7 @@ from retrim.runkit.training import train
 
 from ..datt.controller import DattNet
 from ..datt.method import datt_of
-from ..datt.training import DATT_STEPS, check_rival, check_steps, steps_made, trained_datt
+from ..datt.training import DATT_STEPS, check_period, check_steps, rounded_steps, train_datt
 
 INTRO = """\
 Made by `retrim reproduce efficiency`. Steps are control ticks of one simulated vehicle. Training: its time without
@@ -56,7 +56,7 @@ def efficiency(
     if not loaded:
         raise ConfigError("--presets: name at least one preset for hover")
     check_steps(datt_steps)
-    check_rival(loaded[0])
+    check_period(loaded[0])
     document = Document(run, "efficiency", "What each method costs", INTRO, [0], reporter)
     rows: list[dict[str, Any]] = []
     for preset in loaded:
@@ -86,11 +86,11 @@ def efficiency(
         watch = Stopwatch()
         with tempfile.TemporaryDirectory() as folder:  # always trained anew, even if the run's folder has the network
             afresh = Run("efficiency", Path(folder), stop=run.stop)
-            nets: dict[int, DattNet] = trained_datt(loaded[0], [0], afresh, reporter, steps=datt_steps)
+            nets: dict[int, DattNet] = train_datt(loaded[0], [0], afresh, reporter, steps=datt_steps)
         compiling = watch.compile_s
         if nets:
             rows.append({
-                "method": "datt", "steps": steps_made(datt_steps), "training_s": watch.total_s - compiling,
+                "method": "datt", "steps": rounded_steps(datt_steps), "training_s": watch.total_s - compiling,
                 "training_compile_s": compiling, "decision_s": decision_s(setup, datt_of(setup, nets[0])),
             })  # fmt: skip
     if rows:

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from retrim.errors import PlantError
-from retrim.evaluation.kept import digest_of
+from retrim.evaluation.section_store import digest_of
 from retrim.runkit.document import Document, Link, TableSection
 from retrim.runkit.provenance import section_key
 from retrim.runkit.reporter import Reporter
@@ -80,7 +80,7 @@ def everything(run: Run, reporter: Reporter, *, quick: bool = False) -> None:
         before = _read(run, done) if page.is_file() else None
         if before is not None and before.pop("page") == digest_of(page):
             reporter.say(f"{name}: as an earlier run of this folder has made it")
-            run.taken_over += 1
+            run.reused += 1
             row |= before
         else:
             took = _read(run, begun) or {"s": 0.0, "at_least": False}

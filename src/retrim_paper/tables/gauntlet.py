@@ -11,7 +11,7 @@ from retrim.config.presets import Preset
 from retrim.config.scenario import Scenario
 from retrim.config.setup import Setup
 from retrim.errors import ConfigError, JobError, PlantError
-from retrim.evaluation.kept_flights import forget_flights
+from retrim.evaluation.flight_store import clear_flights
 from retrim.evaluation.metrics import metres
 from retrim.evaluation.study import fly_all, refuse_misfits, table_presets, train_all
 from retrim.runkit.document import Document, TableSection
@@ -113,7 +113,7 @@ def gauntlet(
     intro = (FAULTS_INTRO if faults else INTRO).format(sensors=sensors)
     document = Document(run, name, title, intro, seeds, reporter, data="results")
     study = train_all(loaded, seeds, run, reporter)
-    home, flown, found = Setup.from_preset(loaded).flown.home(), dict[str, list[Flight]](), list[dict[str, Any]]()
+    home, flown, found = Setup.from_preset(loaded).flight_task.home(), dict[str, list[Flight]](), list[dict[str, Any]]()
     names, at_once = list(chosen), max(1, cores() // CORES)
     for together in (names[n : n + at_once] for n in range(0, len(names), at_once)):
         if run.interrupted:
@@ -138,7 +138,7 @@ def gauntlet(
         document.add(_section(found, methods, flown, document, study.about(), left_out), found)
     document.write()
     if not run.interrupted:
-        forget_flights(run)
+        clear_flights(run)
 
 
 def _installed(preset: Preset, asked: Mapping[str, Scenario]) -> tuple[dict[str, Scenario], list[str]]:

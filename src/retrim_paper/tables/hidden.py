@@ -11,7 +11,7 @@ from retrim.config.loading import load_for
 from retrim.config.methods import find_method
 from retrim.config.scenario import Scenario
 from retrim.errors import ConfigError
-from retrim.evaluation.kept_flights import forget_flights
+from retrim.evaluation.flight_store import clear_flights
 from retrim.evaluation.limits import check_flights, check_seeds
 from retrim.evaluation.metrics import metres
 from retrim.evaluation.study import Study, fly_all, refuse_misfits, train_all
@@ -201,7 +201,7 @@ def fly_hidden(
             document.add(_section(found, entrants, course, scoring, vehicles, run, about), found)
     document.write()
     if not run.interrupted:
-        forget_flights(run)
+        clear_flights(run)
 
 
 def _scenario(course: Course, vehicle: HiddenVehicle, sensors: str) -> Scenario:

@@ -13,17 +13,17 @@ from retrim.config.presets import Preset
 from retrim.config.scenario import Scenario
 from retrim.config.setup import Setup
 from retrim.evaluation.figures import picture
-from retrim.evaluation.kept import files_behind, keep, kept, named_by, named_in
-from retrim.evaluation.kept_flights import forget_flights
+from retrim.evaluation.flight_store import clear_flights
 from retrim.evaluation.metrics import cell, metres, rows
+from retrim.evaluation.section_store import file_digests, keep, kept, named_by, named_in
 from retrim.evaluation.study import Study, fly_all, refuse_misfits, train_all
 from retrim.runkit.document import Document, TableSection
 from retrim.runkit.provenance import section_key
 from retrim.runkit.reporter import Reporter
 from retrim.runkit.run import Run
 
-from ..datt.training import DATT_STEPS, RIVALS, check_rival, check_steps
-from .beside import figures_table
+from ..datt.training import DATT_STEPS, RIVALS, check_period, check_steps
+from .further_figures import figures_table
 
 LEVELS = {"none": "no disturbance", "small": "small, 0.5 m/s² per axis", "large": "large, 2 m/s² per axis"}
 """The paper's disturbances and their labels."""
@@ -87,7 +87,7 @@ def fly_levels(
     sections = [section for section in sections if section.methods]
     for section in sections:
         if any(method in RIVALS for method in section.methods):
-            check_rival(section.preset)
+            check_period(section.preset)
         own = [method for method in section.methods if method not in RIVALS] or ["base"]
         refuse_misfits(section.preset, section.scenarios, methods=own, starts=starts, seconds=seconds)
     for section in sections:
@@ -118,7 +118,7 @@ def fly_levels(
             break
         if made is not None:
             keep(run, name, *made)
-            forget_flights(run)
+            clear_flights(run)
     document.write()
 
 
@@ -127,7 +127,7 @@ def _files_behind(section: Levels) -> dict[str, str]:
     named = list[str | None](section.methods)
     for each in section.scenarios:
         named += named_by(each)
-    return files_behind(*named, *named_in(section.preset))
+    return file_digests(*named, *named_in(section.preset))
 
 
 def _level_section(

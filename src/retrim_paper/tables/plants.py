@@ -5,7 +5,7 @@ from dataclasses import replace
 from retrim.config.plants import PLANTS
 from retrim.config.scenario import Scenario
 from retrim.errors import PlantError
-from retrim.evaluation.kept_flights import forget_flights
+from retrim.evaluation.flight_store import clear_flights
 from retrim.evaluation.metrics import cell, metres, rows
 from retrim.evaluation.study import fly_all, table_presets, train_all
 from retrim.runkit.document import Document, TableSection
@@ -109,4 +109,4 @@ def plants(
         document.add(TableSection(COLUMNS, tuple(lines), title), found)
     document.write()
     if not run.interrupted:
-        forget_flights(run)
+        clear_flights(run)

@@ -10,7 +10,7 @@ from retrim.config.scenario import Scenario
 from retrim.config.setup import Setup
 from retrim.errors import ConfigError
 from retrim.evaluation.figures import picture
-from retrim.evaluation.kept_flights import forget_flights
+from retrim.evaluation.flight_store import clear_flights
 from retrim.evaluation.metrics import mean_and_deviation, metres, rows
 from retrim.evaluation.study import fly_all, table_presets, train_all
 from retrim.runkit.document import Document, TableSection
@@ -84,7 +84,7 @@ def reversing(
     document.more = {"moments_s": moments.tolist(), "errors_m": {m: np.array(e).tolist() for m, e in errors.items()}}
     document.add(_section(errors, moments, updates, about, drawn[0] if drawn else None), found)
     if not run.interrupted:
-        forget_flights(run)
+        clear_flights(run)
 
 
 def _peak(row: dict[str, Any]) -> str:

@@ -11,10 +11,10 @@ import numpy as np
 
 from retrim.config.scenario import Scenario
 from retrim.errors import ConfigError
+from retrim.evaluation.batches import LOT
+from retrim.evaluation.executor import report_progress
 from retrim.evaluation.fleet import Fleet
-from retrim.evaluation.gathering import told_by
 from retrim.evaluation.limits import check_flights
-from retrim.evaluation.lots import LOT
 from retrim.evaluation.study import refuse_misfits, table_presets, train_all
 from retrim.runkit.document import Document, TableSection
 from retrim.runkit.flights import Flight
@@ -87,7 +87,7 @@ def scaling(
         with run.interruptible(), reporter.progress(f"{n} flights") as advance:
             fleet.run(
                 stop=run.stop,
-                progress=told_by(advance),
+                progress=report_progress(advance),
                 landed=note,
                 forget=True,
             )

@@ -143,7 +143,7 @@ def _flown(
         for spec in specs
     ]
     logs = fly_together(plants, pilots, begun * len(tried), ticks=round(seconds / dt), stop=stop)
-    flights = [scored(setup, specs[0], until_terminated(setup.flown, log)) for log in logs]
+    flights = [scored(setup, specs[0], until_terminated(setup.flight_task, log)) for log in logs]
     errors = [
         CRASH if flight.log.terminated else float(np.sqrt(np.mean(flight.error[flight.log.t > SETTLING] ** 2)))
         for flight in flights

@@ -15,7 +15,7 @@ from ...physics.state import STANDARD_GRAVITY, State
 from .betaflight_firmware import Firmware, find_firmware
 from .betaflight_wire import IDLE, throttle_of
 from .betaflight_world import World
-from .patience import KeepOn
+from .polling import KeepOn
 from .vehicle_plant import VehiclePlant
 from .vehicle_state import VehicleState
 

@@ -27,7 +27,7 @@ STICKS_EVERY = 5  # [ms] between packets of the receiver
 BEHIND = 0.02  # [s] of delay, above which the world does not catch up any more
 
 
-class Ears:
+class MotorListener:
     """Receives motor commands, only from the first sender of valid ones."""
 
     def __init__(self, port: int = MOTORS) -> None:
@@ -86,7 +86,7 @@ class World:
             PlantError: The port of the motors is in use.
         """
         self._model, self._fastest = model, fastest
-        self._ears = Ears()
+        self._ears = MotorListener()
         self._out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._advance = _compiled(model, disturbance)
         self._over, self._lock = threading.Event(), threading.Lock()

@@ -11,7 +11,7 @@ from .crazyflie_link import CrazyflieLink
 from .endpoint import UdpEndpoint, address_of, address_towards
 from .frames import heading_of
 from .linked_plant import LinkedPlant, ThrustScale
-from .patience import KeepOn, insisting
+from .polling import KeepOn, insisting
 from .vehicle_state import VehicleState
 
 ADDRESS = "udp:127.0.0.1:19850"  # of a simulated Crazyflie, or a bridge to the radio, on this machine

@@ -13,7 +13,7 @@ from . import crtp
 from .clock import ArrivalClock
 from .crtp import Packet
 from .endpoint import Endpoint, pump
-from .patience import KeepOn, insisting, wait_until
+from .polling import KeepOn, insisting, wait_until
 from .vehicle_state import Reading
 
 STATES, STATUSES = 1, 2  # numbers of our blocks of the log

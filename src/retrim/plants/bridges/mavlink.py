@@ -11,7 +11,7 @@ from .endpoint import address_of, open_endpoint
 from .frames import heading_of
 from .linked_plant import LinkedPlant, ThrustScale
 from .mavlink_link import MavlinkLink
-from .patience import KeepOn, insisting, wait_until
+from .polling import KeepOn, insisting, wait_until
 from .vehicle_state import VehicleState
 
 ADDRESS = "udp:127.0.0.1:14540"  # that PX4 sends to on its own machine

@@ -9,7 +9,7 @@ import numpy as np
 from ...errors import ConfigError, PlantError
 from .frames import heading_of
 from .linked_plant import LinkedPlant
-from .patience import KeepOn
+from .polling import KeepOn
 from .ros_link import ODOMETRY, POSE, RosLink
 from .vehicle_state import VehicleState
 

@@ -12,7 +12,7 @@ from ...errors import PlantError
 from ...physics.state import STANDARD_GRAVITY, Command, State
 from ..plant import Measurement, Plant, as_numpy, check_command, limited
 from .frames import heading_of
-from .patience import KeepOn, wait_until
+from .polling import KeepOn, wait_until
 from .vehicle_state import VehicleState
 
 THERE, STILL, STAY_S = 0.2, 0.25, 1.0  # [m], [m/s], [s]: limits for a vehicle that has arrived

@@ -8,9 +8,9 @@ from concurrent.futures import Future, ThreadPoolExecutor
 
 from ..runtime.events import Event
 from .events import LiveEvents
+from .operator_requests import OperatorRequests
 from .status import Status
 from .supervisor import LANDING, Supervisor
-from .wishes import Wishes
 
 EVERY = 0.05  # [s] between two reads of the status
 LAST = 1.0  # [s] for a terminal to display the end of a flight
@@ -22,7 +22,7 @@ def watched(
     events: LiveEvents,
     show: Callable[[Status, list[Event]], None],
     stop: threading.Event,
-    wishes: Wishes | None = None,
+    wishes: OperatorRequests | None = None,
 ) -> Status:
     """Take off, watch until the flight is over, and wait until its log is written.
 

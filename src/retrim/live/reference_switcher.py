@@ -12,7 +12,7 @@ from ..runtime.events import Event
 from ..tasks.reference import Reference
 from ..tasks.transition import BEFORE, transition_between
 from ..transport import wire
-from .choices import choices
+from .live_options import choices
 from .session import LiveRequest
 from .status import Status
 from .supervisor import Supervisor
@@ -23,7 +23,7 @@ TOLD = "followed"
 """Topic of the name of the present reference."""
 
 
-class Following:
+class ReferenceSwitcher:
     """Changes the reference on request. It computes the tables in a separate thread."""
 
     def __init__(self, request: LiveRequest, supervisor: Supervisor, work: Executor) -> None:

@@ -19,7 +19,7 @@ T = TypeVar("T")
 NOTHING: Mapping[str, str] = MappingProxyType({})
 
 
-def keep_tree(path: Path, tree: Any, *, kind: str, about: Mapping[str, str] = NOTHING) -> None:
+def save_tree(path: Path, tree: Any, *, kind: str, about: Mapping[str, str] = NOTHING) -> None:
     """Write the arrays of a tree, whole or not at all.
 
     Args:
@@ -31,7 +31,7 @@ def keep_tree(path: Path, tree: Any, *, kind: str, about: Mapping[str, str] = NO
     write_whole(path, wire.pack(_numbers(tree), kind=kind, about=about))
 
 
-def kept_tree(path: Path, like: T, *, kind: str, reporter: Reporter) -> T | None:
+def load_tree(path: Path, like: T, *, kind: str, reporter: Reporter) -> T | None:
     """Return the tree that was written, bit for bit; None if there is no file or it is damaged.
 
     Args:

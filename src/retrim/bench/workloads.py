@@ -1,4 +1,4 @@
-"""The benchmarks. ``python -m retrim.bench.works NAME`` runs one and prints JSON."""
+"""The benchmarks. ``python -m retrim.bench.workloads NAME`` runs one and prints JSON."""
 
 import json
 import resource
@@ -20,9 +20,9 @@ from ..onboard.launch import PYTHON
 from ..physics.state import Command
 from ..runkit.stopwatch import Stopwatch
 from ..runtime.flight import fly
-from .beside import policies
+from .background_load import policies
 from .fleet import eight_flights, on_threads, one_after_another, side_by_side
-from .flown import learner_in_flight
+from .flight import learner_in_flight
 from .machine import on_core, rates
 from .timing import Work, compiled, timed
 from .training import encode_and_pretrain, pretrain

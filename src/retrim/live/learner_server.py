@@ -12,7 +12,7 @@ from subprocess import Popen
 from typing import Any
 
 from ..errors import ConfigError, MessageError, RetrimError, one_line
-from ..onboard.heart import beat_topic
+from ..onboard.heartbeat import beat_topic
 from ..onboard.launch import last_words, launch
 from ..onboard.messages import last_note, pack_note
 from ..onboard.pulses import Pulses
@@ -21,9 +21,9 @@ from ..transport.bridge import Bridge
 from ..transport.network import DISTRUST, FAREWELL
 from ..transport.remote import Address
 from ..transport.shared_memory import SharedMemoryBus
-from .fleet_process import FleetProcess, Seat
+from .fleet_process import FleetProcess, FleetSlot
+from .learner_mission import LearnerMission
 from .learner_process import LearnerPlan
-from .mission import Mission
 from .spec import MAINS
 
 IDLE, SELDOM = 0.002, 0.05  # [s] between two reads of a bus, during a flight and before it
@@ -32,7 +32,7 @@ SILENCE = 5.0  # [s] without a message from the flight until this is reported
 STARTING, ATTEMPTS = 300.0, 5  # [s] for a learner to compile and send its first heartbeat; restarts per learner
 
 
-class Ground:
+class LearnerServer:
     """Learners of one flight on another machine. Exit from the context ends them."""
 
     def __init__(self, address: Address, fleet: FleetProcess | None = None, trust: tuple[str, ...] = ()) -> None:
@@ -50,9 +50,9 @@ class Ground:
         self._place = tempfile.TemporaryDirectory(prefix="retrim-ground-")
         self.folder = Path(self._place.name)
         self.address, self._fleet, self._trust = address, fleet, trust
-        self.processes: dict[str, Popen[bytes] | Seat] = {}
+        self.processes: dict[str, Popen[bytes] | FleetSlot] = {}
         self.restarts: dict[str, int] = {}
-        self._mission: Mission | None = None
+        self._mission: LearnerMission | None = None
         self._distrust: float | None = None
         self._bus: SharedMemoryBus | None = None
         self._bridge: Bridge | None = None
@@ -61,7 +61,7 @@ class Ground:
         self._known, self._beaten, self._standing = 0, float("-inf"), "waiting for a flight"
         self._heard = (0, time.monotonic())
 
-    def __enter__(self) -> "Ground":
+    def __enter__(self) -> "LearnerServer":
         """Return the ground station."""
         return self
 
@@ -110,7 +110,7 @@ class Ground:
         """Accept a new mission, if there is one; return whether there is a mission."""
         message = self._network.latest("mission", self._known)
         try:
-            mission = None if message is None else Mission.unpack(message.data)
+            mission = None if message is None else LearnerMission.unpack(message.data)
         except MessageError:
             mission = None
         self._known = self._known if message is None else message.version
@@ -134,7 +134,7 @@ class Ground:
             self._begin_with("policy")
         return True
 
-    def _begin(self, mission: Mission) -> None:
+    def _begin(self, mission: LearnerMission) -> None:
         """Start learning for a new flight."""
         self._end()
         self._bus = SharedMemoryBus.create({**mission.capacities, **{beat_topic(x): 1024 for x in mission.layers}})
@@ -259,7 +259,7 @@ def learn_for(
         if len(addresses) > 1:
             fleet = FleetProcess(Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="retrim-fleet-"))))
             stack.callback(fleet.close)
-        grounds = [stack.enter_context(Ground(address, fleet, trust)) for address in addresses]
+        grounds = [stack.enter_context(LearnerServer(address, fleet, trust)) for address in addresses]
         stands = dict.fromkeys(grounds, "waiting for a flight")
         # One thread for each flight, so that a slow network to one vehicle does not delay the others.
         pool = stack.enter_context(ThreadPoolExecutor(len(grounds)))
@@ -278,7 +278,7 @@ def learn_for(
         return _summary(stands)
 
 
-def _serve(ground: Ground, stands: dict[Ground, str], stop: threading.Event) -> None:
+def _serve(ground: LearnerServer, stands: dict[LearnerServer, str], stop: threading.Event) -> None:
     """Learn for one flight until it is over, and store its status in ``stands``."""
     for words in ground.wait():
         stands[ground] = words
@@ -292,7 +292,7 @@ def _serve(ground: Ground, stands: dict[Ground, str], stop: threading.Event) -> 
             time.sleep(IDLE)
 
 
-def _summary(stands: dict[Ground, str]) -> str:
+def _summary(stands: dict[LearnerServer, str]) -> str:
     """Return the status of all flights; several flights are labelled with their addresses."""
     if len(stands) == 1:
         return next(iter(stands.values()))

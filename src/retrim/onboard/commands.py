@@ -3,10 +3,10 @@
 from ..errors import MessageError
 from ..transport.bus import Bus
 from .messages import unpack_note
-from .realtime import Lifeline
+from .realtime import ParentWatch
 
 
-def wait_for_take_off(bus: Bus, parent: Lifeline) -> float | None:
+def wait_for_take_off(bus: Bus, parent: ParentWatch) -> float | None:
     """Wait for the order to take off, and return the time of the first tick, monotonic clock [s].
 
     Returns None if the supervisor ends before it gives the order.

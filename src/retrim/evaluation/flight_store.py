@@ -17,15 +17,15 @@ from ..runkit.flights import Flight, FlightSpec
 from ..runkit.provenance import section_key
 from ..runkit.run import PARTS, Run
 from .fleet import Fleet
-from .kept import files_behind, named_by, named_in
 from .packed_flights import packed, unpacked
+from .section_store import file_digests, named_by, named_in
 
 FLIGHTS = f"{PARTS}/flights"
 Group = tuple[Hashable, str]
 """Group key of a specification; see :attr:`FlightSpec.group`."""
 
 
-class KeptFlights:
+class FlightStore:
     """The flights of a fleet in the folder of a run.
 
     A group has the flights that one program can fly. It is written when it is complete, so that the batches of the
@@ -44,13 +44,13 @@ class KeptFlights:
         for group, specs in self._groups.items():
             scenarios, method = list(dict.fromkeys(spec.scenario for spec in specs)), specs[0].method
             named = [name for scenario in scenarios for name in named_by(scenario)]
-            files = files_behind(method, *named, *named_in(fleet.preset))
+            files = file_digests(method, *named, *named_in(fleet.preset))
             what = {"scenarios": list(map(repr, scenarios)), "method": method, "flights": len(specs), "files": files}
             self._keys[group] = section_key(**about, **what)
         found = [self._read(group) for group in self._groups]
         self.earlier = {flight.spec: flight for flights in found for flight in flights}
         """Flights of an earlier run, which this run does not repeat."""
-        run.taken_over += sum(map(bool, found))
+        run.reused += sum(map(bool, found))
 
     def landed(self, flights: Sequence[Flight]) -> None:
         """Write each group that these flights complete."""
@@ -71,7 +71,7 @@ class KeptFlights:
         return self._run.folder / FLIGHTS / f"{self._keys[group]}.npz"
 
 
-def forget_flights(run: Run) -> None:
+def clear_flights(run: Run) -> None:
     """Remove the flights in the folder of a run, after their table is written."""
     shutil.rmtree(run.folder / FLIGHTS, ignore_errors=True)
 

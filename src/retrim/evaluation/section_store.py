@@ -38,11 +38,11 @@ def kept(run: Run, key: str) -> tuple[TableSection, list[dict[str, Any]]] | None
         section = TableSection(tuple(whole["columns"]), lines, whole["title"], whole["about"], next(iter(drawn), None))
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None  # it is made again
-    run.taken_over += 1
+    run.reused += 1
     return section, rows
 
 
-def files_behind(*names: str | None) -> dict[str, str]:
+def file_digests(*names: str | None) -> dict[str, str]:
     """Return digests of the files that names refer to: CSV files, and the modules of ``module:name``.
 
     Args:

@@ -56,7 +56,7 @@ def updates(setup: Setup, *, lora: bool = False) -> dict[str, Any]:
         "fit_s": fit_s,
         "update_s": run_s,
         "compile_s": fit_compile + compile_s,
-        "update_steps": a.num_updates * a.num_envs * setup.flown.horizon,
+        "update_steps": a.num_updates * a.num_envs * setup.flight_task.horizon,
         "window_s": a.window * setup.preset.dt,
     }
 

@@ -14,7 +14,7 @@ from ..runkit.provenance import section_key
 from ..runkit.reporter import Reporter
 from ..runkit.run import Run
 from ..runkit.training import train, trained_elsewhere
-from .kept import files_behind, named_in
+from .section_store import file_digests, named_in
 
 POLICIES = "policies"
 UNSAFE = re.compile(r"[^\w.+=-]+")
@@ -36,7 +36,7 @@ def trained_policies(preset: Preset, seeds: Sequence[int], run: Run, reporter: R
     Raises:
         JobError: A training failed in another process; raised after the others are completed.
     """
-    made_of = section_key(preset=dump(preset), files=files_behind(*named_in(preset)))
+    made_of = section_key(preset=dump(preset), files=file_digests(*named_in(preset)))
     stem = f"{UNSAFE.sub('-', preset.name)}-{made_of[:8]}"
     paths = {seed: run.trained / POLICIES / f"{stem}-seed{seed}.safetensors" for seed in seeds}
     found = dict[int, AbstractPolicy]()

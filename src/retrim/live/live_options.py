@@ -24,7 +24,7 @@ def choices(setup: Setup, present: str) -> tuple[str, ...]:
         setup: Set-up of the flight.
         present: Name of the present reference.
     """
-    seen = jax.tree.leaves(setup.flown.observation_in_flight, is_leaf=lambda part: isinstance(part, Reference))
+    seen = jax.tree.leaves(setup.flight_task.observation_in_flight, is_leaf=lambda part: isinstance(part, Reference))
     if not any(isinstance(part, Reference) for part in seen):
         return ()
     return (present, *(name for name in REFERENCES if name != present))

@@ -15,7 +15,7 @@ from ..config.loading import load
 from ..config.scenario import Scenario
 from ..config.setup import Setup
 from ..onboard.launch import PYTHON
-from .flown import learner_in_flight
+from .flight import learner_in_flight
 from .machine import on_core
 from .timing import timed
 
@@ -29,7 +29,7 @@ def policies() -> dict[str, Any]:
     Raises:
         OSError: The flight did not begin or did not continue, or the system does not let a process choose its core.
     """
-    command = [*PYTHON, "retrim.bench.beside"]
+    command = [*PYTHON, "retrim.bench.background_load"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as flight:
         on_core(-1)  # after the start of the flight, whose process must be able to choose any core
         learner, state, window = learner_in_flight(PRESET)

@@ -10,7 +10,7 @@ from ..config.scenario import Scenario
 from ..errors import MessageError, PlantError
 from ..onboard.messages import pack_note, unpack_note
 from ..onboard.note_fields import read_fields
-from ..physics.disturbance import Held, Together
+from ..physics.disturbance import HeldEffects, SumOfDisturbances
 from ..physics.effects import ExternalEffects
 from ..physics.state import Command
 from ..physics.vehicle import payload_inertia
@@ -22,7 +22,7 @@ KICK = 15.0  # [m/s^2], maximum per axis
 
 
 @dataclass(frozen=True)
-class Knobs:
+class ManualDisturbance:
     """Positions of the knobs. Their effects add to the disturbance of the scenario."""
 
     push: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -54,7 +54,7 @@ class Knobs:
         return pack_note("knobs", **vars(self))
 
     @classmethod
-    def unpack(cls, data: bytes) -> "Knobs":
+    def unpack(cls, data: bytes) -> "ManualDisturbance":
         """Read knobs.
 
         Raises:
@@ -83,11 +83,11 @@ class KnobbedPlant:
         self.refused = "" if hasattr(plant, "disturb") else "this plant has no knobs"
         """Reason why the last change of the knobs was rejected; empty if it was accepted."""
         self._plant, self._possible = plant, not self.refused
-        self._knobs, self._left = Knobs(), 0
+        self._knobs, self._left = ManualDisturbance(), 0
         self._scenario = disturbance(scenario.disturbance, seed)
         self._turn()
 
-    def turn(self, knobs: Knobs) -> None:
+    def turn(self, knobs: ManualDisturbance) -> None:
         """Set the knobs; a kick begins if ``kicks`` has increased."""
         if knobs.kicks > self._knobs.kicks:
             self._left = round(KICK_S / self._plant.dt)
@@ -105,9 +105,9 @@ class KnobbedPlant:
         try:
             done = self._plant.step(u)
         except PlantError as error:
-            if not self._possible or self._knobs == Knobs(kicks=self._knobs.kicks):
+            if not self._possible or self._knobs == ManualDisturbance(kicks=self._knobs.kicks):
                 raise
-            self.refused, self._knobs, self._left = str(error), Knobs(kicks=self._knobs.kicks), 0
+            self.refused, self._knobs, self._left = str(error), ManualDisturbance(kicks=self._knobs.kicks), 0
             self._turn()
             done = self._plant.step(u)
         if self._left:
@@ -118,5 +118,5 @@ class KnobbedPlant:
 
     def _turn(self) -> None:
         if self._possible:
-            held = Held(self._knobs.effects(kicking=self._left > 0))
-            self._plant.disturb(Together((self._scenario, held)))  # type: ignore[attr-defined]
+            held = HeldEffects(self._knobs.effects(kicking=self._left > 0))
+            self._plant.disturb(SumOfDisturbances((self._scenario, held)))  # type: ignore[attr-defined]

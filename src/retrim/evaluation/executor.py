@@ -10,7 +10,7 @@ from ..errors import ConfigError, JobError
 from ..runkit.flights import Flight, FlightSpec
 from ..runkit.interrupts import interrupts_only_set
 from ..runtime.flight import FlightStopped
-from .lots import Lot
+from .batches import FlightBatch
 from .metrics import Rows, rows
 
 GONE: "Future[list[Flight]]" = Future()
@@ -19,11 +19,11 @@ GONE.cancel()
 OFTEN = 1.0  # [s]: interval of progress reports while flights are running
 Progress = Callable[[float, int], None]
 """Receives the number of completed flights and of all flights; a running flight counts by its completed share."""
-Submit = Callable[[Lot, Callable[[float], None]], "Future[list[Flight]]"]
+Submit = Callable[[FlightBatch, Callable[[float], None]], "Future[list[Flight]]"]
 """Starts a batch; its second argument is a callback that receives the completed share."""
 
 
-def told_by(advance: Callable[[float, str], None]) -> Progress:
+def report_progress(advance: Callable[[float, str], None]) -> Progress:
     """Return a progress callback for a progress bar; ``advance`` receives a share and a text."""
     return lambda done, n: advance(done / n, f"{done:.0f} of {n} flights")
 
@@ -45,7 +45,7 @@ class Flights:
 
 def gathered(
     specs: Sequence[FlightSpec],
-    lots: Sequence[Lot],
+    lots: Sequence[FlightBatch],
     submit: Submit,
     *,
     progress: Progress | None,

@@ -41,7 +41,7 @@ def newest_update(bus: Bus, state: LearnerState, layer: str, after: int = 0) -> 
     return _newest(bus, state, layer, lambda version: version > after)
 
 
-def flown_update(bus: Bus, state: LearnerState, layer: str, status: dict[str, Any]) -> tuple[int, Update] | None:
+def active_update(bus: Bus, state: LearnerState, layer: str, status: dict[str, Any]) -> tuple[int, Update] | None:
     """Return the newest update of a layer in flight, with its version; None if it is not on the bus.
 
     Args:
@@ -61,7 +61,7 @@ def learnt_from(bus: Bus, state: LearnerState, status: dict[str, Any]) -> Learne
         state: Initial state of the learners.
         status: Last status of the control process.
     """
-    fit, policy = (flown_update(bus, state, layer, status) for layer in LAYERS)
+    fit, policy = (active_update(bus, state, layer, status) for layer in LAYERS)
     found = state
     if fit is not None and isinstance(fit[1], ResidualUpdate):
         found = LearnerState(found.policy, fit[1].state)

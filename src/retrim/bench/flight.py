@@ -6,7 +6,7 @@ from ..adapt.learner import OnlineLearner
 from ..adapt.learner_state import LearnerState
 from ..config.loading import load
 from ..config.setup import Setup
-from ..evaluation.effort import full_window
+from ..evaluation.compute_cost import full_window
 from ..learn.window import Window
 
 

@@ -19,7 +19,7 @@ IN_TIME = 0.7  # [s] in which a reference must be taken, before it departs from 
 REMEMBERED = 50  # swaps in a report, which is published ten times a second
 
 
-class Intake:
+class ParameterReceiver:
     """New parameters of the active controller."""
 
     def __init__(self, pilot: LivePilot, bus: Bus, base: str, dt: float) -> None:

@@ -15,7 +15,7 @@ from .actuator_response import ActuatorState
 from .state import STANDARD_GRAVITY, Command, State
 
 
-class FeltFrame(eqx.Module):
+class EffectiveGravityFrame(eqx.Module):
     """A frame in which g + d is standard gravity, straight down."""
 
     Q: Float[Array, "3 3"]
@@ -26,7 +26,7 @@ class FeltFrame(eqx.Module):
     """Disturbance that is part of the gravity of the frame, world [m/s^2]."""
 
     @classmethod
-    def of(cls, d: Float[Array, "3"]) -> "FeltFrame":
+    def of(cls, d: Float[Array, "3"]) -> "EffectiveGravityFrame":
         """Return the frame of g + ``d``, world [m/s^2].
 
         The frame is defined for every ``d`` whose vertical part is smaller than gravity, but not for a weightless

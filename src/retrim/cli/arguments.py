@@ -15,7 +15,7 @@ from ..config.tasks import find_task
 from ..control.policy import AbstractPolicy
 from ..errors import ConfigError
 from ..io.checkpoint import load_delta
-from ..io.trained import load_learnt, load_policy
+from ..io.trained import load_learner_state, load_policy
 
 
 def loaded(
@@ -38,7 +38,7 @@ def loaded(
     if resume is not None:
         if delta is not None:
             raise ConfigError("--delta goes with --policy; --resume holds its own")
-        state, preset = load_learnt(resume, trust=trust)
+        state, preset = load_learner_state(resume, trust=trust)
         return state.policy.policy.merged(), preset, state
     assert policy is not None
     weights, preset = load_policy(policy, trust=trust)
@@ -46,7 +46,7 @@ def loaded(
 
 
 @dataclasses.dataclass(frozen=True)
-class Where:
+class FlightArguments:
     """Conditions of a flight, as the options of a command."""
 
     disturbance: str | None = None
@@ -91,7 +91,7 @@ class Where:
             PlantError: A requirement of the plant is not installed.
         """
         usual = "none" if self.is_vehicle else "large"
-        follows = flown_reference(preset, self.reference)
+        follows = reference_of_flight(preset, self.reference)
         scenario = Scenario(self.disturbance or usual, self.plant, self.vehicle, self.sensors, self.thrust_error,
                             follows, self.delay, self.fault)  # fmt: skip
         if scenario.entry.needs is not None:
@@ -112,7 +112,7 @@ def with_residual(preset: Preset, residual: str | None, state: LearnerState | No
     return changed(preset, adapt={"residual": residual})
 
 
-def flown_reference(preset: Preset, name: str | None) -> str | None:
+def reference_of_flight(preset: Preset, name: str | None) -> str | None:
     """Return the reference of a tracking flight; None for another task.
 
     Args:
@@ -161,7 +161,7 @@ def _without_excitation(value: Any) -> Any:
     return dataclasses.replace(value, excitation=False) if isinstance(value, Family) else value
 
 
-def asked_preset(
+def training_preset(
     task: str,
     preset: str | None = None,
     *,

@@ -26,7 +26,7 @@ class SeenPoseState(eqx.Module):
     last: Command
 
 
-class SeenPose(AbstractController[SeenPoseState]):
+class PoseFilteredController(AbstractController[SeenPoseState]):
     """A controller that receives position, attitude and velocity from the pose filter of the keypoints."""
 
     observation: OccludedKeypoints
@@ -36,11 +36,11 @@ class SeenPose(AbstractController[SeenPoseState]):
     a: Float[Array, "3"] | None = None
     """Acceleration, the mean over the last tick, world [m/s^2]; None if it is not measured."""
 
-    def with_age(self, age: float | Float[Array, ""]) -> "SeenPose":
+    def with_age(self, age: float | Float[Array, ""]) -> "PoseFilteredController":
         """Return the same for frames that are ``age`` old [s]."""
         return dataclasses.replace(self, inner=self.inner.with_age(age))
 
-    def with_inertial(self, omega: Float[Array, "3"], a: Float[Array, "3"]) -> "SeenPose":
+    def with_inertial(self, omega: Float[Array, "3"], a: Float[Array, "3"]) -> "PoseFilteredController":
         """Return the same for a tick in which body rates and acceleration were measured."""
         return dataclasses.replace(self, omega=omega, a=a)
 

@@ -15,7 +15,7 @@ ENOUGH = 0.5  # share of a buffer or a horizon that must be valid
 
 
 @dataclass(frozen=True)
-class Foretold:
+class PredictionScore:
     """Prediction errors of one predictor on one log."""
 
     name: str
@@ -60,9 +60,9 @@ class Protocol:
         return found
 
 
-def foretell(
+def predict_log(
     rows: Targets, dt: float, predictors: Mapping[str, Callable[[], Predictor]], protocol: Protocol
-) -> Iterator[Foretold]:
+) -> Iterator[PredictionScore]:
     """Fit and predict window by window, for each predictor in turn.
 
     Args:
@@ -86,7 +86,7 @@ def foretell(
         x, y, z = np.sqrt(mean)
         per_window = tuple(float(np.sqrt(square.sum())) for square in squares)
         times = tuple(round(now * dt, 6) for _, now, _ in windows)
-        yield Foretold(name, float(np.sqrt(mean.sum())), (float(x), float(y), float(z)), per_window, times)
+        yield PredictionScore(name, float(np.sqrt(mean.sum())), (float(x), float(y), float(z)), per_window, times)
 
 
 def _part(rows: Targets, first: int, last: int) -> Targets:

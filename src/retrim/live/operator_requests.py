@@ -8,12 +8,12 @@ from typing import Any
 
 from ..config.methods import learning_methods
 from ..errors import MessageError, RetrimError
-from ..io.trained import load_learnt, save_learnt
+from ..io.trained import load_learner_state, save_learner_state
 from ..onboard.messages import unpack_note
 from ..onboard.note_fields import shown
 from ..runtime.events import Event
-from .following import Following
-from .knobs import Knobs
+from .manual_disturbance import ManualDisturbance
+from .reference_switcher import ReferenceSwitcher
 from .report import learnt_in
 from .session import LiveRequest, learner_state
 from .status import Status
@@ -22,7 +22,7 @@ from .supervisor import Supervisor
 SETTLED_S = 0.5  # [s] without a further change until a change of the knobs becomes an event
 
 
-class Wishes:
+class OperatorRequests:
     """Reads and executes the requests of the user in one flight. Long operations run in a separate thread."""
 
     def __init__(self, request: LiveRequest, supervisor: Supervisor) -> None:
@@ -31,9 +31,9 @@ class Wishes:
         self._wish: dict[str, Any] = {"method": request.method, "paused": False}
         self._method, self._starts = request.method, 0
         self._versions = {"wish": 0, "knobs": 0}
-        self._turned: tuple[float, Knobs] | None = None
+        self._turned: tuple[float, ManualDisturbance] | None = None
         self._work = ThreadPoolExecutor(1)
-        self.following = Following(request, supervisor, self._work)
+        self.following = ReferenceSwitcher(request, supervisor, self._work)
         self._coming: tuple[str, Future[Path]] | None = None
 
     def obey(self, status: Status) -> list[Event]:
@@ -72,11 +72,13 @@ class Wishes:
     def _start_of(self, method: str, status: Status) -> Path:
         """Write the policy and residual in flight in the form in which ``method`` learns; return the path."""
         start, trust = self._supervisor.start, self._supervisor.spec.trust
-        state = learnt_in(self._supervisor.bus, status, start, trust) or load_learnt(start, trust=trust)[0]
+        state = learnt_in(self._supervisor.bus, status, start, trust) or load_learner_state(start, trust=trust)[0]
         self._starts += 1
         path = self._supervisor.start.parent / f"start-{self._starts}.safetensors"
         merged = state.policy.policy.merged()
-        save_learnt(path, learner_state(self._request, merged, method, state.residual), self._request.setup.preset)
+        save_learner_state(
+            path, learner_state(self._request, merged, method, state.residual), self._request.setup.preset
+        )
         return path
 
     def _arrived(self, t: float) -> list[Event]:
@@ -92,7 +94,7 @@ class Wishes:
     def _knobs(self, t: float) -> list[Event]:
         if (turned := self._new("knobs")) is not None:
             with contextlib.suppress(MessageError):
-                self._turned = time.monotonic(), Knobs.unpack(turned)
+                self._turned = time.monotonic(), ManualDisturbance.unpack(turned)
         if self._turned is None or time.monotonic() - self._turned[0] < SETTLED_S:
             return []
         knobs, self._turned = self._turned[1], None

@@ -14,7 +14,7 @@ LOT, LARGE = 64, 2048  # largest number of flights of one program: on a CPU, on 
 SMALL = 2  # Python steps a single flight, and uses only one core for it
 
 
-class Lot(NamedTuple):
+class FlightBatch(NamedTuple):
     """A batch of flights."""
 
     specs: list[FlightSpec]
@@ -24,7 +24,9 @@ class Lot(NamedTuple):
     """Whether it is the first batch of its program."""
 
 
-def in_lots(groups: Iterable[list[FlightSpec]], program: Callable[[list[FlightSpec]], Hashable | None]) -> list[Lot]:
+def in_batches(
+    groups: Iterable[list[FlightSpec]], program: Callable[[list[FlightSpec]], Hashable | None]
+) -> list[FlightBatch]:
     """Divide flights into batches; flights that cannot share a program run individually.
 
     The first batch of each program comes first, so that different programs compile at the same time.
@@ -33,16 +35,16 @@ def in_lots(groups: Iterable[list[FlightSpec]], program: Callable[[list[FlightSp
         groups: Flights that differ in numbers of the vehicle, start and seed only.
         program: Returns a key that identifies the program of a group; None if its flights run one by one.
     """
-    first, others = dict[Hashable, Lot](), list[Lot]()
+    first, others = dict[Hashable, FlightBatch](), list[FlightBatch]()
     for group in groups:
         of_group = program(group)
         for part in _parts(group, 1 if of_group is None else min(largest(), max(SMALL, -(-len(group) // lanes())))):
             if len(part) == 1:
-                others.append(Lot(part, None))
+                others.append(FlightBatch(part, None))
             elif (of_group, len(part)) in first:
-                others.append(Lot(part, first[of_group, len(part)].compiled))
+                others.append(FlightBatch(part, first[of_group, len(part)].compiled))
             else:
-                first[of_group, len(part)] = Lot(part, threading.Event(), compiles=True)
+                first[of_group, len(part)] = FlightBatch(part, threading.Event(), compiles=True)
     return [*first.values(), *others]
 
 

@@ -20,7 +20,7 @@ LOCAL = re.compile(r"\.(csv|toml)(:|\+|$)", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
-class Mission:
+class LearnerMission:
     """Description of one flight for its learners."""
 
     number: int
@@ -39,7 +39,7 @@ class Mission:
 
     @classmethod
     def of(cls, number: int, reference: str | None, seed: int, base: str, layers: tuple[Layer, ...],
-           floor: int, capacities: Mapping[str, int], start: Path) -> "Mission":  # fmt: skip
+           floor: int, capacities: Mapping[str, int], start: Path) -> "LearnerMission":  # fmt: skip
         """Return the mission of a flight whose learners start from a file."""
         carried = {topic: size for topic, size in capacities.items() if topic in (*OUT, *INTO)}
         return cls(number, reference, seed, base, layers, floor, carried, start.read_bytes())
@@ -68,7 +68,7 @@ class Mission:
         return pack_arrays({"start": np.frombuffer(self.start, dtype=np.uint8)}, kind="mission", about=about)
 
     @classmethod
-    def unpack(cls, data: bytes) -> "Mission":
+    def unpack(cls, data: bytes) -> "LearnerMission":
         """Read a mission.
 
         Raises:

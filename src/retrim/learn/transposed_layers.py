@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Key
 Tree = TypeVar("Tree")
 
 
-class BothLayouts(eqx.nn.Linear):
+class TransposedLinear(eqx.nn.Linear):
     """A linear layer that also holds its transposed weight; its gradients are those of the layer."""
 
     transposed: Float[Array, "*members fan_in fan_out"]
@@ -32,7 +32,7 @@ class BothLayouts(eqx.nn.Linear):
         return y if self.bias is None else y + self.bias
 
 
-def both_layouts(tree: Tree) -> Tree:
+def with_transposed_copy(tree: Tree) -> Tree:
     """Return the same tree (policy, model or environment) with every linear layer in both layouts.
 
     A subclass of a linear layer may compute something else, so it stays unchanged.
@@ -41,7 +41,7 @@ def both_layouts(tree: Tree) -> Tree:
     def is_layer(leaf: object) -> TypeGuard[eqx.nn.Linear]:
         return type(leaf) is eqx.nn.Linear and "scalar" not in (leaf.in_features, leaf.out_features)
 
-    laid: Tree = jax.tree.map(lambda leaf: BothLayouts(leaf) if is_layer(leaf) else leaf, tree, is_leaf=is_layer)
+    laid: Tree = jax.tree.map(lambda leaf: TransposedLinear(leaf) if is_layer(leaf) else leaf, tree, is_leaf=is_layer)
     return laid
 
 
