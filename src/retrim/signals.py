@@ -14,10 +14,10 @@ Handler = Callable[[int, FrameType | None], None]
 
 def ending_signals() -> list[signal.Signals]:
     """Return the signals that end a command; SIGHUP is excluded if ``nohup`` made the process ignore it."""
-    found = [signal.SIGINT, signal.SIGTERM]
+    result = [signal.SIGINT, signal.SIGTERM]
     if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
-        found.append(signal.SIGHUP)
-    return found
+        result.append(signal.SIGHUP)
+    return result
 
 
 @contextlib.contextmanager

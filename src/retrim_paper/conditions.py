@@ -22,15 +22,15 @@ def conditions(preset: Preset, sensors: str = "ideal") -> dict[str, Scenario]:
         sensors: Sensor model of every condition. If it is not ``ideal``, conditions that name their own sensors or use
             a plant without sensors are omitted.
     """
-    found = _at_hover() if preset.track is None else _on_references(preset, preset.track.reference.split("+"))
+    result = _at_hover() if preset.track is None else _on_references(preset, preset.track.reference.split("+"))
     if sensors == "ideal":
-        return found
-    measured = {name: flown for name, flown in found.items() if flown.sensors == "ideal" and flown.entry.has_sensors}
+        return result
+    measured = {name: flown for name, flown in result.items() if flown.sensors == "ideal" and flown.entry.has_sensors}
     return {name: replace(flown, sensors=sensors) for name, flown in measured.items()}
 
 
 def _on_references(preset: Preset, references: Sequence[str]) -> dict[str, Scenario]:
-    found = {
+    result = {
         f"{reference}/{name}": Scenario(disturbance, sensors=sensors, reference=reference)
         for reference in references
         for name, (disturbance, sensors) in FLOWN.items()
@@ -38,14 +38,14 @@ def _on_references(preset: Preset, references: Sequence[str]) -> dict[str, Scena
     first, own = references[0], make_vehicle(preset.vehicle)
     others = {"slow-motors": _like(own, "slow-motors", motor_tau=2.0)}
     others |= {f"random-{n}": _random_vehicle(own, n) for n in range(3)}
-    found |= {f"{first}/{name}": Scenario(vehicle=vehicle, reference=first) for name, vehicle in others.items()}
-    found |= {
+    result |= {f"{first}/{name}": Scenario(vehicle=vehicle, reference=first) for name, vehicle in others.items()}
+    result |= {
         f"{first}/thrust+20": Scenario(thrust_error=0.2, reference=first),
         f"{first}/thrust-20": Scenario(thrust_error=-0.2, reference=first),
         f"{first}/delay-40ms": Scenario(delay=0.04, reference=first),
         f"{first}/simple": Scenario("wind", plant="simple", reference=first),
     }
-    return found
+    return result
 
 
 FLOWN = {

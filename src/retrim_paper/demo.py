@@ -82,17 +82,17 @@ def demonstrate(
     reporter.say(f"hover error in its own model: {1000 * study.errors[0]:.1f} mm")
     scenarios = [replace(scenario, disturbance=level) for level in LEVELS]
     flights = fly_all(study, scenarios, run, reporter, starts=starts, seconds=seconds, keep=False).flown
-    found: list[dict[str, Any]] = list(rows(flights))
+    result: list[dict[str, Any]] = list(rows(flights))
     second = None
     if slow and not run.interrupted:
         family = changed(load_for("hover", "hover/any"), pretrain={"num_updates": UPDATES})
         second = fly_slow_vehicle(study, family, run, reporter, starts=min(starts, MOST), seed=seed)
-    found += [] if second is None else second.rows
+    result += [] if second is None else second.rows
     with interrupts_only_set(run.stop):
-        run.write_results(found, seeds=[seed], preset=preset.name, losses=losses)
+        run.write_results(result, seeds=[seed], preset=preset.name, losses=losses)
         write_events(flights, run.folder)
     title = f"hover error [m]: mean ± std over {starts} starts, last 2 s of {seconds:g} s; in brackets the paper's"
-    table = level_table(found, SHOWN, {method: PAPER[method] for method in SHOWN}, title)
+    table = level_table(result, SHOWN, {method: PAPER[method] for method in SHOWN}, title)
     drawn = [path for each in scenarios for path in picture(flights, setup, each, run.folder)]
     tables = [table] if second is None else [table, second.table]
     drawn += [] if second is None else second.pictures

@@ -106,12 +106,12 @@ def fly_slow_vehicle(
     title = f"One quadrotor with a rate loop of 100 ms, a push of 2 m/s² per axis at 4 s, {starts} starts"
     shown = [flight for each, own in zip(entrants, flights, strict=True) if each.vehicle != "known" for flight in own]
     drawn = picture(shown, setup, scenario, run.folder, stem="slow_vehicle", title=FIGURE, labels=LABELS)
-    found = [
+    result = [
         row | {"preset": each.study.preset.name, "vehicle_known": each.vehicle}
         for each, own in zip(entrants, flights, strict=True)
         for row in rows(own)
     ]
-    return SlowVehicle(TableSection(columns, tuple(lines), title), found, drawn)
+    return SlowVehicle(TableSection(columns, tuple(lines), title), result, drawn)
 
 
 def _fly(each: Entrant, scenario: Scenario, run: Run, reporter: Reporter, starts: int) -> list[Flight]:

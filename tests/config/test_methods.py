@@ -54,7 +54,7 @@ def test_a_controller_flies_by_the_pose_that_the_filter_sees(seeing, key):
     assert type(plain.controller) is not PoseFilteredController
     own = HoverController()
     assert MethodRequest(Setup.from_preset(brief_preset()), None).by_state(own) is own
-    with pytest.raises(ConfigError, match="method 'Passive' needs the state"):
+    with pytest.raises(ConfigError, match="method 'HoverController' needs the state"):
         MethodRequest(seeing["ideal"], None).by_state(own)
 
 

@@ -125,7 +125,7 @@ def test_it_does_not_care_where_it_is_or_where_north_is(kind, key):
 
     def decided(x, goal, heading):
         controller = made(kind, dataclasses.replace(here, goal=goal))
-        point = controller.task.wanted(jnp.array(0.0))._replace(heading=jnp.array(heading))
+        point = controller.task.setpoint(jnp.array(0.0))._replace(heading=jnp.array(heading))
         thrust = thrust_of(controller.gains.acceleration(x, point, jnp.zeros(3)))
         return command_for(x, thrust, point, controller.gains.turning()).vector()
 

@@ -192,7 +192,7 @@ def test_a_constant_push_leaves_nothing_to_learn(d, key):
 def test_the_world_is_seen_as_it_is():
     env, residual = hover_env(), lambda x, u: x.v
     seen = WorldView()(env, residual)
-    assert seen.felt is None
+    assert seen.frame_disturbance is None
     assert seen.dynamics.residual is residual
 
 

@@ -58,7 +58,7 @@ def test_a_plan_costs_what_it_does(key):
     """Of a plan that stays where the vehicle should be: nothing; and a metre away: its distance, for the horizon."""
     controller = mppi(samples=3)
     hover = jnp.tile(Command.hover(float).vector()[None, :, None], (30, 1, 3))
-    wanted = jax.vmap(controller.task.wanted)(DT * jnp.arange(30.0))
+    wanted = jax.vmap(controller.task.setpoint)(DT * jnp.arange(30.0))
     for away in (0.0, 1.0):
         x = State.at(jnp.array(GOAL) + jnp.array([away, 0.0, 0.0]))
         cost = controller._costs(hover, x, Command.hover(float), wanted, jnp.zeros(3))
@@ -68,7 +68,7 @@ def test_a_plan_costs_what_it_does(key):
 def test_more_samples_plan_better(key):
     """Mean over seeds of the cost of the mean that is planned, from a start that is off and tilted."""
     x = State(jnp.array([0.4, -0.3, 1.2]), so3.exp(jnp.array([0.2, -0.1, 0.3])), jnp.array([0.5, 0.0, -0.2]))
-    wanted = jax.vmap(hover_task().wanted)(DT * jnp.arange(30.0))
+    wanted = jax.vmap(hover_task().setpoint)(DT * jnp.arange(30.0))
 
     def planned(samples):
         def cost(key):

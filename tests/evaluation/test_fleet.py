@@ -147,11 +147,11 @@ def test_lots_fly_the_same_to_rounding_and_land_once(fleet, flights, monkeypatch
     assert [len(lot.specs) for lot in fleet.lots(fleet.specs)] == [2, 2, 2, 2]
     assert [len(lot.specs) for lot in fleet.lots(fleet.specs[:3])] == [2, 1]
     assert [lot.compiles for lot in fleet.lots(fleet.specs)] == [True] * 4  # other disturbances: other programs
-    landed, told = [], []
-    together = fleet.run(only=two_lots(fleet), landed=landed.append, progress=lambda done, n: told.append(done))
+    on_result, told = [], []
+    together = fleet.run(only=two_lots(fleet), on_result=on_result.append, progress=lambda done, n: told.append(done))
     alone = {flight.spec: flight for flight in flights.flown}
     assert [flight.spec for flight in together.flown] == two_lots(fleet)
-    assert sorted(len(lot) for lot in landed) == [2, 2]
+    assert sorted(len(lot) for lot in on_result) == [2, 2]
     assert told == sorted(told)
     assert told[-1] == 4
     for flight in together.flown:
@@ -164,11 +164,11 @@ def test_lots_fly_the_same_to_rounding_and_land_once(fleet, flights, monkeypatch
 def test_flights_that_are_forgotten_have_landed(fleet, flights, monkeypatch):
     monkeypatch.setattr(lots, "LOT", 2)
     monkeypatch.setattr(lots, "lanes", lambda: 1)
-    landed = []
-    gone = fleet.run(only=two_lots(fleet), landed=landed.extend, forget=True)
+    on_result = []
+    gone = fleet.run(only=two_lots(fleet), on_result=on_result.extend, forget=True)
     assert gone.flown == []
     assert not gone.interrupted
-    assert {flight.spec for flight in landed} == set(two_lots(fleet))
+    assert {flight.spec for flight in on_result} == set(two_lots(fleet))
 
 
 def test_a_lot_ends_each_flight_where_it_is_terminated(fleet):

@@ -211,9 +211,9 @@ def test_what_failed_elsewhere_is_kept_and_flown_again(tmp_path, monkeypatch):
     reporter.say = said.append
     asked = []
 
-    def flies(executor, *, stop, only, landed, progress, by_lot, forget):
+    def flies(executor, *, stop, only, on_result, progress, by_lot, forget):
         asked.append((executor, list(only), by_lot, forget))
-        landed([flight(0.1, spec=spec) for spec in only[:1]])
+        on_result([flight(0.1, spec=spec) for spec in only[:1]])
         return Flights([], interrupted=False, failed=dict.fromkeys(only[1:], "OSError: gone"))
 
     monkeypatch.setattr(fleet, "run", flies)

@@ -66,7 +66,7 @@ def test_the_error_in_the_own_model_is_that_of_the_last_half_second_of_six(setup
 
 
 def test_seeds_are_trained_elsewhere_at_once_and_come_back_in_order(setup, monkeypatch):
-    asked, landed, gate = [], [], threading.Barrier(2)
+    asked, on_result, gate = [], [], threading.Barrier(2)
 
     def job(preset, seed):
         asked.append((preset, seed))
@@ -78,17 +78,17 @@ def test_seeds_are_trained_elsewhere_at_once_and_come_back_in_order(setup, monke
     with ThreadPoolExecutor(2) as pool:
         found = training.trained_elsewhere(
             setup.preset, (5, 2), pool, reporter=reporter, stop=threading.Event(),
-            landed=lambda seed, policy: landed.append((seed, policy)),
+            on_result=lambda seed, policy: on_result.append((seed, policy)),
         )  # fmt: skip
     assert {preset for preset, _ in asked} == {training.dump(setup.preset)}
     assert list(found) == [5, 2]
-    assert sorted(seed for seed, _ in landed) == [2, 5]
-    assert all(policy is found[seed] for seed, policy in landed)
+    assert sorted(seed for seed, _ in on_result) == [2, 5]
+    assert all(policy is found[seed] for seed, policy in on_result)
     assert reporter.told[-1][1:] == (1.0, "2 of 2 seeds")
 
 
 def test_a_training_that_fails_elsewhere_is_told_once_the_others_have_come(setup, monkeypatch):
-    landed, stop = [], threading.Event()
+    on_result, stop = [], threading.Event()
 
     def job(preset, seed):
         if seed == 1:
@@ -100,9 +100,14 @@ def test_a_training_that_fails_elsewhere_is_told_once_the_others_have_come(setup
         JobError, match=f"1 of 3 trainings of {setup.preset.name} failed: seed 1: disk is full"
     ):  # fmt: skip
         training.trained_elsewhere(
-            setup.preset, (1, 0, 3), pool, reporter=Silent(), stop=stop, landed=lambda seed, _: landed.append(seed)
+            setup.preset,
+            (1, 0, 3),
+            pool,
+            reporter=Silent(),
+            stop=stop,
+            on_result=lambda seed, _: on_result.append(seed),
         )
-    assert sorted(landed) == [0, 3]
+    assert sorted(on_result) == [0, 3]
     stop.set()
     with ThreadPoolExecutor(1) as pool:
         assert training.trained_elsewhere(setup.preset, (0,), pool, reporter=Silent(), stop=stop) == {}

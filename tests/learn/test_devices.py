@@ -9,7 +9,7 @@ import jax
 import numpy as np
 import pytest
 
-from retrim.learn.devices import LEAST_WORK, shared_by, spread, suited
+from retrim.learn.devices import LEAST_WORK, num_shards, shard, suitable_device
 
 HERE = Path(__file__).parent
 WORK = """
@@ -111,12 +111,12 @@ def test_a_shared_base_is_that_of_one_device(found):
     ("n", "devices", "count"), [(24, 8, 8), (10, 8, 5), (7, 8, 7), (11, 8, 1), (64, 3, 2), (5, 1, 1)]
 )
 def test_as_many_devices_share_work_as_divide_it(n, devices, count):
-    assert shared_by(n, devices) == count
+    assert num_shards(n, devices) == count
 
 
 def test_with_one_device_nothing_is_moved():
     tree = {"x": np.ones((4, 2)), "name": "kept"}
-    assert spread(tree) is tree
+    assert shard(tree) is tree
     assert jax.device_count() == 1
 
 
@@ -126,8 +126,8 @@ def test_small_trainings_stay_on_the_cpu(monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     monkeypatch.setattr(jax, "device_count", lambda: 1)
     for starts, device in ((10, jax.devices("cpu")[0]), (LEAST_WORK // 1000, None)):
-        with suited({"w": weights, "name": "a policy"}, starts):
+        with suitable_device({"w": weights, "name": "a policy"}, starts):
             assert jax.config.jax_default_device == device
     monkeypatch.setattr(jax, "device_count", lambda: 2)
-    with suited(weights, 10):
+    with suitable_device(weights, 10):
         assert jax.config.jax_default_device is None

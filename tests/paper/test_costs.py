@@ -32,11 +32,11 @@ def test_scaling_flies_as_many_as_were_asked_for_and_forgets_them(tmp_path, pres
             made.append((policies, tuple(scenarios), how))
             self._study, self._scenarios, self._how = Study(preset, policies, ()), scenarios, how
 
-        def run(self, *, stop, progress, landed, forget):
+        def run(self, *, stop, progress, on_result, forget):
             assert forget
             flown = done.fly(self._study, self._scenarios, None, None, **self._how).flown
             for k in range(0, len(flown), 2):
-                landed(flown[k : k + 2])
+                on_result(flown[k : k + 2])
                 progress(k + 2.0, len(flown))
 
     monkeypatch.setattr(scaling, "Fleet", Fleet)

@@ -44,7 +44,7 @@ def flown(net):
     """States after some seconds of hover, by the heading of the goal and what is commanded from outside."""
 
     def fly(x0, heading, outside):
-        here = hover_task().wanted(jnp.array(0.0))
+        here = hover_task().setpoint(jnp.array(0.0))
         model = RaptorQuadrotor(BemQuadrotor.of(kingfisher(), 0.02), net, lambda t: here._replace(heading=heading))
         calm = ExternalEffects.calm(x0.p.dtype)
 

@@ -61,7 +61,7 @@ def driven(seed, *, delay, lag, rate_lag, gain, drag, n=900, noise=1.0, size=1.0
 
 
 def _following(wanted, keep, y):
-    """What follows ``wanted`` and keeps that share of its distance to it in a step; ``y`` is where it begins."""
+    """What follows ``setpoint`` and keeps that share of its distance to it in a step; ``y`` is where it begins."""
     return lfilter([1 - keep], [1, -keep], wanted, zi=[keep * y])[0]
 
 

@@ -87,7 +87,7 @@ def test_uniform_motion_is_invisible(key):
 
 def test_derivatives_of_the_goal():
     task, t, h = moving(), jnp.array(2.0), 1e-4
-    here, after, before = (task.wanted(t + k * h) for k in (0, 1, -1))
+    here, after, before = (task.setpoint(t + k * h) for k in (0, 1, -1))
     np.testing.assert_allclose(here.v, (after.p - before.p) / (2 * h), atol=1e-7)
     np.testing.assert_allclose(here.a, (after.v - before.v) / (2 * h), atol=1e-7)
     np.testing.assert_allclose(here.jerk, (after.a - before.a) / (2 * h), atol=1e-7)

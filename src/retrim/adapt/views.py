@@ -45,7 +45,7 @@ class GravityView(AbstractView):
     def __call__(self, env: Env, residual: Residual) -> Env:
         """Add the residual to the model; the controller compensates it with the frame, and also a bias of the rates."""
         env = with_lag(env, turning_of(residual))
-        return dataclasses.replace(env.with_residual(residual), felt=NormLimited(residual, self.limit))
+        return dataclasses.replace(env.with_residual(residual), frame_disturbance=NormLimited(residual, self.limit))
 
 
 class RestView(AbstractView):
@@ -59,7 +59,7 @@ class RestView(AbstractView):
         home = env.task.home()
         d = capped(residual(State.at(home), Command.hover(home.dtype)), self.limit)
         env = as_it_turns(env, turning_of(residual))
-        return dataclasses.replace(env.with_residual(residual), felt=Same(d))
+        return dataclasses.replace(env.with_residual(residual), frame_disturbance=Same(d))
 
 
 def turning_of(residual: Residual) -> RateFit | None:

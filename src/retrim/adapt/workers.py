@@ -10,7 +10,7 @@ from jaxtyping import Array, Key
 from ..control.lora import LoraPolicy
 from ..control.policy import AbstractPolicy
 from ..learn.bptt import PolicyState
-from ..learn.devices import suited
+from ..learn.devices import suitable_device
 from ..learn.screening import describe_counts
 from ..learn.window import Window
 from .gate import Verdict
@@ -54,7 +54,7 @@ class ResidualWorker(Worker):
 
     def learn(self, window: Window) -> ResidualUpdate | Rejection:
         """Fit to ``window``."""
-        with suited(self._residual, 1):
+        with suitable_device(self._residual, 1):
             fitted, report = jax.block_until_ready(self.learner.fit_residual(self._residual, window))
         return residual_update(float(window.t[-1]), fitted, report)
 
@@ -93,7 +93,7 @@ class PolicyWorker(Worker):
     def learn(self, window: Window) -> PolicyUpdate | Rejection:
         """Re-train the policy; the window provides starts for the gate."""
         key = self.next_key()
-        with suited(self._policy.policy, self.learner.num_envs):
+        with suitable_device(self._policy.policy, self.learner.num_envs):
             updated = self.learner.update_policy(self._policy, self._residual, window, key)
             trained, verdict = jax.block_until_ready(updated)
         return policy_update(float(window.t[-1]), trained, verdict)

@@ -62,7 +62,9 @@ def bench(run: Run, reporter: Reporter, *, works: Sequence[str] = tuple(WORKS)) 
             if run.interrupted:
                 break
     document = Document(run, "bench", "Bench", INTRO, [0], reporter)
-    document.add(_machine(machine), [{"name": "machine", "cores": cores, **found} for cores, found in machine.items()])
+    document.add(
+        _machine(machine), [{"name": "machine", "cores": cores, **result} for cores, result in machine.items()]
+    )
     document.add(TableSection(COLUMNS, tuple(_cells(row) for row in rows), "Works"), rows)
     return not failed
 
@@ -112,8 +114,8 @@ def _process(name: str, cores: str, environment: dict[str, str]) -> dict[str, An
     )
     if ran.returncode:
         raise OSError(f"failed: {ran.stderr.strip().splitlines()[-1:]}")
-    found: dict[str, Any] = json.loads(ran.stdout.splitlines()[-1])
-    return found
+    result: dict[str, Any] = json.loads(ran.stdout.splitlines()[-1])
+    return result
 
 
 def _seconds(value: float | None) -> str:

@@ -48,13 +48,14 @@ def live_fleet(n: int) -> dict[str, Any]:
     ran = subprocess.run([*PYTHON, "retrim.bench.vehicles", str(n)], stdout=subprocess.PIPE, text=True, check=False)
     if ran.returncode != 0 or not ran.stdout:
         raise OSError(f"the {n} vehicles did not fly to the end")
-    found: dict[str, Any] = json.loads(ran.stdout.splitlines()[-1])
+    result: dict[str, Any] = json.loads(ran.stdout.splitlines()[-1])
     remarks = (
-        f"{found['updates_per_s']:.1f} updates a second, {found['policies_per_s']:.1f} of them better and flown, "
-        f"{found['swap_s']:.2f} s from flight to swap (median; worst "
-        f"{found['worst_swap_s']:.2f}), {found['steady_m']:.4f} m off, {found['late']} of {found['ticks']} ticks late"
+        f"{result['updates_per_s']:.1f} updates a second, {result['policies_per_s']:.1f} of them better and flown, "
+        f"{result['swap_s']:.2f} s from flight to swap (median; worst "
+        f"{result['worst_swap_s']:.2f}), {result['steady_m']:.4f} m off, "
+        f"{result['late']} of {result['ticks']} ticks late"
     )
-    return {"compile_s": found["warm_s"], "run_s": found["swap_s"], "units": None, "remarks": remarks}
+    return {"compile_s": result["warm_s"], "run_s": result["swap_s"], "units": None, "remarks": remarks}
 
 
 class Air:

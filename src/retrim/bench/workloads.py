@@ -171,11 +171,11 @@ def main() -> None:
         print(json.dumps(rates()))
         return
     work = WORKS[sys.argv[1]]
-    found = work.do()
+    result = work.do()
     peak = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     unit = 1024.0 if sys.platform != "darwin" else 1024.0**2
     known = {"goal": work.goal, "paper": work.paper}
-    print(json.dumps({"work": work.title, **known, "peak_mb": peak / unit, **found}))
+    print(json.dumps({"work": work.title, **known, "peak_mb": peak / unit, **result}))
 
 
 if __name__ == "__main__":

@@ -98,14 +98,14 @@ def _fly(fleet: Fleet, setup: Setup, scenario: Scenario, run: Run, vehicle_file:
     if not flights:
         console.print("interrupted before the first flight was over; nothing was saved")
         return INTERRUPTED
-    found, preset, outlet = rows(flights), setup.preset, Outlet(run.folder)
+    result, preset, outlet = rows(flights), setup.preset, Outlet(run.folder)
     with interrupts_only_set(run.stop):
         outlet.write_flights(flights, preset)
         drawn = outlet.write("the picture", lambda folder: picture(flights, setup, scenario, folder)) or []
-        results = outlet.write_results(run, found, seeds=list(fleet.policies), preset=preset.name)
-    n, steady = found[0]["n"], min(flights[0].steady_seconds, fleet.seconds)
+        results = outlet.write_results(run, result, seeds=list(fleet.policies), preset=preset.name)
+    n, steady = result[0]["n"], min(flights[0].steady_seconds, fleet.seconds)
     title = f"{preset.task} error [m], last {steady:g} s of {fleet.seconds:g} s, {n} start{'s' * (n > 1)}"
-    lines = tuple((row["disturbance"], row["method"], cell(row)) for row in found)
+    lines = tuple((row["disturbance"], row["method"], cell(row)) for row in result)
     show_table(TableSection(("disturbance", "method", "error"), lines, title))
     for note in notes(flights, preset):
         console.print(note, markup=False, soft_wrap=True)

@@ -31,9 +31,9 @@ def learn(
     def ordered(stop: threading.Event) -> int:
         for number in ending_signals()[1:]:
             signal.signal(number, lambda *_: stop.set())
-        found = flights_at(addresses, key)
+        result = flights_at(addresses, key)
         with RichReporter().progress(", ".join(addresses)) as advance:
-            last = learn_for(found, stop, lambda text: advance(0.5, text), trust)
+            last = learn_for(result, stop, lambda text: advance(0.5, text), trust)
         console.print(printable(last), markup=False, soft_wrap=True)
         return 0
 

@@ -29,10 +29,10 @@ GROUP = "retrim.commands"
 
 def commands() -> dict[str, tuple[str, str]]:
     """Return help and module of every command, by name."""
-    found = {name: (about, f"{PACKAGE}.{name}") for name, about in COMMANDS.items()}
+    result = {name: (about, f"{PACKAGE}.{name}") for name, about in COMMANDS.items()}
     for entry in entry_points(group=GROUP):
-        found |= entry.load()
-    return found
+        result |= entry.load()
+    return result
 
 
 def describe(known: Mapping[str, tuple[str, str]]) -> str:

@@ -79,11 +79,11 @@ class _Writer:
     def inline(self, closed: ClosedJaxpr, given: Sequence[Ref]) -> list[Ref]:
         """Write the lines of a trace; return its outputs."""
         jaxpr: Jaxpr = closed.jaxpr
-        found: dict[Var, Ref] = dict(zip(jaxpr.invars, given, strict=True))
-        found |= {var: self.constant(value) for var, value in zip(jaxpr.constvars, closed.consts, strict=True)}
+        result: dict[Var, Ref] = dict(zip(jaxpr.invars, given, strict=True))
+        result |= {var: self.constant(value) for var, value in zip(jaxpr.constvars, closed.consts, strict=True)}
 
         def read(atom: Any) -> Ref:
-            return found[atom] if isinstance(atom, Var) else self.constant(np.asarray(atom.val, atom.aval.dtype))
+            return result[atom] if isinstance(atom, Var) else self.constant(np.asarray(atom.val, atom.aval.dtype))
 
         for eqn in jaxpr.eqns:
             operands = [read(atom) for atom in eqn.invars]
@@ -99,7 +99,7 @@ class _Writer:
                 results = self._write(eqn, operands)
             else:
                 raise no_form(f"operation {name!r}")
-            found |= dict(zip(eqn.outvars, results, strict=True))
+            result |= dict(zip(eqn.outvars, results, strict=True))
         return [read(atom) for atom in jaxpr.outvars]
 
     def _write(self, eqn: Any, operands: list[Ref]) -> list[Ref]:

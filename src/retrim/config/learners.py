@@ -139,6 +139,6 @@ def effective_gravity_frame(
         (vehicle.command_min, vehicle.command_max),
         longest_delay=longest_delay(preset),
     )
-    found = None if known is None else known.turning
-    bias = jnp.zeros(3) if found is None else found.bias
+    result = None if known is None else known.turning
+    bias = jnp.zeros(3) if result is None else result.bias
     return GravityFrame(controller, observer, known, rate_bias=bias)

@@ -87,8 +87,8 @@ def with_vehicle(preset: Preset, vehicle: str | VehicleSpec) -> Preset:
     Raises:
         ConfigError: There is no such vehicle, or its file cannot be used.
     """
-    found = vehicle_from(vehicle)
-    return changed(preset, vehicle=dataclasses.asdict(found) if isinstance(found, VehicleSpec) else found)
+    result = vehicle_from(vehicle)
+    return changed(preset, vehicle=dataclasses.asdict(result) if isinstance(result, VehicleSpec) else result)
 
 
 def values(preset: Preset) -> dict[str, Any]:

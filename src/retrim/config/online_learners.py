@@ -40,8 +40,8 @@ class LearnerRequest:
             ConfigError: The preset names an unknown optimiser, or settings that its task does not permit.
         """
         make = OPTIMISERS.find(self.preset.adapt.optimiser)
-        found = learner_settings(self.preset, self.env, make)
-        return kind(**{"env": self.env, "residual_model": self.model, **found, **settings})
+        result = learner_settings(self.preset, self.env, make)
+        return kind(**{"env": self.env, "residual_model": self.model, **result, **settings})
 
 
 LEARNERS: Registry[Callable[[LearnerRequest], OnlineLearner]] = Registry("learner", example="module:name of a function")

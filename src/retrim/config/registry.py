@@ -56,8 +56,8 @@ class Registry(Mapping[str, T], Generic[T]):
             return self._imported(name)
         for entry in entry_points(group=f"retrim.{self._kind}s"):
             if entry.name == name:
-                found: T = entry.load()
-                return found
+                result: T = entry.load()
+                return result
         raise ConfigError(f"no {self._kind} {name!r}; {suggestion(name, self)}, or {self._example}")
 
     def _imported(self, name: str) -> T:
@@ -68,10 +68,10 @@ class Registry(Mapping[str, T], Generic[T]):
         if here not in sys.path:
             sys.path.append(here)
         try:
-            found: T = getattr(importlib.import_module(module), attribute)
+            result: T = getattr(importlib.import_module(module), attribute)
         except Exception as error:  # the module of a user can raise any exception
             raise ConfigError(f"{self._kind} {name!r} cannot be imported: {type(error).__name__}: {error}") from error
-        return found
+        return result
 
     def __getitem__(self, name: str) -> T:
         """Return the object that is registered under ``name``."""

@@ -36,8 +36,8 @@ def make_residual(request: ResidualRequest) -> ResidualModel:
         ConfigError: The name does not exist, or the object is not a residual model.
     """
     name = request.preset.adapt.residual
-    found = RESIDUALS.find(name)
-    model = found if isinstance(found, ResidualModel) and not isinstance(found, type) else found(request)
+    result = RESIDUALS.find(name)
+    model = result if isinstance(result, ResidualModel) and not isinstance(result, type) else result(request)
     if not isinstance(model, ResidualModel):
         raise ConfigError(f"residual {name!r} gives a {type(model).__name__} without init, fit and predict")
     return model

@@ -65,7 +65,7 @@ def suggestion(name: str, known: Iterable[str]) -> str:
 
 def _explained(kind: type[Any], error: ValidationError) -> str:
     """Return the first mistakes, each with its path and, for an unknown key, the valid keys."""
-    found, mistakes = dict[str, str](), error.errors(include_url=False, include_context=False, include_input=False)
+    result, mistakes = dict[str, str](), error.errors(include_url=False, include_context=False, include_input=False)
     for each in mistakes[:CHECKED]:
         path = [excerpt(str(part), quotes=False) for part in each["loc"] if not str(part).startswith("function-")]
         where = ".".join(path)
@@ -74,11 +74,11 @@ def _explained(kind: type[Any], error: ValidationError) -> str:
             message = f"{UNKNOWN}; {suggestion(path[-1], _keys(kind, path[:-1]))}"
         elif each["type"] in ("missing", "missing_argument"):
             message = "is missing"
-        if found.get(where) in (None, NO_NAME):  # a table or a name is valid here: prefer the mistake in the table
-            found[where] = message
-    ordered = sorted(found.items(), key=lambda each: not each[1].startswith(UNKNOWN))  # typos explain missing keys
+        if result.get(where) in (None, NO_NAME):  # a table or a name is valid here: prefer the mistake in the table
+            result[where] = message
+    ordered = sorted(result.items(), key=lambda each: not each[1].startswith(UNKNOWN))  # typos explain missing keys
     told = [f"{where}: {message}" if where else message for where, message in ordered][:TOLD]
-    more = len(found) - len(told) + max(len(mistakes) - CHECKED, 0)
+    more = len(result) - len(told) + max(len(mistakes) - CHECKED, 0)
     return "; ".join(told) + (f"; and {more} more" if more else "")
 
 

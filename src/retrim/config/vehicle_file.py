@@ -180,11 +180,11 @@ def check_flyable(vehicle: Vehicle) -> None:
     Raises:
         ValueError: A step response of the rates overshoots too much or rises too slowly; the message has its values.
     """
-    for axis, found, slowest in zip(("roll", "pitch", "yaw"), step_responses(vehicle), SLOWEST, strict=True):
-        if found.overshoot > OVERSHOOT or found.rise > slowest:
+    for axis, result, slowest in zip(("roll", "pitch", "yaw"), step_responses(vehicle), SLOWEST, strict=True):
+        if result.overshoot > OVERSHOOT or result.rise > slowest:
             raise ValueError(
-                f"the {axis} rate cannot be controlled: a step of 1 rad/s overshoots by {found.overshoot:.0%} "
-                f"and reaches 63 % after {found.rise:.2g} s, and {OVERSHOOT:.0%} and {slowest:g} s can be flown; the "
+                f"the {axis} rate cannot be controlled: a step of 1 rad/s overshoots by {result.overshoot:.0%} "
+                f"and reaches 63 % after {result.rise:.2g} s, and {OVERSHOOT:.0%} and {slowest:g} s can be flown; the "
                 f"motors are too slow (motor_tau = {float(vehicle.motor_tau):g} s), or the thrust too small for arm "
                 f"and inertia"
             )

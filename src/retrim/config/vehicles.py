@@ -46,9 +46,9 @@ def make_vehicle(vehicle: str | VehicleSpec | Vehicle) -> Vehicle:
     if isinstance(vehicle, Vehicle):
         return vehicle
     try:
-        found = vehicle_from(vehicle)
-        made = found.build() if isinstance(found, VehicleSpec) else VEHICLES.find(found)()
-        if isinstance(made, Vehicle) and not is_published(found):
+        result = vehicle_from(vehicle)
+        made = result.build() if isinstance(result, VehicleSpec) else VEHICLES.find(result)()
+        if isinstance(made, Vehicle) and not is_published(result):
             check_flyable(made)
     except (ValueError, TypeError) as error:
         raise (

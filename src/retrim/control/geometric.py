@@ -76,7 +76,7 @@ class GeometricController(AbstractController[GeometricState]):
         """Compute the command for the state in which it begins to act."""
         gain, dt = self.gains.integral, self.prediction.dt
         x, _ = self.prediction(memory.underway, x, gain * -memory.integral)
-        wanted = self.task.wanted(t + self.prediction.path.delay.astype(t.dtype))
+        wanted = self.task.setpoint(t + self.prediction.path.delay.astype(t.dtype))
         bound = self.limit / jnp.maximum(gain, 1e-6)
         integral = jnp.clip(memory.integral + dt * (wanted.p - x.p), -bound, bound)
         acceleration = self.gains.acceleration(x, wanted, integral)

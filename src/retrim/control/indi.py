@@ -76,7 +76,7 @@ class IndiController(AbstractController[IncrementalState]):
         share = jnp.where(follows(t, memory.t, dt), 1.0 - jnp.exp(-dt / self.tau.astype(a.dtype)), 0.0)
         excess = memory.excess + share * (thrust - thrust_of(a) - memory.excess)
         soon, _ = self.prediction(memory.underway, x, -excess, self.omega)
-        wanted = self.task.wanted(t + self.prediction.path.delay.astype(t.dtype))
+        wanted = self.task.setpoint(t + self.prediction.path.delay.astype(t.dtype))
         acceleration = self.gains.acceleration(soon, wanted, jnp.zeros_like(x.p))
         asked = command_for(soon, thrust_of(acceleration) + excess, wanted, self.gains.turning())
         u = asked.within(self.low, self.high)

@@ -86,7 +86,7 @@ class MppiController(AbstractController[MppiState]):
         dt = self.prediction.dt
         begin = t.astype(dtype) + self.prediction.path.delay.astype(dtype)
         times = begin + dt * (1 + jnp.arange(self.horizon, dtype=dtype))
-        wanted = jax.vmap(self.task.wanted)(times)
+        wanted = jax.vmap(self.task.setpoint)(times)
         low, high = self.low.vector().astype(dtype), self.high.vector().astype(dtype)
         drawn = random.normal(random.fold_in(self.key, memory.tick), (self.horizon, 4, self.samples), dtype)
         noise = jnp.tensordot(self._colour(dtype), drawn, 1)

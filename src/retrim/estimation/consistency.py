@@ -46,8 +46,8 @@ class Findings(eqx.Module):
     @property
     def any(self) -> Bool[Array, "..."]:
         """Whether there is a contradiction."""
-        found: Bool[Array, ...] = jnp.any(jnp.stack(jax.tree.leaves(self)), axis=0)
-        return found
+        result: Bool[Array, ...] = jnp.any(jnp.stack(jax.tree.leaves(self)), axis=0)
+        return result
 
 
 def gap(before: State, after: State, dt: float) -> Float[Array, "3"]:
@@ -162,8 +162,8 @@ class Consistency(eqx.Module):
             successive: Whether one tick separates the two measurements; otherwise they are not compared.
         """
         missing, v = gap(before, x, dt), 0.5 * (before.v + x.v)
-        found = contradictions(before, x, dt, self.noise)
-        possible = ~(successive & found.any)
+        result = contradictions(before, x, dt, self.noise)
+        possible = ~(successive & result.any)
         moving = jax.tree.map(lambda old, new: old + dt / SCALE_TAU * (new - old), self.scale, Scale.of(missing, v, dt))
         scale = where(successive & possible & self.possible, moving, self.scale)
         shows, wrong = scale.verdict(dt, self.noise)
@@ -173,4 +173,4 @@ class Consistency(eqx.Module):
         new = jnp.minimum(gap_noise(self.gap, missing), NOISE_LIMIT)
         noise = self.noise + (1.0 - jnp.exp(-dt / NOISE_TAU)) * (new - self.noise)
         noise = jnp.where(successive & possible & self.possible, noise, self.noise)
-        return Consistency(missing, noise, scale, scaled, successive & found.repeated, possible, certain, doubt)
+        return Consistency(missing, noise, scale, scaled, successive & result.repeated, possible, certain, doubt)

@@ -132,8 +132,8 @@ def joined(address: str | None, reporter: Reporter) -> Iterator[Cluster | None]:
 
 def ours() -> dict[str, str]:
     """Return the values that must be equal on all machines: versions, and the digest of retrim's code."""
-    found = versions()
-    return {name: found.get(name, "missing") for name in (*ALIKE, *EXTRAS)} | {"code": code()}
+    result = versions()
+    return {name: result.get(name, "missing") for name in (*ALIKE, *EXTRAS)} | {"code": code()}
 
 
 def check_alike(theirs: dict[str, str], who: str) -> None:

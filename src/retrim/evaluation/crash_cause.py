@@ -20,7 +20,7 @@ def likely_cause(log: Log, lateness: float) -> str | None:
         lateness: Delay and lag of the body rates in the model of training [s].
     """
     return next(
-        (found for cause in (_clock, _numbers, _motion, _rates, _limit) for found in cause(log, lateness)), None
+        (result for cause in (_clock, _numbers, _motion, _rates, _limit) for result in cause(log, lateness)), None
     )
 
 
@@ -117,9 +117,9 @@ def body_rates(R: np.ndarray, dt: float) -> np.ndarray:
 def _fit(measured: np.ndarray, commanded: np.ndarray, delay: int, lag: float, dt: float) -> tuple[float, float]:
     """Return gain and correlation between measured rates and delayed, lagged commands."""
     late = np.concatenate([np.zeros((delay, 2)), commanded[: len(commanded) - delay]])
-    share, acting, found = np.exp(-dt / lag) if lag else 0.0, np.zeros(2), np.empty_like(late)
+    share, acting, result = np.exp(-dt / lag) if lag else 0.0, np.zeros(2), np.empty_like(late)
     for k, each in enumerate(late):
         acting = each + share * (acting - each)
-        found[k] = acting
-    power, both = np.sum(found**2), np.sum(found * measured)
+        result[k] = acting
+    power, both = np.sum(result**2), np.sum(result * measured)
     return float(both / max(power, 1e-9)), float(both / max(np.sqrt(power * np.sum(measured**2)), 1e-9))

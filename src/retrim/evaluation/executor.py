@@ -49,7 +49,7 @@ def gathered(
     submit: Submit,
     *,
     progress: Progress | None,
-    landed: Callable[[Sequence[Flight]], None] | None,
+    on_result: Callable[[Sequence[Flight]], None] | None,
     stop: threading.Event,
     outlive: bool = False,
     forget: bool = False,
@@ -61,9 +61,9 @@ def gathered(
         lots: The same flights, in batches.
         submit: Starts one batch.
         progress: Called in this thread when flights are completed, and periodically before.
-        landed: Receives completed flights, in this thread.
+        on_result: Receives completed flights, in this thread.
         stop: Aborts the running flights. Ctrl-C does the same, and sets it.
-        forget: Discard each flight after ``landed`` has received it; thousands of logs would fill the memory.
+        forget: Discard each flight after ``on_result`` has received it; thousands of logs would fill the memory.
         outlive: Continue if a batch fails, and return the failures; a configuration error still ends everything.
 
     Raises:
@@ -94,9 +94,9 @@ def gathered(
                 else:
                     flights = future.result()
                     flown |= {flight.spec: None if forget else flight for flight in flights}
-                    if landed is not None:
+                    if on_result is not None:
                         with interrupts_only_set(stop):
-                            landed(flights)
+                            on_result(flights)
                     if forget:
                         futures[waiting[future]] = GONE
                 del waiting[future]
@@ -116,8 +116,8 @@ def gathered(
             kept = [flight for each in late if each.exception() is None for flight in each.result()]
             new = [flight for flight in kept if flight.spec not in flown]
             flown |= {flight.spec: None if forget else flight for flight in new}
-            if landed is not None and new:
-                landed(new)
+            if on_result is not None and new:
+                on_result(new)
     kept_flights = [flight for spec in specs if (flight := flown.get(spec)) is not None]
     return Flights(kept_flights, len(flown) < len(specs), failed)
 

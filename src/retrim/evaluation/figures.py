@@ -88,13 +88,13 @@ def picture(
 
 def spans(name: str, home: Array, seconds: float) -> list[plots.Span]:
     """Return times and labels of the disturbance in a flight; a disturbance that always changes has one span."""
-    times, found, changes = timeline(name, home, seconds)
+    times, result, changes = timeline(name, home, seconds)
     if len(changes) > FEW:
         return [plots.Span(0.0, seconds, name, strong=False)]
     marked = []
     for first, after in itertools.pairwise([0, *changes, len(times)]):
         end = float(times[after]) if after < len(times) else seconds
-        here: ExternalEffects = jax.tree.map(lambda leaf, i=first: np.asarray(leaf)[i], found)
+        here: ExternalEffects = jax.tree.map(lambda leaf, i=first: np.asarray(leaf)[i], result)
         if label := _label(here):
             marked.append(plots.Span(float(times[first]), end, label, strong=bool(here.push[0] < 0)))
     return marked

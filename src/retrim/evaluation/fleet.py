@@ -124,7 +124,7 @@ class Fleet:
         executor: Executor | None = None,
         *,
         progress: Progress | None = None,
-        landed: Callable[[Sequence[Flight]], None] | None = None,
+        on_result: Callable[[Sequence[Flight]], None] | None = None,
         stop: threading.Event | None = None,
         only: Sequence[FlightSpec] | None = None,
         by_lot: bool = False,
@@ -137,12 +137,12 @@ class Fleet:
                 programs. By default flights of a simulated plant run in batches, each as one program, and the others
                 one by one, on one thread per core.
             progress: Called in this thread when flights are completed, and periodically before.
-            landed: Receives completed flights, in this thread.
+            on_result: Receives completed flights, in this thread.
             stop: Aborts the running flights. Ctrl-C does the same, and sets it.
             only: Fly these specifications, a part of ``specs``.
             by_lot: Submit the batches of the default to an executor with other processes, instead of single flights.
                 The flights are then the same bit for bit.
-            forget: Do not return flights: thousands of logs would fill the memory, and ``landed`` has received them.
+            forget: Do not return flights: thousands of logs would fill the memory, and ``on_result`` has received them.
 
         Returns:
             The completed flights, in the order of the specifications, and the flights whose job failed in another
@@ -156,19 +156,25 @@ class Fleet:
         if isinstance(executor, ThreadPoolExecutor):
             lots = [FlightBatch([spec], None) for spec in specs]
             return gathered(
-                specs, lots, self._here(executor, stop), progress=progress, landed=landed, stop=stop, forget=forget
+                specs,
+                lots,
+                self._here(executor, stop),
+                progress=progress,
+                on_result=on_result,
+                stop=stop,
+                forget=forget,
             )
         if executor is not None:
             lots = self.lots(specs) if by_lot else [FlightBatch([spec], None) for spec in specs]
             submit = self._away(executor, learnt=not forget)
             return gathered(
-                specs, lots, submit, progress=progress, landed=landed, stop=stop, outlive=True, forget=forget
+                specs, lots, submit, progress=progress, on_result=on_result, stop=stop, outlive=True, forget=forget
             )
         lots = self.lots(specs)
         self.warm_up([lot.specs[0] for lot in lots if lot.compiled is None])
         with ThreadPoolExecutor(1 if self._latency == "measured" else lanes()) as pool:
             return gathered(
-                specs, lots, self._here(pool, stop), progress=progress, landed=landed, stop=stop, forget=forget
+                specs, lots, self._here(pool, stop), progress=progress, on_result=on_result, stop=stop, forget=forget
             )
 
     def _here(self, pool: Executor, stop: threading.Event) -> Submit:

@@ -47,12 +47,12 @@ class FlightStore:
             files = file_digests(method, *named, *named_in(fleet.preset))
             what = {"scenarios": list(map(repr, scenarios)), "method": method, "flights": len(specs), "files": files}
             self._keys[group] = section_key(**about, **what)
-        found = [self._read(group) for group in self._groups]
-        self.earlier = {flight.spec: flight for flights in found for flight in flights}
+        result = [self._read(group) for group in self._groups]
+        self.earlier = {flight.spec: flight for flights in result for flight in flights}
         """Flights of an earlier run, which this run does not repeat."""
-        run.reused += sum(map(bool, found))
+        run.reused += sum(map(bool, result))
 
-    def landed(self, flights: Sequence[Flight]) -> None:
+    def save(self, flights: Sequence[Flight]) -> None:
         """Write each group that these flights complete."""
         self._over |= {flight.spec: flight for flight in flights}
         for group in dict.fromkeys(flight.spec.group for flight in flights):

@@ -23,7 +23,7 @@ def wrong_rows(n: int, dtype: jnp.dtype) -> int:
         return jnp.sum((identity @ y) ** 2)
 
     with jax.default_matmul_precision("float32"):  # intended rounding is not a fault
-        found = np.asarray(jax.jit(jax.vmap(one))(jnp.asarray(rows, dtype=dtype)), dtype=np.float64)
+        result = np.asarray(jax.jit(jax.vmap(one))(jnp.asarray(rows, dtype=dtype)), dtype=np.float64)
     expected = np.arange(n, dtype=np.float64) ** 2
     tolerance = 0.0 if dtype == jnp.float64 else 1e-6
-    return int(np.sum(np.abs(found - expected) > tolerance * expected))
+    return int(np.sum(np.abs(result - expected) > tolerance * expected))

@@ -165,8 +165,8 @@ def interval(records: Sequence[Mapping[str, Any]], draws: int = 2000) -> list[fl
 def _average(
     records: Sequence[Mapping[str, Any]], name: str, of: Callable[[list[float]], Any] = np.mean
 ) -> float | None:
-    found = [each[name] for each in records if each.get(name) is not None]
-    return float(of(found)) if found else None
+    result = [each[name] for each in records if each.get(name) is not None]
+    return float(of(result)) if result else None
 
 
 def _column(records: Sequence[Mapping[str, Any]], name: str) -> np.ndarray:

@@ -39,21 +39,21 @@ def trained_policies(preset: Preset, seeds: Sequence[int], run: Run, reporter: R
     made_of = section_key(preset=dump(preset), files=file_digests(*named_in(preset)))
     stem = f"{UNSAFE.sub('-', preset.name)}-{made_of[:8]}"
     paths = {seed: run.trained / POLICIES / f"{stem}-seed{seed}.safetensors" for seed in seeds}
-    found = dict[int, AbstractPolicy]()
+    result = dict[int, AbstractPolicy]()
     for seed, path in paths.items():
         if path.is_file():
             try:
-                found[seed] = load_policy(path, trust=python_names(preset))[0]
+                result[seed] = load_policy(path, trust=python_names(preset))[0]
             except CheckpointError as error:
                 reporter.say(f"{error}; trained again")
 
-    def landed(seed: int, policy: AbstractPolicy) -> None:
+    def on_result(seed: int, policy: AbstractPolicy) -> None:
         save_policy(paths[seed], policy, preset)
-        found[seed] = policy
+        result[seed] = policy
 
-    missing = [seed for seed in paths if seed not in found]
+    missing = [seed for seed in paths if seed not in result]
     if missing and run.executor is not None and not run.interrupted:
-        trained_elsewhere(preset, missing, run.executor, reporter=reporter, stop=run.stop, landed=landed)
+        trained_elsewhere(preset, missing, run.executor, reporter=reporter, stop=run.stop, on_result=on_result)
         missing = []
     setup = Setup.from_preset(preset)  # one set-up, so that the seeds share its programs
     for seed in missing:
@@ -62,5 +62,5 @@ def trained_policies(preset: Preset, seeds: Sequence[int], run: Run, reporter: R
         reporter.say(f"preset {preset.name}, seed {seed}")
         policy, _ = train(setup, seed, reporter=reporter, stop=run.stop)
         if not run.interrupted:
-            landed(seed, policy)
-    return {seed: found[seed] for seed in paths if seed in found}
+            on_result(seed, policy)
+    return {seed: result[seed] for seed in paths if seed in result}

@@ -29,8 +29,8 @@ def kept(run: Run, key: str) -> tuple[TableSection, list[dict[str, Any]]] | None
     if not path.is_file():
         return None
     try:
-        found = json.loads(path.read_text())
-        whole, rows = found["section"], found["rows"]
+        result = json.loads(path.read_text())
+        whole, rows = result["section"], result["rows"]
         drawn = {run.folder / name: digest for name, digest in (whole["picture"] or {}).items()}
         if any(digest_of(path) != digest for path, digest in drawn.items()):
             return None
@@ -48,13 +48,13 @@ def file_digests(*names: str | None) -> dict[str, str]:
     Args:
         *names: Names of any kind, and sums of names. Their modules must have been imported.
     """
-    found = dict[str, str]()
+    result = dict[str, str]()
     for part in (part for name in names if name for part in name.split("+")):
         head = part.partition(":")[0].partition("=")[0]
         path = Path(getattr(sys.modules.get(head) if ":" in part else None, "__file__", None) or head)
         if path.is_file():
-            found[part] = digest_of(path)
-    return found
+            result[part] = digest_of(path)
+    return result
 
 
 def named_in(preset: Preset) -> list[str | None]:

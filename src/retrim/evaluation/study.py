@@ -116,9 +116,13 @@ def fly_all(
     if left:
         with run.interruptible(), reporter.progress("flying") as advance:
             advance(0.0, "compiling the programs of a flight (kept in a cache for the next time)")
-            landed = None if kept is None else kept.landed
             flights = fleet.run(
-                run.executor, stop=run.stop, progress=report_progress(advance), landed=landed, only=left, by_lot=True
+                run.executor,
+                stop=run.stop,
+                progress=report_progress(advance),
+                on_result=None if kept is None else kept.save,
+                only=left,
+                by_lot=True,
             )
     if flights.failed:
         why = next(iter(flights.failed.values()))

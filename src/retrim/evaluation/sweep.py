@@ -150,7 +150,7 @@ def _fly(fleet: Fleet, keys: Mapping[FlightSpec, str], kept: "_Kept", run: Run, 
             run.executor,
             stop=run.stop,
             only=missing,
-            landed=keep,
+            on_result=keep,
             progress=report_progress(advance),
             by_lot=True,
             forget=True,
@@ -203,11 +203,11 @@ def _report(sweep: Sweep, kept: Sequence[dict[str, Any]], run: Run, reporter: Re
     groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
     for row in kept:
         groups.setdefault(tuple(row[name] for name in GROUP), []).append(row)
-    found, cells = Rows(), list[tuple[str, ...]]()
+    result, cells = Rows(), list[tuple[str, ...]]()
     varied = [name for i, name in enumerate(GROUP) if len({group[i] for group in groups}) > 1 or name == "method"]
     for flights in groups.values():
         row = summary(flights, GROUP)
-        found.append(row)
+        result.append(row)
         none = "crashed" if row["crashes"] else "-"
         figures = (none if row[name] is None else metres(row[name]) for name in ("median", "max"))
         cells.append((*(str(flights[0][name]) for name in varied), cell(row), *figures))
@@ -217,9 +217,9 @@ def _report(sweep: Sweep, kept: Sequence[dict[str, Any]], run: Run, reporter: Re
     if cells:
         drawn = save(bars("Error at the end of the flights [m]", _bar_groups(groups)), run.folder, "sweep")
         columns = (*varied, "mean ± std [m]", "median [m]", "maximum [m]")
-        document.add(TableSection(columns, tuple(cells), picture=drawn[0]), found)
+        document.add(TableSection(columns, tuple(cells), picture=drawn[0]), result)
     document.write()
-    return found
+    return result
 
 
 def _bar_groups(groups: Mapping[tuple[Any, ...], list[dict[str, Any]]]) -> dict[str, dict[str, list[float]]]:

@@ -43,12 +43,12 @@ def load_tree(path: Path, like: T, *, kind: str, reporter: Reporter) -> T | None
     if not path.is_file():
         return None
     try:
-        found = wire.unpack(path.read_bytes(), _numbers(like), kind=kind, source=str(path))
+        result = wire.unpack(path.read_bytes(), _numbers(like), kind=kind, source=str(path))
     except MessageError as error:
         reporter.say(f"{error}; trained again")
         return None
     arrays, fixed = eqx.partition(like, eqx.is_array)
-    whole = jax.tree.map(lambda was, now: random.wrap_key_data(now) if _is_key(was) else now, arrays, found)
+    whole = jax.tree.map(lambda was, now: random.wrap_key_data(now) if _is_key(was) else now, arrays, result)
     tree: T = eqx.combine(whole, fixed)
     return tree
 

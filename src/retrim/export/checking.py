@@ -69,12 +69,12 @@ def check_onnx(path: Path, policy: Portable, rows: np.ndarray, wanted: np.ndarra
     import onnxruntime
 
     session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
-    found = session.run(["command"], {"observation": rows})[0]
+    result = session.run(["command"], {"observation": rows})[0]
     spoilt = session.run(["command", "finite"], {"observation": _spoilt(rows)})
     if not np.isnan(spoilt[0]).all() or np.any(spoilt[1]):
         return Parity("ONNX Runtime, for numbers that are not finite,", math.inf, math.inf)
     step = _timed(lambda o: session.run(["command"], {"observation": o[None]}), rows)
-    return Parity("ONNX Runtime", _worst(policy, np.asarray(found), wanted), step)
+    return Parity("ONNX Runtime", _worst(policy, np.asarray(result), wanted), step)
 
 
 def check_c(path: Path, policy: Portable, rows: np.ndarray, wanted: np.ndarray) -> Parity | None:
@@ -83,7 +83,7 @@ def check_c(path: Path, policy: Portable, rows: np.ndarray, wanted: np.ndarray) 
     Raises:
         ConfigError: It does not compile.
     """
-    compiler = next((found for name in ("gcc", "cc", "clang") if (found := shutil.which(name))), None)
+    compiler = next((result for name in ("gcc", "cc", "clang") if (result := shutil.which(name))), None)
     if compiler is None:
         return None
     with tempfile.TemporaryDirectory() as folder:

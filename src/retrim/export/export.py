@@ -74,17 +74,19 @@ def export(
     portable = portable_of(weights, Setup.from_preset(preset))
     written = FORMATS[to].write(path, portable)
     rows = SPREAD * observations(portable.sizes[0], ROWS, seed=1)
-    found = FORMATS[to].check(path, portable, rows, commands(weights, rows))
-    if found is None:
+    result = FORMATS[to].check(path, portable, rows, commands(weights, rows))
+    if result is None:
         reporter.say(f"{path} was not run: there is nothing here that runs it")
         return written
-    if not found.worst <= PARITY:
+    if not result.worst <= PARITY:
         for each in written:
             each.unlink(missing_ok=True)
-        raise ConfigError(f"{path}: {found.by} misses JAX by {found.worst:.1e} of the command range; nothing was kept")
+        raise ConfigError(
+            f"{path}: {result.by} misses JAX by {result.worst:.1e} of the command range; nothing was kept"
+        )
     reporter.say(
-        f"{found.by} and JAX: {found.worst:.1e} of the command range at most, on {len(rows)} observations; "
-        f"{1e6 * found.step_s:.1f} µs a step"
+        f"{result.by} and JAX: {result.worst:.1e} of the command range at most, on {len(rows)} observations; "
+        f"{1e6 * result.step_s:.1f} µs a step"
     )
     if portable.observation is None:
         reporter.say(f"a {preset.task} policy does not see the state alone: its observation is yours to compute")

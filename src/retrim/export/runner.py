@@ -35,8 +35,8 @@ class Runner:
             self._arrays = {name: file[name] for name in file.files}
         self.about: dict[str, Any] = json.loads(str(self._arrays["about"]))
         self._layers = [(self._arrays[f"w{i}"], self._arrays[f"b{i}"]) for i in range(self.about["layers"])]
-        found = self.command(self._arrays["test_observations"])
-        missed = np.abs(found - self._arrays["test_commands"]) / (self._arrays["high"] - self._arrays["low"])
+        result = self.command(self._arrays["test_observations"])
+        missed = np.abs(result - self._arrays["test_commands"]) / (self._arrays["high"] - self._arrays["low"])
         if not missed.max() <= TOLERANCE:
             raise ValueError(f"{path}: its test vectors are missed by {missed.max():.1e} of the command range")
         if not self._survives_bad_numbers():

@@ -30,5 +30,5 @@ def newer_release(header: Mapping[str, str]) -> str | None:
 
 
 def _numbers(text: str) -> tuple[int, int, int] | None:
-    found = NUMBERS.fullmatch(text)
-    return None if found is None else (int(found[1]), int(found[2]), int(found[3] or 0))
+    result = NUMBERS.fullmatch(text)
+    return None if result is None else (int(result[1]), int(result[2]), int(result[3] or 0))

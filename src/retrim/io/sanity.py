@@ -80,11 +80,11 @@ def check_size(tree: Any, *, source: str, largest: float = LARGEST) -> None:
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
         if np.asarray(leaf).dtype.kind != "f" or not np.size(leaf):
             continue
-        found = float(np.max(np.abs(np.asarray(leaf))))
-        if not found <= largest:
+        result = float(np.max(np.abs(np.asarray(leaf))))
+        if not result <= largest:
             name = jax.tree_util.keystr(path, simple=True, separator=".")
             raise CheckpointError(
-                f"{source}: {excerpt(name, quotes=False)} holds {found:.3g}; at most {largest:g} can be flown"
+                f"{source}: {excerpt(name, quotes=False)} holds {result:.3g}; at most {largest:g} can be flown"
             )
 
 

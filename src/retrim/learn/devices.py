@@ -26,7 +26,7 @@ MANY = "many"
 LEAST_WORK = 500_000
 
 
-def suited(policy: Any, starts: int) -> AbstractContextManager[Any]:
+def suitable_device(policy: Any, starts: int) -> AbstractContextManager[Any]:
     """Return a context in which a training runs on the device that suits its size: the CPU if it is small.
 
     Args:
@@ -40,12 +40,12 @@ def suited(policy: Any, starts: int) -> AbstractContextManager[Any]:
     return on_cpu
 
 
-def shared_by(n: int, devices: int) -> int:
+def num_shards(n: int, devices: int) -> int:
     """Return the number of devices that share ``n`` equal pieces of work: the largest number that divides ``n``."""
     return max(k for k in range(1, devices + 1) if n % k == 0)
 
 
-def spread(tree: T, *, axis: int = 0) -> T:
+def shard(tree: T, *, axis: int = 0) -> T:
     """Divide the arrays of a tree among the devices, along one common axis; with one device, return the tree unchanged.
 
     Inside ``jit`` this is a constraint, from which the compiler derives how to divide later computations; outside, the
@@ -62,12 +62,12 @@ def spread(tree: T, *, axis: int = 0) -> T:
     return _laid(tree, leaves[0].shape[axis], PartitionSpec(*[None] * axis, MANY)) if leaves else tree
 
 
-def whole(tree: T, n: int) -> T:
+def replicate(tree: T, n: int) -> T:
     """Replicate the arrays of a tree on each device that shares ``n`` pieces of work; see :func:`spread`."""
     return _laid(tree, n, PartitionSpec())
 
 
-def gathered(tree: T) -> T:
+def to_default_device(tree: T) -> T:
     """Copy replicated arrays through the host, so that any device may use them; with one device, return them unchanged.
 
     An array from a program on several devices is bound to these devices; an array from the host is not.
@@ -79,7 +79,7 @@ def gathered(tree: T) -> T:
 
 
 def _laid(tree: T, n: int, how: PartitionSpec) -> T:
-    count = shared_by(n, jax.device_count())
+    count = num_shards(n, jax.device_count())
     if jax.process_count() > 1 and count < jax.device_count():
         hosts = jax.process_count()
         raise ConfigError(f"{n} cannot be divided among the {jax.device_count()} devices of {hosts} hosts")

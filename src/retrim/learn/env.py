@@ -25,7 +25,7 @@ class Env(eqx.Module):
     task: AbstractTask
     delay: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros(()))
     """Transport delay of commands [s]. Another value does not need another compilation."""
-    felt: Residual | None = None
+    frame_disturbance: Residual | None = None
     """Disturbance that a controller around the policy compensates with the frame of the effective gravity, as a
     function of the state and the last command, world [m/s^2]; None if the policy observes in the world frame."""
     jump_cost: Float[Array, ""] | None = None
@@ -71,7 +71,11 @@ class Env(eqx.Module):
             x: State.
             last: Command issued one tick ago.
         """
-        return None if self.felt is None else EffectiveGravityFrame.of(lax.stop_gradient(self.felt(x, last)))
+        return (
+            None
+            if self.frame_disturbance is None
+            else EffectiveGravityFrame.of(lax.stop_gradient(self.frame_disturbance(x, last)))
+        )
 
     def cost_of_jump(self, before: Command, after: Command) -> Float[Array, ""]:
         """Return the cost of the change of the policy's command from ``before`` to ``after`` in one tick."""

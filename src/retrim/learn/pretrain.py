@@ -13,7 +13,7 @@ from ..control.policy import AbstractPolicy
 from ..errors import TrainingError
 from ..tasks.task import AbstractTask, Start
 from .bptt import PolicyState, bptt
-from .devices import gathered, spread, suited, whole
+from .devices import replicate, shard, suitable_device, to_default_device
 from .env import Env
 
 PATIENCE = 10  # consecutive steps without a finite loss; fewer are due to bad starts, which are left out
@@ -38,8 +38,8 @@ def train_chunk(
     Training is divided into such chunks, so that progress can be shown and an interrupted run keeps its results.
     Several devices share the starts of each step.
     """
-    starts = spread(jax.vmap(jax.vmap(env.reset))(random.split(key, (num_updates, num_envs))), axis=1)
-    return whole(bptt(state, env, starts, optimiser=optimiser), num_envs)
+    starts = shard(jax.vmap(jax.vmap(env.reset))(random.split(key, (num_updates, num_envs))), axis=1)
+    return replicate(bptt(state, env, starts, optimiser=optimiser), num_envs)
 
 
 def pretrain(
@@ -75,8 +75,8 @@ def pretrain(
     state = PolicyState(policy, optimiser.init(policy.params))
     steps, bad = 0, 0
     for k in random.split(key, num_updates // chunk):
-        with suited(policy, num_envs):
-            state, losses = gathered(train_chunk(state, env, k, optimiser, chunk, num_envs))
+        with suitable_device(policy, num_envs):
+            state, losses = to_default_device(train_chunk(state, env, k, optimiser, chunk, num_envs))
         for loss in losses.tolist():
             steps, bad = steps + 1, 0 if math.isfinite(loss) else bad + 1
             if bad >= PATIENCE or (bad and steps == num_updates):

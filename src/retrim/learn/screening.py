@@ -42,8 +42,8 @@ REASONS = (
 
 def describe_counts(counts: Int[ArrayLike, "5"] | Sequence[int]) -> str:
     """Return the reasons with their counts in words; an empty string if all are zero."""
-    found = zip(REASONS, np.asarray(counts, dtype=int).tolist(), strict=False)
-    return ", ".join(f"{name}: {n}" for name, n in found if n)
+    result = zip(REASONS, np.asarray(counts, dtype=int).tolist(), strict=False)
+    return ", ".join(f"{name}: {n}" for name, n in result if n)
 
 
 def screen(window: Window, dt: float) -> Screening:
@@ -62,16 +62,16 @@ def screen(window: Window, dt: float) -> Screening:
     valid = window.valid[:-1] & window.valid[1:] & successive
     gaps = jax.vmap(lambda a, b: gap(a, b, dt))(before, after)
     noise = _median(jax.vmap(gap_noise)(gaps[:-1], gaps[1:]), valid[:-1] & valid[1:])
-    found: Findings = jax.vmap(lambda a, b: contradictions(a, b, dt, noise))(before, after)
-    stale = jnp.concatenate([jnp.zeros(1, dtype=bool), found.repeated[:-1]])
-    bad = found.any | stale
+    result: Findings = jax.vmap(lambda a, b: contradictions(a, b, dt, noise))(before, after)
+    stale = jnp.concatenate([jnp.zeros(1, dtype=bool), result.repeated[:-1]])
+    bad = result.any | stale
     moments = jax.vmap(lambda missing, a, b: Scale.of(missing, 0.5 * (a.v + b.v), dt))(gaps, before, after)
     n = jnp.maximum(jnp.sum(valid & ~bad), 1).astype(noise.dtype)
     scale = jax.vmap(lambda good, each: jax.tree.map(lambda leaf: jnp.where(good, leaf, 0.0), each))(
         valid & ~bad, moments
     )
     shows, wrong = jax.tree.map(lambda leaf: jnp.sum(leaf, axis=0) / n, scale).verdict(dt, noise)
-    counts = jnp.stack([jnp.sum(leaf & valid) for leaf in jax.tree.leaves(found)])
+    counts = jnp.stack([jnp.sum(leaf & valid) for leaf in jax.tree.leaves(result)])
     good, nothing = valid & ~bad, jnp.zeros(1, dtype=bool)
     beside = jnp.concatenate([nothing, good]) | jnp.concatenate([good, nothing])
     judged = jnp.concatenate([nothing, valid]) | jnp.concatenate([valid, nothing])

@@ -50,8 +50,8 @@ def adaptive_source(setup: Setup, state: LearnerState) -> ControllerSource:
     given |= vehicle_half(setup, setup.controller(state))
 
     def whole(parameters: dict[str, Any]) -> tuple[AbstractPolicy, Any]:
-        found: tuple[AbstractPolicy, Any] = eqx.combine((parameters["policy"], parameters["residual"]), parts[1])
-        return found
+        result: tuple[AbstractPolicy, Any] = eqx.combine((parameters["policy"], parameters["residual"]), parts[1])
+        return result
 
     def controller(parameters: dict[str, Any]) -> AbstractController[Any]:
         policy, residual = whole(parameters)

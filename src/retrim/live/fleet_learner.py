@@ -130,10 +130,10 @@ class FleetLearner:
 
     def _kinds(self) -> dict[Any, dict[str, "_Member"]]:
         """Return the members of each kind, by name."""
-        found: dict[Any, dict[str, _Member]] = {}
+        result: dict[Any, dict[str, _Member]] = {}
         for name, member in self._members.items():
-            found.setdefault(member.kind, {})[name] = member
-        return found
+            result.setdefault(member.kind, {})[name] = member
+        return result
 
 
 class _Member(NamedTuple):

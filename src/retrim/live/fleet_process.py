@@ -64,12 +64,12 @@ def _look(fleet: FleetLearner, folder: Path, done: set[str]) -> None:
     new = sorted(there.keys() - fleet.loops.keys() - done)
     for name in new:
         try:
-            found: LearnerPlan = pickle.loads(there[name].read_bytes())  # written by the parent of this process
-            bus = SharedMemoryBus(found.folder)
+            result: LearnerPlan = pickle.loads(there[name].read_bytes())  # written by the parent of this process
+            bus = SharedMemoryBus(result.folder)
             if bus.latest("ended") is not None:
                 done.add(name)
                 continue
-            fleet.add(name, found, bus, there[name].exists)
+            fleet.add(name, result, bus, there[name].exists)
         except RetrimError as error:
             done.add(name)
             print(error, file=sys.stderr, flush=True)

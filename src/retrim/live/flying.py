@@ -119,15 +119,15 @@ def _written(
     outlet.write("what was learnt", partial(write_learner_state, [flight], preset))
     outlet.write("events.jsonl", partial(write_events, [flight]))
     recorded = _recorded(request, rows, events, outlet)
-    found = results(request, flight, rows, status, events)
+    result = results(request, flight, rows, status, events)
     path = outlet.write_results(
-        run, found, seeds=[request.seed], preset=preset.name, seconds=float(flight.log.t[-1]),
+        run, result, seeds=[request.seed], preset=preset.name, seconds=float(flight.log.t[-1]),
         ended=status.ended, scheduling=refused, histograms_ms=histograms(rows),
     )  # fmt: skip
     for start in run.folder.glob("start*.safetensors"):  # initial states, contained in the learned state
         start.unlink(missing_ok=True)
     paths = [*recorded, *([] if path is None else [path]), log, *complaints(run.folder)]
-    return LiveFlight(flight, found, paths, request, status.ended == "landed", outlet)
+    return LiveFlight(flight, result, paths, request, status.ended == "landed", outlet)
 
 
 def _recorded(request: LiveRequest, rows: np.ndarray, events: LiveEvents, outlet: Outlet) -> list[Path]:
@@ -149,8 +149,8 @@ def _recorded(request: LiveRequest, rows: np.ndarray, events: LiveEvents, outlet
         record(place, recording)
         return place
 
-    found = {path: outlet.write(path.name, partial(put, path)) for path in filter(can_record, paths.values())}
-    return [place for path, place in found.items() if path == request.record and place is not None]
+    result = {path: outlet.write(path.name, partial(put, path)) for path in filter(can_record, paths.values())}
+    return [place for path, place in result.items() if path == request.record and place is not None]
 
 
 def _warmed_up(supervisor: Supervisor, run: Run, reporter: Reporter) -> bool:

@@ -121,11 +121,11 @@ class LearnerLoop:
         self._take_residual()
         if (
             self.plan.layer == "policy"
-            and (found := active_update(self.bus, self.state, "policy", self._status())) is not None
-            and found[0] > self.plan.floor
+            and (result := active_update(self.bus, self.state, "policy", self._status())) is not None
+            and result[0] > self.plan.floor
         ):
-            self._flown = [found]
-            self.worker.receive(found[1])
+            self._flown = [result]
+            self.worker.receive(result[1])
 
     def step(self) -> bool:
         """Read new messages and learn if an update is due; return whether an update was learned."""
@@ -181,8 +181,8 @@ class LearnerLoop:
         if followed is None or (message := self._fresh(f"parameters.{REFERENCE}")) is None:
             return
         with contextlib.suppress(MessageError):
-            found = Parameters.unpack(message, wire.names(followed), half=REFERENCE, base=self.plan.base, after=0)
-            leaves = jax.device_put(list(found.arrays.values()))
+            result = Parameters.unpack(message, wire.names(followed), half=REFERENCE, base=self.plan.base, after=0)
+            leaves = jax.device_put(list(result.arrays.values()))
             self.setup = self.setup.on(jax.tree.unflatten(jax.tree.structure(followed), leaves))
             self.worker.follow(self.setup.learner)
 
@@ -199,8 +199,8 @@ class LearnerLoop:
         whole = self._learnt_by(update)
         arrays = wire.names(parameter_groups(whole.policy.policy.merged(), whole.residual)[layer])
         keep(self.bus, layer, version, update, self._status())
-        found = Parameters(layer, version, self.plan.base, update.computed_from, arrays, parent)
-        self.bus.publish(topic, found.pack())
+        result = Parameters(layer, version, self.plan.base, update.computed_from, arrays, parent)
+        self.bus.publish(topic, result.pack())
         if isinstance(update, PolicyUpdate):
             self._pending = version, update, self._clock()
         else:
@@ -245,10 +245,10 @@ class LearnerLoop:
 
     def _take_residual(self) -> None:
         """Pass the newest residual fit to the worker, if it is new."""
-        found = newest_update(self.bus, self.state, "residual", after=self._known.get("fit", 0))
-        if found is not None:
-            self._known["fit"] = found[0]
-            self.worker.receive(found[1])
+        result = newest_update(self.bus, self.state, "residual", after=self._known.get("fit", 0))
+        if result is not None:
+            self._known["fit"] = result[0]
+            self.worker.receive(result[1])
 
     def _fresh(self, topic: str) -> bytes | None:
         message = self.bus.latest(topic, self._known.get(topic, 0))

@@ -183,8 +183,8 @@ class _Page:
         return None
 
     def _learners(self) -> dict[str, dict[str, Any]]:
-        found = {layer: last_note(self._bus, f"learner.{layer}") for layer in ("residual", "policy")}
-        return {layer: note for layer, note in found.items() if note}
+        result = {layer: last_note(self._bus, f"learner.{layer}") for layer in ("residual", "policy")}
+        return {layer: note for layer, note in result.items() if note}
 
     def _knobs(self) -> ManualDisturbance:
         """Return the positions of the knobs."""
@@ -227,11 +227,11 @@ class _Page:
         Raises:
             MessageError: A field has another type, or there is no such choice.
         """
-        found = read_fields("wish", {name: value for name, value in wish.items() if name in FIELDS["wish"]})
+        result = read_fields("wish", {name: value for name, value in wish.items() if name in FIELDS["wish"]})
         for name, there in (("method", (*self._spec.methods, "none")), ("reference", tuple(self._spec.paths))):
-            if name in found and found[name] not in there:
-                raise MessageError(f"wish: {name} = {shown(found[name])} is not among {', '.join(there)}")
-        return found
+            if name in result and result[name] not in there:
+                raise MessageError(f"wish: {name} = {shown(result[name])} is not among {', '.join(there)}")
+        return result
 
 
 def _text(

@@ -128,11 +128,11 @@ def answer(bus: Bus, tick: int, until: float) -> Setpoint | None:
             if message is None:
                 continue
             try:
-                found = Setpoint.unpack(message.data)
+                result = Setpoint.unpack(message.data)
             except MessageError:
                 continue
-            if found.tick == tick or found.landed:
-                return found
+            if result.tick == tick or result.landed:
+                return result
         if time.monotonic() >= until:
             return None
         time.sleep(3e-4)

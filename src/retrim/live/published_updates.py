@@ -62,12 +62,12 @@ def learnt_from(bus: Bus, state: LearnerState, status: dict[str, Any]) -> Learne
         status: Last status of the control process.
     """
     fit, policy = (active_update(bus, state, layer, status) for layer in LAYERS)
-    found = state
+    result = state
     if fit is not None and isinstance(fit[1], ResidualUpdate):
-        found = LearnerState(found.policy, fit[1].state)
+        result = LearnerState(result.policy, fit[1].state)
     if policy is not None and isinstance(policy[1], PolicyUpdate):
-        found = LearnerState(policy[1].state, found.residual)
-    return None if fit is None and policy is None else found
+        result = LearnerState(policy[1].state, result.residual)
+    return None if fit is None and policy is None else result
 
 
 def _flies(layer: str, status: dict[str, Any]) -> Callable[[int], bool]:
@@ -82,11 +82,11 @@ def _version(message: Message | None) -> int:
 
 
 def _newest(bus: Bus, state: LearnerState, layer: str, wanted: Callable[[int], bool]) -> tuple[int, Update] | None:
-    found: list[tuple[int, Update]] = []
+    result: list[tuple[int, Update]] = []
     for i in range(SLOTS):
         message = bus.latest(slot(layer, i))
         if message is None or not wanted(version := _version(message)):
             continue
         with contextlib.suppress(MessageError):
-            found.append((version, unpack_update(message.data[PREFIX:], state, source=layer)))
-    return max(found, key=lambda each: each[0], default=None)
+            result.append((version, unpack_update(message.data[PREFIX:], state, source=layer)))
+    return max(result, key=lambda each: each[0], default=None)

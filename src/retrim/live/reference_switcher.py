@@ -128,5 +128,5 @@ class ReferenceSwitcher:
         self._version += 1
         arrays = {key: np.asarray(leaf) for key, leaf in wire.names(table).items()}
         base = self._supervisor.spec.controller.base
-        found = Parameters(REFERENCE, self._version, base, since, arrays)
-        self._supervisor.bus.publish(f"parameters.{REFERENCE}", found.pack())
+        result = Parameters(REFERENCE, self._version, base, since, arrays)
+        self._supervisor.bus.publish(f"parameters.{REFERENCE}", result.pack())

@@ -170,8 +170,8 @@ def learnt_in(bus: Bus, status: Status, start: Path, trust: Collection[str] = ()
 
 def complaints(folder: Path) -> list[Path]:
     """Return the files with the standard output and error of the processes; remove empty files."""
-    found = sorted(folder.glob("*.log"))
-    for path in found:
+    result = sorted(folder.glob("*.log"))
+    for path in result:
         if not path.stat().st_size:
             path.unlink()
-    return [path for path in found if path.exists()]
+    return [path for path in result if path.exists()]

@@ -276,7 +276,7 @@ class Supervisor:
                 raise PlantError(f"the {role} process ended before take-off: {last_words(self._complaints(role))}")
 
     def _rejections(self) -> list[str]:
-        found = []
+        result = []
         for layer in self.spec.layers:
             message = self.bus.latest(f"said.{layer}", self._said.get(layer, 0))
             if message is None:
@@ -284,8 +284,8 @@ class Supervisor:
             self._said[layer] = message.version
             with contextlib.suppress(MessageError, KeyError, ValueError, TypeError):
                 said = json.loads(describe(message.data, kind="rejected", source=layer)["update"])
-                found.append(f"{layer}: {plain(str(said['reason']))}")
-        return found
+                result.append(f"{layer}: {plain(str(said['reason']))}")
+        return result
 
     def _start(self, role: str) -> None:
         cores = cores_of("learn" if role in UNHURRIED else "fly", self._cores)

@@ -18,8 +18,8 @@ def log_path(path: Path, spare: Sequence[Path]) -> Path:
         path: Regular path of the log.
         spare: Temporary folders, in the order in which they are tried.
     """
-    found = [folder / path.name for folder in spare if (folder / path.name).exists()]
-    return found[-1] if found else path
+    result = [folder / path.name for folder in spare if (folder / path.name).exists()]
+    return result[-1] if result else path
 
 
 class LogFile:

@@ -153,10 +153,10 @@ def read_fields(kind: str, fields: Any) -> dict[str, Any]:
     """
     if not isinstance(fields, dict):
         raise MessageError(f"{kind}: no fields")
-    known, found = FIELDS.get(kind.partition(".")[0], {}), dict(fields)
-    for name in known.keys() & found.keys():
+    known, result = FIELDS.get(kind.partition(".")[0], {}), dict(fields)
+    for name in known.keys() & result.keys():
         try:
-            found[name] = known[name](found[name])
+            result[name] = known[name](result[name])
         except ValueError as error:
             raise MessageError(f"{kind}: {name} = {shown(fields[name])} must be {error}") from None
-    return found
+    return result

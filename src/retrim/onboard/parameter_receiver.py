@@ -71,7 +71,7 @@ class ParameterReceiver:
                 continue
             self._known[half] = message.version
             try:
-                found = Parameters.unpack(
+                result = Parameters.unpack(
                     message.data, self.pilot.expected(half), half=half, base=self._base, after=self.newest[half]
                 )
             except StaleError:
@@ -79,12 +79,12 @@ class ParameterReceiver:
             except MessageError:
                 self.refuse(half)
             else:
-                if found.computed_from > t + AHEAD:
+                if result.computed_from > t + AHEAD:
                     self.refuse(f"{half} of a time to come")
-                elif half == REFERENCE and t > found.computed_from + IN_TIME:
+                elif half == REFERENCE and t > result.computed_from + IN_TIME:
                     self.refuse("late reference")
                 else:
-                    self._take(found, t)
+                    self._take(result, t)
 
     def watch(self, error: float, missed: float) -> None:
         """Process the result of one tick of the policy, and roll back policies that fly clearly worse.
@@ -93,10 +93,10 @@ class ParameterReceiver:
             error: Distance from the target [m].
             missed: Acceleration error of the corrected model [m/s^2].
         """
-        found = self._flown.take(error, missed)
-        if found.proven is not None:
-            self.pilot.proven(found.proven)
-        if found.worse:
+        result = self._flown.take(error, missed)
+        if result.proven is not None:
+            self.pilot.proven(result.proven)
+        if result.worse:
             self.given_up = [*self.given_up, *self.pilot.back()][-REMEMBERED:]
 
     def refuse(self, what: str) -> None:

@@ -143,10 +143,10 @@ def read_log(path: Path) -> np.ndarray:
     has, flew = accounted(rows), rows[:, -1] == Mode.WATCHDOG
     order = np.lexsort((~has, ~flew, rows[:, 0]))
     ticks, first = np.unique(rows[order, 0], return_index=True)
-    found: np.ndarray = rows[order[first]]
+    result: np.ndarray = rows[order[first]]
     for column in ACCOUNTS.values():
-        found[np.searchsorted(ticks, rows[has, 0]), column] = rows[has, column]
-    return found
+        result[np.searchsorted(ticks, rows[has, 0]), column] = rows[has, column]
+    return result
 
 
 def _lines(path: Path) -> np.ndarray:

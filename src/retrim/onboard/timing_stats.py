@@ -30,8 +30,8 @@ def accounted(rows: np.ndarray) -> np.ndarray:
     Args:
         rows: Columns as in :data:`retrim.onboard.messages.COLUMNS`.
     """
-    found: np.ndarray = rows[:, ACCOUNTS["step"]] > 0.0
-    return found
+    result: np.ndarray = rows[:, ACCOUNTS["step"]] > 0.0
+    return result
 
 
 def blind_row(
@@ -60,5 +60,5 @@ def measured(rows: np.ndarray) -> np.ndarray:
     Args:
         rows: Columns as in :data:`retrim.onboard.messages.COLUMNS`.
     """
-    found: np.ndarray = accounted(rows) | ~np.isin(rows[:, -1], (Mode.BLIND, Mode.DROP))
-    return found
+    result: np.ndarray = accounted(rows) | ~np.isin(rows[:, -1], (Mode.BLIND, Mode.DROP))
+    return result

@@ -51,15 +51,15 @@ class Betaflight(eqx.Module):
             thrust_map: As in :meth:`of`.
             coefficient: True T / Omega^2 of one rotor [N s^2].
         """
-        found, power = cls.of(thrust_map), authority(vehicle, coefficient)
-        plain = found.gains(power)
+        result, power = cls.of(thrust_map), authority(vehicle, coefficient)
+        plain = result.gains(power)
         keep, own = is_damped(plain, power.lead, vehicle.motor_tau), tuned(plain, vehicle.motor_tau)
         scaled = (own.a / P_SCALE, own.i / I_SCALE, own.b / D_SCALE)
         kp, ki, kd = (
             jnp.where(keep, old, new / power.alpha)
-            for old, new in zip((found.kp, found.ki, found.kd), scaled, strict=True)
+            for old, new in zip((result.kp, result.ki, result.kd), scaled, strict=True)
         )
-        return dataclasses.replace(found, kp=kp, ki=ki, kd=kd)
+        return dataclasses.replace(result, kp=kp, ki=ki, kd=kd)
 
     def gains(self, power: Authority) -> Gains:
         """Return the gains in units of angular acceleration.

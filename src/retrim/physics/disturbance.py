@@ -29,8 +29,8 @@ class Disturbance(Protocol):
 @eqx.filter_jit
 def effects_at(times: ArrayLike, x: State, disturbance: Disturbance) -> ExternalEffects:
     """Return the external effects in the state ``x`` at each of ``times`` [s] (leading axis)."""
-    found: ExternalEffects = jax.vmap(lambda t: disturbance(t, x))(jnp.asarray(times, dtype=x.p.dtype))
-    return found
+    result: ExternalEffects = jax.vmap(lambda t: disturbance(t, x))(jnp.asarray(times, dtype=x.p.dtype))
+    return result
 
 
 class Push(eqx.Module):

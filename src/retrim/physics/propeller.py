@@ -199,11 +199,11 @@ def rotor(
     :meth:`Inflow.above`, use 16.
     """
     omega, v_hor = jnp.maximum(omega, OMEGA_FLOOR), jnp.maximum(v_hor, V_HOR_FLOOR)
-    found = Inflow(
+    result = Inflow(
         solved(prop, omega, v_hor, v_ver, inflow.v_i, steps=steps),
         solved(prop, omega, v_hor, jnp.zeros_like(v_ver), inflow.v_h, steps=steps),
     )
-    return blade_forces(prop, omega, v_hor, v_ver, vortex_ring(found, v_ver)), found
+    return blade_forces(prop, omega, v_hor, v_ver, vortex_ring(result, v_ver)), result
 
 
 @eqx.filter_jit

@@ -131,8 +131,8 @@ class Repeated(AbstractMeasurementFault):
         """Return the newest measurement or the one before it."""
         lost = random.uniform(key, (), self.probability.dtype) < self.probability
         before, now = (jax.tree.map(lambda leaf, row=row: leaf[row], past) for row in (0, 1))
-        found: State = where(lost, before, now)
-        return found
+        result: State = where(lost, before, now)
+        return result
 
 
 class ScaledVelocity(AbstractMeasurementFault):

@@ -32,7 +32,7 @@ def flight_vehicle_toml(log: Log, setup: Setup, name: str) -> str:
         raise LogError(f"the flight must be at least {LEAST:g} s long to identify its vehicle, got {log.t[-1]:.2f} s")
     estimator = PathEstimator.of(log.dt, memory=MEMORY)
     path = jax.jit(estimate_path)(estimator, jax.tree.map(jnp.asarray, log.window(ticks)))
-    found = Identified(
+    result = Identified(
         delay=_known(path.delay),
         thrust_gain=_known(path.thrust_gain),
         thrust_offset=None,
@@ -46,9 +46,9 @@ def flight_vehicle_toml(log: Log, setup: Setup, name: str) -> str:
         unexplained=0.0,
         rate_damping=_known(path.rate_damping),
     )
-    if found.delay is None and found.rate_lag is None and found.thrust_lag is None:
+    if result.delay is None and result.rate_lag is None and result.thrust_lag is None:
         raise LogError("the flight moves too little to identify its vehicle: fly from farther away, or under a push")
-    return vehicle_toml(found, setup, name)
+    return vehicle_toml(result, setup, name)
 
 
 def _known(each: PathParameter) -> Estimate | None:

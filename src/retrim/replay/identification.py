@@ -95,13 +95,13 @@ def identify(log: FlightLog, *, seed: int = 0) -> Identified:
     random = np.random.default_rng(seed)
     chosen = [random.integers(0, len(blocks), len(blocks)) for _ in range(DRAWS)]
     draws = [np.ones(len(blocks)), *(np.bincount(draw, minlength=len(blocks)).astype(float) for draw in chosen)]
-    found = [_solved(told, thrust, draw) for draw in draws]
+    result = [_solved(told, thrust, draw) for draw in draws]
 
-    for each in found:
+    for each in result:
         each["full"] = each["thrust gain"] * (log.full_thrust or 0.0) + each["offset"]
 
     def of(name: str, known: bool) -> Estimate | None:
-        values = [each[name] for each in found] if known else []
+        values = [each[name] for each in result] if known else []
         return Estimate(values[0], *(float(q) for q in np.percentile(values[1:], INSIDE))) if known else None
 
     moved = np.sqrt(np.mean(np.einsum("nji,nj->ni", log.R, log.v)[log.valid] ** 2, axis=0))
@@ -110,7 +110,7 @@ def identify(log: FlightLog, *, seed: int = 0) -> Identified:
     found_by_batch = Identified(
         of("delay", bool(told)), of("thrust gain", lift), of("offset", lift),
         of("full", lift and log.full_thrust is not None), of("thrust lag", lift), of("rates lag", turn),
-        of("rates gain", turn), of("yaw lag", yaw), of("yaw gain", yaw), (x, y, z), found[0]["left"],
+        of("rates gain", turn), of("yaw lag", yaw), of("yaw gain", yaw), (x, y, z), result[0]["left"],
     )  # fmt: skip
     return _with_path(found_by_batch, path_of_log(log)) if turn else found_by_batch
 
@@ -144,18 +144,18 @@ def _solved(told: dict[str, Channel], thrust: Channel, draw: np.ndarray) -> dict
     fits = {name: channel.sums.fit(draw) for name, channel in told.items()}
     late = np.sum([misfit.min(axis=1) for misfit, _ in fits.values()], axis=0) if fits else np.zeros(len(DELAYS))
     d = int(np.argmin(late))
-    found = {"delay": lowest(DELAYS, late, d)}
+    result = {"delay": lowest(DELAYS, late, d)}
     for name, (misfit, theta) in {"thrust": thrust.sums.fit(draw), **fits}.items():
         k = int(np.argmin(misfit[d]))
         lag = lowest(LAGS, misfit[d], k)
         slopes = (np.gradient(theta[:, k], DELAYS, axis=0)[d], np.gradient(theta[d], LAGS, axis=0)[k])
-        between = theta[d, k] + (found["delay"] - DELAYS[d]) * slopes[0] + (lag - LAGS[k]) * slopes[1]
-        found |= {f"{name} lag": lag, f"{name} gain": float(between[0])}
+        between = theta[d, k] + (result["delay"] - DELAYS[d]) * slopes[0] + (lag - LAGS[k]) * slopes[1]
+        result |= {f"{name} lag": lag, f"{name} gain": float(between[0])}
         if name == "thrust":
-            found |= {f"drag {axis}": float(between[1 + i]) for i, axis in enumerate("xyz")}
+            result |= {f"drag {axis}": float(between[1 + i]) for i, axis in enumerate("xyz")}
             count = thrust.sums.n @ draw
-            found |= {"offset": float(between[6]), "left": float(np.sqrt(3.0 * np.exp(misfit[d, k] / count)))}
-    return found
+            result |= {"offset": float(between[6]), "left": float(np.sqrt(3.0 * np.exp(misfit[d, k] / count)))}
+    return result
 
 
 def _blocks(log: FlightLog) -> np.ndarray:
@@ -163,13 +163,13 @@ def _blocks(log: FlightLog) -> np.ndarray:
     size, warm = 10 * max(1, round(0.1 * BLOCK / log.dt)), round(WARM / log.dt)
     good = log.valid[:-1] & log.valid[1:]
     settled = np.convolve(good, np.ones(warm + 1), mode="full")[: len(good)] > warm
-    found, run = [], 0
+    result, run = [], 0
     for k, fine in enumerate(settled):
         run = run + 1 if fine else 0
         if run == size:
-            found.append(np.arange(k - size + 1, k + 1))
+            result.append(np.arange(k - size + 1, k + 1))
             run = 0
-    return np.array(found)
+    return np.array(result)
 
 
 def _thrust(log: FlightLog, blocks: np.ndarray) -> Channel:

@@ -47,17 +47,17 @@ class Protocol:
             LogError: There is no such window.
         """
         buffer, horizon, every = (max(1, round(x / dt)) for x in (self.buffer, self.horizon, self.every))
-        found = []
+        result = []
         for now in range(buffer, len(valid) - horizon + 1, every):
             before, after = valid[now - buffer : now], valid[now : now + horizon]
             if before.mean() >= ENOUGH and after.mean() >= ENOUGH:
-                found.append((now - buffer, now, now + horizon))
-        if not found:
+                result.append((now - buffer, now, now + horizon))
+        if not result:
             raise LogError(
                 f"the log has {np.sum(valid) * dt:.1f} s of flight, and no {self.buffer + self.horizon:g} s of it in "
                 f"one piece; choose a shorter --buffer or --horizon"
             )
-        return found
+        return result
 
 
 def predict_log(
@@ -90,5 +90,5 @@ def predict_log(
 
 
 def _part(rows: Targets, first: int, last: int) -> Targets:
-    found: Targets = jax.tree.map(lambda leaf: leaf[first:last], rows)
-    return found
+    result: Targets = jax.tree.map(lambda leaf: leaf[first:last], rows)
+    return result

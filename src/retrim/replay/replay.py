@@ -119,11 +119,11 @@ def replay(path: Path, asked: Replay, run: Run, reporter: Reporter) -> Document:
     document.more["agreement"] = dict(log.agreement)
     document.add(agreement_section(log))
     document.add(residual_section(log, rows))
-    found = _foretold(asked, protocol, setup, log, rows, reporter, run)
-    if found:
-        drawn = picture(log, rows, found, protocol, run.folder)[0]
-        section = dataclasses.replace(prediction_section(found, protocol), picture=drawn)
-        document.add(section, [dataclasses.asdict(each) for each in found])
+    result = _foretold(asked, protocol, setup, log, rows, reporter, run)
+    if result:
+        drawn = picture(log, rows, result, protocol, run.folder)[0]
+        section = dataclasses.replace(prediction_section(result, protocol), picture=drawn)
+        document.add(section, [dataclasses.asdict(each) for each in result])
     if asked.identify and not run.interrupted:
         with reporter.progress("identifying") as advance:
             advance(0.0, "delays and lags")
@@ -142,7 +142,7 @@ def replay(path: Path, asked: Replay, run: Run, reporter: Reporter) -> Document:
 def _foretold(
     asked: Replay, protocol: Protocol, setup: Setup, log: FlightLog, rows: Targets, reporter: Reporter, run: Run
 ) -> list[PredictionScore]:
-    found = list[PredictionScore]()
+    result = list[PredictionScore]()
     home = np.mean(log.p[log.valid], axis=0)
     goal = tuple(float(x) for x in home)
     preset = changed(setup.preset, goal=goal, dt=min(max(0.001, round(log.dt, 3)), SLOWEST))
@@ -155,9 +155,9 @@ def _foretold(
     with reporter.progress("foretelling") as advance, run.interruptible():
         advance(0.0, next(iter(predictors)))
         for each in predict_log(rows, log.dt, predictors, protocol):
-            found.append(each)
-            advance(len(found) / len(predictors), f"{each.name}: {each.rmse:.3f} m/s^2")
-    return found
+            result.append(each)
+            advance(len(result) / len(predictors), f"{each.name}: {each.rmse:.3f} m/s^2")
+    return result
 
 
 def _adapted(

@@ -197,8 +197,8 @@ _terminated = eqx.filter_jit(_out_of_bounds)
 
 @eqx.filter_jit
 def _all_terminated(task: AbstractTask, t: Any, x: State) -> Array:
-    found: Array = jax.vmap(lambda t, x: _out_of_bounds(task, t, x))(t, x)
-    return found
+    result: Array = jax.vmap(lambda t, x: _out_of_bounds(task, t, x))(t, x)
+    return result
 
 
 @eqx.filter_jit

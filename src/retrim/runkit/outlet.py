@@ -52,7 +52,7 @@ class Outlet:
         for folder in (self.folder, *self.spare):
             try:
                 folder.mkdir(parents=True, exist_ok=True, mode=0o777 if folder == self.folder else 0o700)
-                found = put(folder)
+                result = put(folder)
             except OSError as error:
                 reason = reason or error.strerror or str(error)
                 if folder != self.folder:
@@ -61,7 +61,7 @@ class Outlet:
                 continue
             if folder != self.folder:
                 self.faults.append(f"{name} cannot be written to {self.folder} ({reason}); it is in {folder}")
-            return found
+            return result
         self.faults.append(f"{name} cannot be written to {self.folder} ({reason}), nor to any temporary folder")
         return None
 

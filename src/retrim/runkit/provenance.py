@@ -70,11 +70,11 @@ def versions() -> dict[str, str]:
 @functools.cache
 def _versions() -> dict[str, str]:
     """Return the versions, cached: each look-up reads package files, and every flight of a sweep needs them."""
-    found = {name: version(name) for name in PACKAGES}
+    result = {name: version(name) for name in PACKAGES}
     for name in EXTRAS:
         with contextlib.suppress(PackageNotFoundError):
-            found[name] = version(name)
-    return found | {"python": platform.python_version()}
+            result[name] = version(name)
+    return result | {"python": platform.python_version()}
 
 
 def section_key(**what: Any) -> str:

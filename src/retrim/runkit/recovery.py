@@ -28,10 +28,10 @@ def timeline(name: str, home: Array, seconds: float) -> tuple[np.ndarray, Extern
         Times [s], the effects at each (leading axis), and the samples at which they differ from the one before.
     """
     times = np.linspace(0.0, seconds, max(1, round(seconds / STEP)), endpoint=False)
-    found = effects_at(times, State.at(home), disturbance(name))
-    values = np.concatenate([np.asarray(leaf).reshape(len(times), -1) for leaf in jax.tree.leaves(found)], axis=1)
+    result = effects_at(times, State.at(home), disturbance(name))
+    values = np.concatenate([np.asarray(leaf).reshape(len(times), -1) for leaf in jax.tree.leaves(result)], axis=1)
     changes = np.flatnonzero(np.any(np.diff(values, axis=0) != 0, axis=1)) + 1
-    return times, found, changes.tolist()
+    return times, result, changes.tolist()
 
 
 def change_times(name: str, home: Array, seconds: float) -> list[float]:
@@ -42,8 +42,8 @@ def change_times(name: str, home: Array, seconds: float) -> list[float]:
     times, _, changes = timeline(name, home, seconds)
     if len(changes) > FEW:
         return []
-    found = [float(times[i]) for i in changes]
-    return [t for i, t in enumerate(found) if i == 0 or t - found[i - 1] > AT_ONCE]
+    result = [float(times[i]) for i in changes]
+    return [t for i, t in enumerate(result) if i == 0 or t - result[i - 1] > AT_ONCE]
 
 
 def recoveries(
@@ -63,12 +63,12 @@ def recoveries(
         the start of the flight.
     """
     starts = list(changes) or [0.0]
-    found = list[float]()
+    result = list[float]()
     for start, end in zip(starts, [*starts[1:], np.inf], strict=True):
         rows = (t >= start - 1e-6) & (t < end - 1e-6)
         outside = error[rows] >= limit
         if terminated or not len(outside) or outside[-1]:
-            found.append(float("inf"))
+            result.append(float("inf"))
         else:
-            found.append(float(t[rows][np.flatnonzero(outside)[-1] + 1] - start) if outside.any() else 0.0)
-    return found
+            result.append(float(t[rows][np.flatnonzero(outside)[-1] + 1] - start) if outside.any() else 0.0)
+    return result

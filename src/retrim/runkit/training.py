@@ -67,7 +67,7 @@ def trained_elsewhere(
     *,
     reporter: Reporter,
     stop: threading.Event,
-    landed: Callable[[int, AbstractPolicy], None] = lambda seed, policy: None,
+    on_result: Callable[[int, AbstractPolicy], None] = lambda seed, policy: None,
 ) -> dict[int, AbstractPolicy]:
     """Pretrain a policy for each seed, all at once, in other processes.
 
@@ -77,7 +77,7 @@ def trained_elsewhere(
         executor: Executor with other processes, which trains one seed per job.
         reporter: Receives the progress.
         stop: Aborts the unfinished trainings; Ctrl-C does the same, and sets it.
-        landed: Receives each policy when it is trained.
+        on_result: Receives each policy when it is trained.
 
     Returns:
         Policies by seed; all of them, unless ``stop`` was set.
@@ -86,19 +86,19 @@ def trained_elsewhere(
         JobError: A training failed; raised after the others are completed.
     """
     jobs = {executor.submit(train_job, dump(preset), seed): seed for seed in seeds}
-    found, failed, waiting = dict[int, AbstractPolicy](), list[str](), set(jobs)
+    result, failed, waiting = dict[int, AbstractPolicy](), list[str](), set(jobs)
     try:
         with reporter.progress(f"pretraining {preset.name} elsewhere") as advance:
             while waiting and not stop.is_set():
-                advance(len(found) / len(jobs), f"{len(found)} of {len(jobs)} seeds")
+                advance(len(result) / len(jobs), f"{len(result)} of {len(jobs)} seeds")
                 for job in wait(waiting, 1.0, FIRST_COMPLETED).done:
                     waiting.remove(job)
                     if (error := job.exception()) is not None:
                         failed.append(f"seed {jobs[job]}: {' '.join(str(error).split())}")
                         continue
-                    found[jobs[job]] = job.result()
-                    landed(jobs[job], found[jobs[job]])
-            advance(len(found) / len(jobs), f"{len(found)} of {len(jobs)} seeds")
+                    result[jobs[job]] = job.result()
+                    on_result(jobs[job], result[jobs[job]])
+            advance(len(result) / len(jobs), f"{len(result)} of {len(jobs)} seeds")
     except KeyboardInterrupt:
         stop.set()
     finally:
@@ -106,7 +106,7 @@ def trained_elsewhere(
             job.cancel()
     if failed:
         raise JobError(f"{len(failed)} of {len(jobs)} trainings of {preset.name} failed: {failed[0]}")
-    return {seed: found[seed] for seed in seeds if seed in found}
+    return {seed: result[seed] for seed in seeds if seed in result}
 
 
 def train_job(preset: str, seed: int) -> AbstractPolicy:

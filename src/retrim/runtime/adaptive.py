@@ -106,8 +106,8 @@ class AdaptivePilot(Pilot):
 
     def take_events(self) -> list[Event]:
         """Return the events since the last call."""
-        found, self._new_events = self._new_events, []
-        return found
+        result, self._new_events = self._new_events, []
+        return result
 
     def _apply(self, t: float, tick: int) -> None:
         for learner, _ in self.learners:

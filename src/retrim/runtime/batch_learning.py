@@ -22,7 +22,7 @@ from ..adapt.updates import Layer, Skip, Update
 from ..adapt.workers import PolicyWorker, ResidualWorker, policy_update, residual_update
 from ..control.controller import AbstractController
 from ..learn.bptt import PolicyState
-from ..learn.devices import spread
+from ..learn.devices import shard
 from ..learn.window import Window
 from ..physics.state import where
 from .adaptive import AdaptivePilot
@@ -53,12 +53,12 @@ def offers(period: int, latency: int, ticks: int) -> list[Offer]:
         latency: Time from an offer to its update [ticks].
         ticks: Length of the flight.
     """
-    found, free = list[Offer](), 0
+    result, free = list[Offer](), 0
     for tick in range(period, ticks, period):
         busy = tick < free
         free = free if busy else tick + latency
-        found.append(Offer(tick, None if busy else free))
-    return found
+        result.append(Offer(tick, None if busy else free))
+    return result
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ def fly_and_learn(
     Returns:
         The learner state of each flight at its end, and the events of each flight.
     """
-    plan, keys = plans[0], spread(jnp.stack([each.key for each in plans]))
+    plan, keys = plans[0], shard(jnp.stack([each.key for each in plans]))
     batch.controllers = _controllers(plan, state)
     if cold:
         with ThreadPoolExecutor(1) as beside:
@@ -166,13 +166,13 @@ class _Instant(NamedTuple):
 
 
 def _instants(plan: Plan, ticks: int) -> list[_Instant]:
-    found = list[_Instant]()
+    result = list[_Instant]()
     for layer in (RESIDUAL, POLICY):
         for offer in offers(plan.periods[layer], plan.latencies[layer], ticks):
-            found.append(_Instant(offer.tick, 1, layer, offer))
+            result.append(_Instant(offer.tick, 1, layer, offer))
             if offer.visible is not None and offer.visible < ticks:
-                found.append(_Instant(offer.visible, 0, layer, offer))
-    return sorted(found, key=lambda instant: instant[:3])
+                result.append(_Instant(offer.visible, 0, layer, offer))
+    return sorted(result, key=lambda instant: instant[:3])
 
 
 def _controllers(plan: Plan, state: LearnerState) -> Any:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..learn.devices import spread
+from ..learn.devices import shard
 from ..learn.window import Window
 from ..physics.state import Command, State
 from ..plants.sim import SimState, Simulation
@@ -74,7 +74,7 @@ class Batch:
         hover = Command.hover(x.p.dtype)
         u = jax.tree.map(lambda leaf: jax.device_put(np.broadcast_to(leaf, (n, size, *leaf.shape))), hover)
         nothing, every = jnp.zeros((n, size), x.p.dtype), jnp.ones((n, size), dtype=bool)
-        blank: Window = spread(jax.vmap(Window)(nothing, x, u, every, nothing))
+        blank: Window = shard(jax.vmap(Window)(nothing, x, u, every, nothing))
         return blank
 
     def window(self, tick: int, size: int) -> Window:
@@ -88,7 +88,7 @@ class Batch:
         n = x.p.shape[0]
         t = jnp.asarray(np.broadcast_to(at * self.dt, (n, size)), dtype=x.p.dtype)
         valid, age = jax.device_put(np.broadcast_to(wanted >= 0, (n, size))), jnp.full_like(t, self._simulations.age)
-        windows: Window = spread(jax.vmap(Window)(t, x, u, valid, age))
+        windows: Window = shard(jax.vmap(Window)(t, x, u, valid, age))
         return windows
 
     def log(self, i: int, events: Sequence[Event]) -> Log:
@@ -120,14 +120,14 @@ def stacked(trees: Sequence[T]) -> T:
     """Return trees of one structure as one tree, with a leading axis that is divided among the devices."""
     arrays = [eqx.filter(tree, eqx.is_array) for tree in trees]
     together = jax.tree.map(lambda *leaves: _stack(leaves), *arrays)
-    whole: T = spread(eqx.combine(together, eqx.filter(trees[0], eqx.is_array, inverse=True)))
+    whole: T = shard(eqx.combine(together, eqx.filter(trees[0], eqx.is_array, inverse=True)))
     return whole
 
 
 def one(tree: T, i: int) -> T:
     """Return one tree of those that :func:`stacked` has stacked."""
-    found: T = jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf)[i]), tree)
-    return found
+    result: T = jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf)[i]), tree)
+    return result
 
 
 def _stack(leaves: Sequence[Any]) -> Array:

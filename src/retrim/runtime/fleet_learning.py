@@ -19,7 +19,7 @@ from ..adapt.workers import PolicyWorker, ResidualWorker, policy_update, residua
 from ..control.lora import LoraPolicy
 from ..control.policy import Policy
 from ..learn.bptt import PolicyState, policy_gradient
-from ..learn.devices import gathered, spread
+from ..learn.devices import shard, to_default_device
 from ..learn.residuals.model import FittedResidual
 from ..learn.window import Window
 from .batch_learning import fit_all, row, update_all
@@ -57,7 +57,7 @@ def learn_together(
     keys = [worker.next_key() for worker in workers if isinstance(worker, PolicyWorker)]
     state = stacked([_on(_state(workers[i]), base) for i in filled])
     flown = None if base is None else stacked([_policy(workers[i]) for i in filled])
-    trained, verdicts = update_all(first.learner, state, window, spread(jnp.stack([keys[i] for i in filled])), flown)
+    trained, verdicts = update_all(first.learner, state, window, shard(jnp.stack([keys[i] for i in filled])), flown)
     verdicts, t = jax.device_get((verdicts, window.t[:, -1]))
     return [policy_update(float(t[i]), one(trained, i), row(verdicts, i)) for i in range(n)]
 
@@ -92,7 +92,7 @@ def learn_base(
     weight = jnp.asarray([1.0 / n] * n + [0.0] * (len(filled) - n))
     window = stacked([windows[i] for i in filled])
     stepped: PolicyState = _base_step(workers[0].learner, base, states, window, weight, key)
-    return gathered(stepped)  # the next step may be shared by other devices
+    return to_default_device(stepped)  # the next step may be shared by other devices
 
 
 def refused_by_all(updates: Sequence[Update]) -> bool:
@@ -115,8 +115,8 @@ def _base_step(
     change, memory = _optimiser(learner).update(mean, base.optimiser, params)
     stepped = PolicyState(base.policy.with_params(optax.apply_updates(params, change)), memory)
     fine = jnp.isfinite(optax.tree.norm(mean))
-    found: PolicyState = jax.tree.map(lambda new, old: jnp.where(fine, new, old), stepped, base)
-    return found
+    result: PolicyState = jax.tree.map(lambda new, old: jnp.where(fine, new, old), stepped, base)
+    return result
 
 
 def _optimiser(learner: OnlineLearner) -> optax.GradientTransformation:

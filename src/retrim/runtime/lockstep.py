@@ -44,10 +44,10 @@ class LockstepLearner(Learner):
 
     def poll(self, tick: int) -> list[Update]:
         """Return the updates that are visible at this tick."""
-        found, self._skipped = self._skipped, []
+        result, self._skipped = self._skipped, []
         if self._ready is not None and self._ready[0] <= tick:
-            found, self._ready = [*found, self._ready[1]], None
-        return found
+            result, self._ready = [*result, self._ready[1]], None
+        return result
 
     def receive(self, update: Update) -> None:
         """Pass a published update on to the worker."""

@@ -106,8 +106,8 @@ class ControllerPilot(Pilot):
 
     def take_events(self) -> list[Event]:
         """Return the events since the last call: changes of the controller's stage, and identified vehicles."""
-        found, self._events = self._events, []
-        return found
+        result, self._events = self._events, []
+        return result
 
     def _note(self, t: float, condition: Condition | None) -> None:
         if condition is not None and int(condition.stage) != self._stage:

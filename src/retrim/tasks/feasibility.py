@@ -34,12 +34,12 @@ def unflyable(rows: np.ndarray, every: float, lap: tuple[float, float], vehicle:
 
 def _not_at_rest(rows: np.ndarray, lap: tuple[float, float]) -> list[str]:
     first, final = np.linalg.norm(rows[0, 3:6]), np.linalg.norm(rows[-1, 3:6])
-    found = list[str]()
+    result = list[str]()
     if first > REST:
-        found.append(f"it starts at speed, {first:.2f} m/s, and a flight starts at rest")
+        result.append(f"it starts at speed, {first:.2f} m/s, and a flight starts at rest")
     if lap[0] == lap[1] and final > REST:
-        found.append(f"it ends at speed, {final:.2f} m/s, where its last point is held")
-    return found
+        result.append(f"it ends at speed, {final:.2f} m/s, where its last point is held")
+    return result
 
 
 def _standing_alone(rows: np.ndarray, every: float) -> tuple[np.ndarray, np.ndarray]:
@@ -75,27 +75,27 @@ def _open_lap(rows: np.ndarray, every: float, lap: tuple[float, float]) -> list[
 
 def beyond_limits(rows: np.ndarray, every: float, vehicle: Vehicle) -> list[str]:
     """Return the reasons why a table exceeds thrust and rates of a vehicle; see :func:`unflyable`."""
-    found = list[str]()
+    result = list[str]()
     accelerations, alone = _standing_alone(rows, every)
     lift = np.where(alone, np.inf, accelerations[:, 2] + STANDARD_GRAVITY)
     k = int(np.argmin(lift))
     if lift[k] < 0.0:
         down = STANDARD_GRAVITY - lift[k]
-        found.append(
+        result.append(
             f"it is steeper than free fall at {k * every:.2f} s ({down:.1f} m/s² downwards): rotors cannot push down"
         )
     c_max, rate_max = float(vehicle.command_max.c), np.asarray(vehicle.omega_max)
     i = int(np.argmax(rows[:, 6]))
     if rows[i, 6] > c_max:
-        found.append(f"it needs {rows[i, 6]:.1f} m/s² of thrust at {i * every:.2f} s, the vehicle has {c_max:.1f}")
+        result.append(f"it needs {rows[i, 6]:.1f} m/s² of thrust at {i * every:.2f} s, the vehicle has {c_max:.1f}")
     shares = np.abs(rows[:, 7:10]) / rate_max
     j, axis = (int(index) for index in np.unravel_index(int(np.argmax(shares)), shares.shape))
     if shares[j, axis] > 1.0:
-        found.append(
+        result.append(
             f"it needs {abs(rows[j, 7 + axis]):.1f} rad/s about {'xyz'[axis]} at {j * every:.2f} s, "
             f"the limit is {rate_max[axis]:.1f}"
         )
-    return found
+    return result
 
 
 def _below_ground(rows: np.ndarray, every: float) -> list[str]:

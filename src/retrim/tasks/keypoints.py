@@ -172,8 +172,8 @@ def key_of(x: State) -> Key[Array, ""]:
 def _whitening_at(goal: tuple[float, float, float], dt: float, x64: bool) -> Statistics:
     """Return the statistics of :func:`_whitening`, computed once per process, goal, tick and precision."""
     plain = Keypoints.of(jnp.array(goal, float), jnp.ones(3), whitened=False, dt=dt)
-    found: Statistics = _whitening(plain)
-    return found
+    result: Statistics = _whitening(plain)
+    return result
 
 
 @eqx.filter_jit

@@ -103,7 +103,7 @@ class MovingGoal(AbstractTask):
         p = self.path(t)
         return p if self.frame is None else self.frame.vector(p)
 
-    def wanted(self, t: Float[Array, ""]) -> Point:
+    def setpoint(self, t: Float[Array, ""]) -> Point:
         """Return position, derivatives and command of the goal at time ``t`` [s]; its heading is zero."""
         one = jnp.ones_like(t)
 

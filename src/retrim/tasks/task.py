@@ -105,7 +105,7 @@ class AbstractTask(eqx.Module):
         """Return the target position of the vehicle at time ``t`` [s], world [m]."""
         return self.home()
 
-    def wanted(self, t: Float[Array, ""]) -> Point:
+    def setpoint(self, t: Float[Array, ""]) -> Point:
         """Return the reference at time ``t`` [s], for controllers that follow one; by default rest at the target."""
         p = self.target(t)
         rest, none = jnp.zeros_like(p), jnp.zeros_like(p[0])

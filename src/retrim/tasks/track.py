@@ -69,7 +69,7 @@ class AbstractTrack(AbstractTask):
         """Return the position of the reference at time ``t`` [s], world [m]."""
         return self.reference(t).p
 
-    def wanted(self, t: Float[Array, ""]) -> Point:
+    def setpoint(self, t: Float[Array, ""]) -> Point:
         """Return the reference at time ``t`` [s]."""
         return self.reference(t)
 

@@ -25,8 +25,8 @@ class InProcessBus(Bus):
         """Return the last message of ``topic`` if it is newer than ``after``."""
         check_topic(topic, self._capacities)
         with self._lock:
-            found = self._last[topic]
-        return found if found.version > after else None
+            result = self._last[topic]
+        return result if result.version > after else None
 
     def close(self) -> None:
         """Do nothing."""

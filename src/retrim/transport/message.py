@@ -56,8 +56,8 @@ def describe(data: bytes, *, kind: str, source: str) -> dict[str, str]:
         MessageError: It is not a complete message of this format and ``kind``.
     """
     header = _header(data, source)
-    if (found := header.get("kind", UNNAMED)) != kind:
-        raise MessageError(f"{source}: holds a {found!r}, expected a {kind!r}")
+    if (result := header.get("kind", UNNAMED)) != kind:
+        raise MessageError(f"{source}: holds a {result!r}, expected a {kind!r}")
     return header
 
 
@@ -90,7 +90,7 @@ def unpack_arrays(data: bytes, expected: Mapping[str, ArrayLike], *, kind: str, 
         tensors = load(data)
     except (SafetensorError, KeyError, ValueError) as error:
         raise MessageError(f"{source}: a tensor of a type that is not used here ({error})") from error
-    found: dict[str, np.ndarray] = {}
+    result: dict[str, np.ndarray] = {}
     for name in sorted(expected.keys() | tensors.keys()):
         if name not in tensors:
             raise MessageError(f"{source}: tensor {name!r} is missing")
@@ -104,13 +104,13 @@ def unpack_arrays(data: bytes, expected: Mapping[str, ArrayLike], *, kind: str, 
             expects = "floating point" if real else "integers"
             raise MessageError(f"{source}: tensor {name!r} has type {there.dtype}, expected {expects}")
         with np.errstate(over="ignore"):
-            found[name] = there.astype(wanted.dtype)
-        if not (finite := np.isfinite(found[name])).all():
+            result[name] = there.astype(wanted.dtype)
+        if not (finite := np.isfinite(result[name])).all():
             wrong = finite.size - np.count_nonzero(finite)
             raise MessageError(f"{source}: tensor {name!r} has {wrong} weights that are not finite")
     if header.pop("checksum", None) != _checksum(tensors, header):
         raise MessageError(f"{source}: the checksum does not match; the file was damaged or edited")
-    return {name: found[name] for name in expected}
+    return {name: result[name] for name in expected}
 
 
 def _in_order(data: bytes) -> bytes:

@@ -69,8 +69,8 @@ class NetworkBus(Bus):
         """Return the last message of ``topic`` if it is newer than ``after``."""
         check_topic(topic, self._capacities)
         with self._lock:
-            found = self._last[topic]
-        return found if found.version > after else None
+            result = self._last[topic]
+        return result if result.version > after else None
 
     def _received(self, topic: str, frame: bytes) -> None:
         """Receive a message from the network, in any thread."""
@@ -80,8 +80,8 @@ class NetworkBus(Bus):
         elif len(frame) > head + self._capacities[topic]:
             self._refused += 1
         elif self._talk is not None:
-            if (found := self._talk.open(topic, frame)) is not None:
-                count, data = found
+            if (result := self._talk.open(topic, frame)) is not None:
+                count, data = result
                 self._take(topic, OTHER, count, data)
         elif len(frame) < head:
             self._refused += 1

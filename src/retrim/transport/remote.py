@@ -42,13 +42,13 @@ class Address:
         Raises:
             ConfigError: It is not an address.
         """
-        found = ADDRESS.fullmatch(text)
-        if not found or found["kind"] not in KINDS or not 1 <= int(found["port"]) <= 65_535:
+        result = ADDRESS.fullmatch(text)
+        if not result or result["kind"] not in KINDS or not 1 <= int(result["port"]) <= 65_535:
             raise ConfigError(
                 f"{text!r} is no address of a bus; one is zenoh:HOST:PORT or ros:HOST:PORT, with /KEY for one of "
                 "several vehicles there"
             )
-        return cls(found["kind"], found["host"], int(found["port"]), found["key"] or "", shared)
+        return cls(result["kind"], result["host"], int(result["port"]), result["key"] or "", shared)
 
     @property
     def loopback(self) -> bool:

@@ -78,10 +78,10 @@ class ZenohBus(NetworkBus):
         self._subscribers = []
         for topic in capacities:
             where, listener = f"{prefix}/{topic}", self._listener(topic)
-            found = ext.declare_advanced_subscriber(
+            result = ext.declare_advanced_subscriber(
                 self._session, where, listener, history=history, allowed_origin=remote
             )
-            self._subscribers.append(found)
+            self._subscribers.append(result)
         self._begin()
 
     def close(self) -> None:

@@ -114,11 +114,11 @@ def bars(title: str, groups: dict[str, dict[str, list[float]]]) -> "matplotlib.f
             places = np.arange(len(groups)) + (k - (len(methods) - 1) / 2) * width
             color = BASE if method == "base" else next(others)
             finite = [[v for v in group.get(method, []) if np.isfinite(v)] for group in groups.values()]
-            means = [float(np.mean(found)) if found else 0.0 for found in finite]
+            means = [float(np.mean(result)) if result else 0.0 for result in finite]
             axes.bar(places, means, 0.9 * width, color=color, alpha=0.5, label=method)
-            for place, group, found in zip(places, groups.values(), finite, strict=True):
-                axes.plot(np.full(len(found), place), found, "o", color=color, markersize=4)
-                if crashed := len(group.get(method, [])) - len(found):
+            for place, group, result in zip(places, groups.values(), finite, strict=True):
+                axes.plot(np.full(len(result), place), result, "o", color=color, markersize=4)
+                if crashed := len(group.get(method, [])) - len(result):
                     axes.annotate(
                         f"{crashed} crashed", (place, 0.0), color=color, rotation=90, ha="center", va="bottom"
                     )

@@ -39,5 +39,5 @@ def advantages(seen: Seen, last: Float[Array, " envs"], discount: float, trace: 
         return (advantage, value), advantage
 
     rows = (seen.outcome.reward, over, seen.value)
-    found: Array = lax.scan(back, (jnp.zeros_like(last), last), rows, reverse=True)[1]
-    return found
+    result: Array = lax.scan(back, (jnp.zeros_like(last), last), rows, reverse=True)[1]
+    return result

@@ -28,7 +28,7 @@ def add_raptor(setup: Setup, plant: Plant) -> SimPlant:
         raise ConfigError(
             "method 'raptor' reads the state on board, without noise or delay: fly it with sensors 'ideal'"
         )
-    model = RaptorQuadrotor(plant.simulation.model, RaptorNet.load(), setup.flight_task.wanted)
+    model = RaptorQuadrotor(plant.simulation.model, RaptorNet.load(), setup.flight_task.setpoint)
     plant.simulation = dataclasses.replace(plant.simulation, model=model)
     return plant
 

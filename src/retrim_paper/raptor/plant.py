@@ -102,7 +102,7 @@ class RaptorQuadrotor(AbstractSubstepDynamics[RaptorState]):
 
     base: BemQuadrotor
     net: RaptorNet
-    wanted: Any
+    setpoint: Any
     """The reference: a function of the time since the start of the flight [s], whose values have p, v and heading."""
 
     @property
@@ -138,7 +138,7 @@ class RaptorQuadrotor(AbstractSubstepDynamics[RaptorState]):
 
     def _decided(self, s: RaptorState) -> tuple[Float[Array, "4"], Float[Array, " hidden"]]:
         body, x = s.body.body, self.state(s)
-        goal = self.wanted(SUBSTEP * s.ms.astype(x.p.dtype))
+        goal = self.setpoint(SUBSTEP * s.ms.astype(x.p.dtype))
         facing = so3.rotz(goal.heading).T
         p = jnp.clip(so3.act(facing, x.p - goal.p), -FARTHEST, FARTHEST)
         v = jnp.clip(so3.act(facing, x.v - goal.v), -FASTEST, FASTEST)

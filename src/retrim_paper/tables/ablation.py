@@ -57,7 +57,7 @@ def ablation(
     document = Document(run, f"ablation_{task}", f"Ablation: {task}", INTRO, seeds, reporter)
     studies = dict[str, Study]()
     for name, levers in ((f"{task}/retrim", (*CONTROL, *OFF[task])), (f"{task}/paper", (*CONTROL, *ON[task]))):
-        lines, found = list[tuple[str, ...]](), list[dict[str, Any]]()
+        lines, result = list[tuple[str, ...]](), list[dict[str, Any]]()
         for lever in levers:
             if run.interrupted:
                 break
@@ -76,13 +76,13 @@ def ablation(
                     clear_flights(run)
             if not run.interrupted:
                 lines += made[0].rows
-            found += made[1]
+            result += made[1]
         columns = tuple(
             each if reference is None else f"{reference}, {each}"
             for reference in REFERENCES[task]
             for each in DISTURBANCES[task]
         )
-        document.add(TableSection(("lever", *columns), tuple(lines), f"Preset {name}"), found)
+        document.add(TableSection(("lever", *columns), tuple(lines), f"Preset {name}"), result)
     document.write()
 
 
@@ -98,7 +98,7 @@ def _flown(
 ) -> tuple[TableSection, list[dict[str, Any]]]:
     """Fly one component under all disturbances; return its line of the table, and the rows behind it."""
     run, reporter = document.run, document.reporter
-    cells, found = list[str](), list[dict[str, Any]]()
+    cells, result = list[str](), list[dict[str, Any]]()
     for reference in REFERENCES[task]:
         study = _study(_follows(preset, reference), studies, document.seeds, run, reporter)
         scenarios = [Scenario(each, reference=reference) for each in DISTURBANCES[task]]
@@ -107,9 +107,9 @@ def _flown(
         for scenario in scenarios:
             group = [flight for flight in flights.flown if flight.spec.scenario == scenario]
             if group:
-                found.append(_row(group, preset.name, lever))
-                cells.append(cell(found[-1], digits=4))
-    return TableSection((), ((lever.label, *cells),)), found
+                result.append(_row(group, preset.name, lever))
+                cells.append(cell(result[-1], digits=4))
+    return TableSection((), ((lever.label, *cells),)), result
 
 
 def _follows(preset: Preset, reference: str | None) -> Preset:

@@ -113,7 +113,11 @@ def gauntlet(
     intro = (FAULTS_INTRO if faults else INTRO).format(sensors=sensors)
     document = Document(run, name, title, intro, seeds, reporter, data="results")
     study = train_all(loaded, seeds, run, reporter)
-    home, flown, found = Setup.from_preset(loaded).flight_task.home(), dict[str, list[Flight]](), list[dict[str, Any]]()
+    home, flown, result = (
+        Setup.from_preset(loaded).flight_task.home(),
+        dict[str, list[Flight]](),
+        list[dict[str, Any]](),
+    )
     names, at_once = list(chosen), max(1, cores() // CORES)
     for together in (names[n : n + at_once] for n in range(0, len(names), at_once)):
         if run.interrupted:
@@ -128,14 +132,14 @@ def gauntlet(
         for name, scenario in zip(together, scenarios, strict=True):
             if own := [flight for flight in flights if flight.spec.scenario == scenario]:
                 flown[name] = own
-                found += rows_of(name, own, change_times(scenario.disturbance, home, seconds))
-        if found:
-            run.write_results(found, seeds=seeds)  # written now, so that a kill loses running flights only
-    if found:
+                result += rows_of(name, own, change_times(scenario.disturbance, home, seconds))
+        if result:
+            run.write_results(result, seeds=seeds)  # written now, so that a kill loses running flights only
+    if result:
         if faults:
             document.more["promise"] = promise_rows(flown)
             document.add(promise_section(document.more["promise"]))
-        document.add(_section(found, methods, flown, document, study.about(), left_out), found)
+        document.add(_section(result, methods, flown, document, study.about(), left_out), result)
     document.write()
     if not run.interrupted:
         clear_flights(run)
@@ -147,17 +151,17 @@ def _installed(preset: Preset, asked: Mapping[str, Scenario]) -> tuple[dict[str,
     Raises:
         PlantError: No condition has an installed plant.
     """
-    found, lacking, why = dict[str, Scenario](), list[str](), None
+    result, lacking, why = dict[str, Scenario](), list[str](), None
     for name, scenario in asked.items():
         try:
             scenario.make(preset.vehicle, dt=preset.dt)
-            found[name] = scenario
+            result[name] = scenario
         except PlantError as error:
             lacking.append(f"{name}: {error}")
             why = error
-    if why is not None and not found:
+    if why is not None and not result:
         raise why
-    return found, lacking
+    return result, lacking
 
 
 def rows_of(name: str, flights: Sequence[Flight], changes: Sequence[float]) -> list[dict[str, Any]]:
@@ -168,7 +172,7 @@ def rows_of(name: str, flights: Sequence[Flight], changes: Sequence[float]) -> l
         flights: Flights of the condition.
         changes: Times at which its world changed [s].
     """
-    found = list[dict[str, Any]]()
+    result = list[dict[str, Any]]()
     for method in dict.fromkeys(flight.spec.method for flight in flights):
         group = [flight for flight in flights if flight.spec.method == method]
         values = {
@@ -181,7 +185,7 @@ def rows_of(name: str, flights: Sequence[Flight], changes: Sequence[float]) -> l
         scenario = group[0].spec.scenario
         for metric in METRICS:
             mean, worst = float(np.mean(values[metric])), float(np.max(values[metric]))
-            found.append(
+            result.append(
                 {
                     "scenario": name,
                     "method": method,
@@ -200,7 +204,7 @@ def rows_of(name: str, flights: Sequence[Flight], changes: Sequence[float]) -> l
                     "fault": scenario.fault,
                 }
             )
-    return found
+    return result
 
 
 def _recoveries(flight: Flight, changes: Sequence[float], limit: float) -> list[float]:

@@ -190,15 +190,15 @@ def fly_hidden(
     studies = {name: train_all(preset, seeds, run, reporter) for name, preset in presets.items()}
     about = " ".join(study.about() for study in studies.values())
     for course in courses:
-        found = list[dict[str, Any]]()
+        result = list[dict[str, Any]]()
         for entrant in entrants:
             if run.interrupted:
                 break
             reporter.say(f"{course.title}: {entrant.label}, {count} vehicles")
             flights = _fly(studies[entrant.preset], entrant, course, vehicles, run, reporter, starts, sensors)
-            found += [_row(entrant, course, vehicles, flight, scoring) for flight in flights]
-        if found:
-            document.add(_section(found, entrants, course, scoring, vehicles, run, about), found)
+            result += [_row(entrant, course, vehicles, flight, scoring) for flight in flights]
+        if result:
+            document.add(_section(result, entrants, course, scoring, vehicles, run, about), result)
     document.write()
     if not run.interrupted:
         clear_flights(run)

@@ -156,7 +156,7 @@ def _level_section(
         return None
     place = {scenario: i for i, scenario in enumerate(section.scenarios)}
     flown.sort(key=lambda flight: (place[flight.spec.scenario], methods.index(flight.spec.method)))
-    found = [{**row, "preset": study.preset.name, "section": title} for row in rows(flown)]
+    result = [{**row, "preset": study.preset.name, "section": title} for row in rows(flown)]
     kinds = [event.kind for flight in flown for event in flight.events]
     crashed = sum(flight.log.terminated for flight in flown)
     about = (
@@ -166,8 +166,8 @@ def _level_section(
     setup = Setup.from_preset(study.preset, section.scenario.reference)
     first = [f for f in flown if f.spec.seed == flown[0].spec.seed and f.spec.method in section.drawn]
     drawn = picture(first, setup, section.scenarios[-1], run.folder, stem=section.stem)
-    table = level_table(found, methods, section.paper, title, section.levels)
-    return replace(table, about=about, picture=drawn[0] if drawn else None), found
+    table = level_table(result, methods, section.paper, title, section.levels)
+    return replace(table, about=about, picture=drawn[0] if drawn else None), result
 
 
 def level_table(

@@ -73,9 +73,9 @@ def drag_panel() -> Panel:
     curves, speeds = list[Curve](), np.linspace(0.0, 10.0, 41)
     for i, name in enumerate(("small", "kingfisher")):
         bem = BemQuadrotor.of(VEHICLES[name](), DT)
-        found = np.array([_drag(bem, float(v)) for v in speeds])
-        curves.append(Curve(speeds, found[:, 0], f"{name}: rotors and body", color=i))
-        curves.append(Curve(speeds, found[:, 1], f"{name}: rotors", dashed=True, color=i))
+        result = np.array([_drag(bem, float(v)) for v in speeds])
+        curves.append(Curve(speeds, result[:, 0], f"{name}: rotors and body", color=i))
+        curves.append(Curve(speeds, result[:, 1], f"{name}: rotors", dashed=True, color=i))
     curves.append(Curve(np.array([0.0, 8.0]), 0.24 * np.array([0.0, 8.0]), "kingfisher, published: 0.24 1/s", color=2))
     return Panel("Drag of the level vehicle", "speed [m/s]", "deceleration [m/s²]", curves)
 
@@ -151,15 +151,15 @@ def sag_panel() -> Panel:
     """Plot the vertical acceleration under u_hover while the battery sags."""
     bem, sag, times = BemQuadrotor.of(VEHICLES["small"](), DT), disturbance("battery"), np.linspace(0.0, 120.0, 61)
     x = State.at(jnp.zeros(3))
-    found = []
+    result = []
     for t in times:
         force = _force(bem, _init(bem, x), sag(jnp.array(float(t)), x))
-        found.append(float(force[2] / bem.vehicle.mass) - STANDARD_GRAVITY)
+        result.append(float(force[2] / bem.vehicle.mass) - STANDARD_GRAVITY)
     return Panel(
         "Battery sag: u_hover held still",
         "time [s]",
         "vertical acceleration [m/s²]",
-        [Curve(times, np.array(found), "small, -0.2 %/s down to 80 %")],
+        [Curve(times, np.array(result), "small, -0.2 %/s down to 80 %")],
     )
 
 

@@ -97,8 +97,8 @@ def plants(
         except PlantError as error:
             document.add(TableSection((), (), title, f"Left out: {error}"))
             continue
-        found = [{**row, "group": title} for row in rows(flown)]
-        by = {(row["disturbance"], row["method"]): row for row in found}
+        result = [{**row, "group": title} for row in rows(flown)]
+        by = {(row["disturbance"], row["method"]): row for row in result}
         lines = []
         for name in disturbances:
             ours = [by.get((name, method)) for method in METHODS]
@@ -106,7 +106,7 @@ def plants(
             peak = None if ours[-1] is None else ours[-1]["peak_after_5s"]
             n, crashes = (sum(row[key] for row in ours if row) for key in ("n", "crashes"))
             lines.append((name, *cells, "-" if peak is None else metres(peak), f"{crashes} of {n}"))
-        document.add(TableSection(COLUMNS, tuple(lines), title), found)
+        document.add(TableSection(COLUMNS, tuple(lines), title), result)
     document.write()
     if not run.interrupted:
         clear_flights(run)

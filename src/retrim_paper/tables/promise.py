@@ -24,7 +24,7 @@ def promise_rows(flights: Mapping[str, Sequence[Flight]]) -> list[dict[str, Any]
     Args:
         flights: Flights of each condition, by all methods.
     """
-    found = list[dict[str, Any]]()
+    result = list[dict[str, Any]]()
     for condition, group in flights.items():
         crashed = {(f.spec.method, f.spec.seed, f.spec.start): f.log.terminated for f in group}
         bound = FACTOR * min(_steady(group, method) for method in (BASE, OBSERVER)) + MARGIN
@@ -34,7 +34,7 @@ def promise_rows(flights: Mapping[str, Sequence[Flight]]) -> list[dict[str, Any]
                 continue
             worse = sum(f.log.terminated and not crashed.get((BASE, f.spec.seed, f.spec.start), True) for f in own)
             steady = _steady(group, method)
-            found.append(
+            result.append(
                 {
                     "scenario": condition,
                     "method": method,
@@ -47,7 +47,7 @@ def promise_rows(flights: Mapping[str, Sequence[Flight]]) -> list[dict[str, Any]
                     "holds": bool(worse == 0 and (steady <= bound or not np.isfinite(bound))),
                 }
             )
-    return found
+    return result
 
 
 def promise_section(rows: Sequence[dict[str, Any]]) -> TableSection:

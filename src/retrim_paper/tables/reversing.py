@@ -74,15 +74,15 @@ def reversing(
     errors: dict[str, list[np.ndarray]] = {
         m: [_errors(f, moments, span) for f in flown if f.spec.method == m and not f.log.terminated] for m in METHODS
     }
-    found = rows(flown)
-    peaks = "; ".join(f"{METHODS[row['method']].strip('*')} {_peak(row)}" for row in found)
-    crashed = sum(row["crashes"] for row in found)
+    result = rows(flown)
+    peaks = "; ".join(f"{METHODS[row['method']].strip('*')} {_peak(row)}" for row in result)
+    crashed = sum(row["crashes"] for row in result)
     about = f"{study.about()} Median of the largest error after 5 s [m]: {peaks}. "
     about += f"{crashed} of {len(flown)} flights crashed."
     pictured = [f for f in flown if f.spec.method in ("base", "full")]
     drawn = picture(pictured, Setup.from_preset(loaded), scenario, run.folder)
     document.more = {"moments_s": moments.tolist(), "errors_m": {m: np.array(e).tolist() for m, e in errors.items()}}
-    document.add(_section(errors, moments, updates, about, drawn[0] if drawn else None), found)
+    document.add(_section(errors, moments, updates, about, drawn[0] if drawn else None), result)
     if not run.interrupted:
         clear_flights(run)
 
@@ -109,8 +109,8 @@ def _moments(adapt: Adapt, seconds: float) -> tuple[np.ndarray, list[int]]:
 def _errors(flight: Flight, moments: np.ndarray, span: float = 1.0) -> np.ndarray:
     """Return the mean error over the last ``span`` seconds before each moment [m]."""
     t = flight.log.t
-    found = [flight.error[(t > end - span) & (t <= end + 1e-6)].mean() for end in moments.flat]
-    return np.array(found).reshape(moments.shape)
+    result = [flight.error[(t > end - span) & (t <= end + 1e-6)].mean() for end in moments.flat]
+    return np.array(result).reshape(moments.shape)
 
 
 def _section(
@@ -119,7 +119,7 @@ def _section(
     lines = list[tuple[str, ...]]()
     for i, reversal in enumerate(moments[:, 0]):
         for method, name in METHODS.items():
-            table = [found[i] for found in errors[method]]
+            table = [result[i] for result in errors[method]]
             columns = np.array(table).T  # empty if no flight was completed
             cells = [mean_and_deviation(column) for column in columns]
             cells = cells or ["-"] * moments.shape[1]

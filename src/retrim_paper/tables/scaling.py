@@ -80,15 +80,15 @@ def scaling(
         fleet = Fleet(loaded, study.policies, scenarios, methods=METHODS, starts=n // EACH, seconds=seconds)
         watch, errors = Stopwatch(), list[float]()
 
-        def note(landed: Sequence[Flight], errors: list[float] = errors) -> None:
-            errors += [flight.steady for flight in landed]
-            sizes.append(len(pickle.dumps(replace(landed[0], learnt=None))))
+        def note(on_result: Sequence[Flight], errors: list[float] = errors) -> None:
+            errors += [flight.steady for flight in on_result]
+            sizes.append(len(pickle.dumps(replace(on_result[0], learnt=None))))
 
         with run.interruptible(), reporter.progress(f"{n} flights") as advance:
             fleet.run(
                 stop=run.stop,
                 progress=report_progress(advance),
-                landed=note,
+                on_result=note,
                 forget=True,
             )
         if not run.interrupted and errors:

@@ -103,10 +103,10 @@ def tuning(
             for i, (setup, (_, disturbed, sensors, reference)) in enumerate(zip(setups, conditions, strict=True)):
                 scenario = Scenario(disturbed, plant, sensors=sensors, reference=reference)
                 advance(i / len(conditions), f"condition {i + 1} of {len(conditions)}")
-                found = _flown(
+                result = _flown(
                     baseline, tried, setup, scenario, starts=starts, seconds=seconds, seed=seed, stop=run.stop
                 )
-                scores += np.array(found) / len(conditions)
+                scores += np.array(result) / len(conditions)
             document.add(_section(name, tried, scores), _rows(name, tried, scores))
     document.write()
 

@@ -67,8 +67,8 @@ def normal_estimate(mean: Float[Array, ""], deviation: Float[Array, ""], before:
 def delay_estimate(posterior: PathPosterior) -> Estimate:
     """Return the estimate of the delay [s]."""
     mean, deviation = _moments(posterior.cells[:, 0], posterior.weight)
-    found = normal_estimate(mean, deviation, LONGEST_DELAY / 12.0**0.5)
-    return dataclasses.replace(found, low=jnp.maximum(found.low, 0.0))
+    result = normal_estimate(mean, deviation, LONGEST_DELAY / 12.0**0.5)
+    return dataclasses.replace(result, low=jnp.maximum(result.low, 0.0))
 
 
 def lag_estimate(posterior: PathPosterior, before: Float[Array, ""]) -> Estimate:

@@ -222,13 +222,13 @@ class PathEstimator(eqx.Module):
             lag_estimate(thrust, self.thrust.lag_spread),
             gain_estimate(thrust, self.thrust.gain_spread),
         )
-        found = Channels(
+        result = Channels(
             channels.rates.predicted_by(rates),
             channels.yaw.predicted_by(yaw),
             channels.thrust.predicted_by(thrust),
             channels.force.predicted_by(force),
         )
-        return dataclasses.replace(s, channels=found, estimate=estimate)
+        return dataclasses.replace(s, channels=result, estimate=estimate)
 
     def issued(self, s: PathState, u: Command) -> PathState:
         """Return the memory after the command ``u`` was issued for the tick that begins."""

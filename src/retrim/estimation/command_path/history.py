@@ -49,10 +49,10 @@ class CommandHistory(eqx.Module):
 
 def ages(dt: float) -> np.ndarray:
     """Return the ages of commands for which the step response is evaluated [ticks]."""
-    last, found = round(SPAN / dt), [1]
-    while found[-1] < last:
-        found.append(min(found[-1] + max(1, found[-1] // SINGLE), last))
-    return np.array(found)
+    last, result = round(SPAN / dt), [1]
+    while result[-1] < last:
+        result.append(min(result[-1] + max(1, result[-1] // SINGLE), last))
+    return np.array(result)
 
 
 def _joining(dt: float) -> np.ndarray:

@@ -81,11 +81,11 @@ def path_posterior(channel: Channel, prior: Prior, belief: Belief | None, dt: fl
     region = region_of(cells, fit, 1.0, least)
     coarse, within = coarse_grid(prior, belief)
     far, _ = likelihood_of(coarse, one)
-    best, found = (
+    best, result = (
         jnp.max(each.log_likelihood + log_prior(at, prior, belief)) for each, at in ((far, coarse), (fit, cells))
     )
     restart = region_of(coarse, far, TEMPER, within)
-    region = jax.tree.map(lambda new, old: jnp.where(best > found + ELSEWHERE, new, old), restart, region)
+    region = jax.tree.map(lambda new, old: jnp.where(best > result + ELSEWHERE, new, old), restart, region)
     cells, least = around(region)
     fit, h = likelihood_of(cells, one)
     weight = _weight(fit.log_likelihood, cells, prior, belief, 1.0)

@@ -92,11 +92,11 @@ def log_prior(cells: Float[Array, "cells 3"], prior: Prior, belief: Belief | Non
     inside = (d >= 0.0) & (d <= LONGEST_DELAY) & (log_lag >= jnp.log(LAGS[0])) & (log_lag <= jnp.log(LAGS[1]))
     inside &= (ringing >= 0.0) & (ringing <= MOST_RINGING)
     if belief is None:
-        found = -0.5 * ((log_lag - jnp.log(prior.lag)) / prior.lag_spread) ** 2
+        result = -0.5 * ((log_lag - jnp.log(prior.lag)) / prior.lag_spread) ** 2
     else:
         away = cells[:, :2] - belief.mean[None]
-        found = -0.5 * jnp.sum(away * (away @ _inverse(belief.covariance)), axis=1)
-    return jnp.where(inside, found, -jnp.inf)
+        result = -0.5 * jnp.sum(away * (away @ _inverse(belief.covariance)), axis=1)
+    return jnp.where(inside, result, -jnp.inf)
 
 
 def _inverse(a: Float[Array, "2 2"]) -> Float[Array, "2 2"]:

@@ -15,11 +15,11 @@ def describe_path(estimate: PathEstimate, declared: tuple[float, float] | None =
     thrust = "thrust gain " + _text(estimate.thrust_gain)
     if not (bool(estimate.delay.excited) and bool(estimate.rate_lag.excited)):
         return f"{thrust}; rate delay and lag not excited"
-    found = f"{thrust}; rate delay {_milliseconds(estimate.delay.mean)}, lag {_milliseconds(estimate.rate_lag.mean)}"
+    result = f"{thrust}; rate delay {_milliseconds(estimate.delay.mean)}, lag {_milliseconds(estimate.rate_lag.mean)}"
     if declared is None:
-        return found
+        return result
     delay, lag = declared
-    return f"{found} (vehicle file: {_milliseconds(delay)}, {_milliseconds(lag)})"
+    return f"{result} (vehicle file: {_milliseconds(delay)}, {_milliseconds(lag)})"
 
 
 def _text(each: Estimate) -> str:

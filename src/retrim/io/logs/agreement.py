@@ -59,8 +59,8 @@ def agreement(chosen: LogMap, ticks: Ticks, valid: np.ndarray) -> dict[str, floa
         late = max(1, round(LATE / ticks.dt))
         shifts = [np.concatenate([np.full(lag, ticks.thrust[0]), ticks.thrust])[: len(ticks.t)] for lag in range(late)]
         thrusts = [mean(each[:, None])[:, 0] for each in shifts]
-        found = max(_correlation(changes, each - smoothed(each, rows)) for each in thrusts)
-        scores["climb"] = found * abs(found)
+        result = max(_correlation(changes, each - smoothed(each, rows)) for each in thrusts)
+        scores["climb"] = result * abs(result)
     turned = mean(turning(ticks.R, ticks.dt))
     for name, rates in (("turning", ticks.command), ("gyroscope", ticks.rates if ticks.gyroscope else None)):
         if rates is not None and max(_rms(mean(rates)), _rms(turned)) > TURNS:
@@ -90,7 +90,7 @@ def _with_signs(
 ) -> float:
     """Return the agreement of all axes, or that of an axis of opposite sign whose motion exceeds ``least``."""
     axes = [(p, q) for p, q in zip(x.T, by.T, strict=True) if min(_size(p), _size(q)) > least]
-    return min([score, *(found for p, q in axes if (found := agree(p, q)) < AGAINST)])
+    return min([score, *(result for p, q in axes if (result := agree(p, q)) < AGAINST)])
 
 
 def _beyond_noise(changes: np.ndarray, k: int) -> float:

@@ -44,14 +44,14 @@ def read_csv(
     times = arrays[places[""][0][0]][:, places[""][0][1]]
     if times.shape[1] != 1:
         raise LogError(f"{path}: column {time.field!r} holds lists, not times")
-    found = dict[str, Series]()
+    result = dict[str, Series]()
     for what, taken in list(places.items())[1:]:
         parts = [
             sign_of(name) * _part(path, name, arrays[place], part)
             for name, (place, part) in zip(wanted[what], taken, strict=True)
         ]
-        found[what] = Series(time.scale * times[:, 0], np.concatenate(parts, axis=1))
-    return found, notes
+        result[what] = Series(time.scale * times[:, 0], np.concatenate(parts, axis=1))
+    return result, notes
 
 
 def _lines(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:

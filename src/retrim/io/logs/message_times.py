@@ -23,7 +23,7 @@ def stamp_of(message: Any, time: Clock | None) -> float:
 
     Zero is an unset stamp, or the beginning of a simulation; NaN means that the message has no stamp.
     """
-    found = float("nan")
+    result = float("nan")
     stamps = [] if time is None else [(time.field, time.scale)]
     stamps += [("header.stamp", NANOSECOND), ("stamp", NANOSECOND)]
     if str(getattr(message, "__msgtype__", "")).startswith("px4_msgs/"):
@@ -36,10 +36,10 @@ def stamp_of(message: Any, time: Clock | None) -> float:
         if hasattr(value, "sec"):
             value, scale = value.sec * 10**9 + value.nanosec, NANOSECOND
         if isinstance(value, (int, float, np.number)):
-            found = scale * float(value)
-        if found > 0.0:
+            result = scale * float(value)
+        if result > 0.0:
             break
-    return found
+    return result
 
 
 def on_one_time(stamps: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray], list[str]]:

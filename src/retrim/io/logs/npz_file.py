@@ -18,7 +18,7 @@ def read_npz(
         raise LogError(f'{path}: an NPZ file needs a table [time] in the map, as field = "t" and unit = "s"')
     arrays = NpzMembers(path)
     t = _flat(path, time.field, arrays)[:, 0] * time.scale
-    found = dict[str, Series]()
+    result = dict[str, Series]()
     for what, fields in wanted.items():
         try:
             columns = [sign_of(name) * first_of(name, lambda each: _flat(path, each, arrays)) for name in fields]
@@ -29,8 +29,8 @@ def read_npz(
         for name, column in zip(fields, columns, strict=True):
             if len(column) != len(t):
                 raise LogError(f"{path}: {name!r} has {len(column)} samples, but {time.field!r} has {len(t)}")
-        found[what] = Series(t, np.concatenate(columns, axis=1))
-    return found, []
+        result[what] = Series(t, np.concatenate(columns, axis=1))
+    return result, []
 
 
 def _flat(path: Path, name: str, arrays: NpzMembers) -> np.ndarray:

@@ -167,8 +167,8 @@ def turning(R: np.ndarray, dt: float) -> np.ndarray:
 
 def _columns(path: Path, name: str, series: dict[str, Series]) -> Series:
     """Return a series after a check of its number of columns."""
-    wanted, found = {"thrust": 1, "hover": 1}.get(name, 3), series[name].values.shape[1]
-    if name != "attitude" and found != wanted:
-        hint = "; add the motors' thrusts up into one column" if name == "thrust" and found == 4 else ""
-        raise LogError(f"{path}: {name} needs {wanted} number{'s' * (wanted > 1)}, its fields hold {found}{hint}")
+    wanted, result = {"thrust": 1, "hover": 1}.get(name, 3), series[name].values.shape[1]
+    if name != "attitude" and result != wanted:
+        hint = "; add the motors' thrusts up into one column" if name == "thrust" and result == 4 else ""
+        raise LogError(f"{path}: {name} needs {wanted} number{'s' * (wanted > 1)}, its fields hold {result}{hint}")
     return series[name]

@@ -66,7 +66,7 @@ def _mended(chosen: LogMap, read: Callable[[Other, slice], Ticks], valid: np.nda
     ticks = read(Other("", chosen, {}), part)
     scores = agreement(chosen, ticks, valid[part])
     wrong = {name: score for name, score in scores.items() if score < 1.0 - SUSPECT and name != "climb"}
-    best, found = (0.0, 0.0), ""
+    best, result = (0.0, 0.0), ""
     turned = with_heading(chosen, heading_between(ticks, valid[part]) if valid[part].any() else 0.0)
     for other in (*others(chosen), turned) if wrong else ():
         try:
@@ -79,8 +79,8 @@ def _mended(chosen: LogMap, read: Callable[[Other, slice], Ticks], valid: np.nda
             continue
         if (rank := (round(_least(after), 1), sum(after.values()))) > best:
             name, best = min(mended, key=lambda each: wrong[each]), rank
-            found = f"{EXPLAINED[name]} ({100 * wrong[name]:.0f} % agreement); with {other.words} they would"
-    return found
+            result = f"{EXPLAINED[name]} ({100 * wrong[name]:.0f} % agreement); with {other.words} they would"
+    return result
 
 
 def _part(valid: np.ndarray) -> slice:

@@ -131,12 +131,12 @@ def _clock(chosen: LogMap) -> Clock | None:
 
 def _valid(series: dict[str, Series], name: str) -> Series:
     """Return the samples of a quantity without those that its flags mark as invalid at the same time."""
-    found = series[name]
-    keep = np.ones(len(found.t), dtype=bool)
+    result = series[name]
+    keep = np.ones(len(result.t), dtype=bool)
     for other, flag in series.items():
         if other.startswith(f"{name} valid"):
-            keep &= flag.values[np.clip(np.searchsorted(flag.t, found.t, side="right") - 1, 0, None), 0] != 0.0
-    return Series(found.t[keep], found.values[keep])
+            keep &= flag.values[np.clip(np.searchsorted(flag.t, result.t, side="right") - 1, 0, None), 0] != 0.0
+    return Series(result.t[keep], result.values[keep])
 
 
 def _reader(path: Path) -> LogReader:

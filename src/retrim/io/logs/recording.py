@@ -101,8 +101,8 @@ def quaternions(x: np.ndarray) -> np.ndarray:
     """Return the attitudes of states as quaternions x, y, z, w, (n, 4)."""
     from scipy.spatial.transform import Rotation  # local, because it takes as long to import as all of retrim
 
-    found: np.ndarray = Rotation.from_matrix(x[:, 3:12].reshape(-1, 3, 3)).as_quat()
-    return found
+    result: np.ndarray = Rotation.from_matrix(x[:, 3:12].reshape(-1, 3, 3)).as_quat()
+    return result
 
 
 class _Messages:

@@ -26,8 +26,8 @@ def known(series: Series, grid: np.ndarray, dt: float, *, held: float = 0.0) -> 
     inside = (grid >= series.t[0]) & (grid <= series.t[-1])
     left, right = np.clip(after - 1, 0, len(series.t) - 1), np.clip(after, 0, len(series.t) - 1)
     at_sample = series.t[left] == grid
-    found: np.ndarray = inside & (at_sample | (series.t[right] - series.t[left] <= longest))
-    return found
+    result: np.ndarray = inside & (at_sample | (series.t[right] - series.t[left] <= longest))
+    return result
 
 
 def interpolated(series: Series, grid: np.ndarray) -> np.ndarray:
@@ -80,7 +80,7 @@ def around(valid: np.ndarray, reach: int) -> np.ndarray:
 def runs(flags: np.ndarray, length: int) -> np.ndarray:
     """Return where flags belong to a run of at least that length."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(int), [0]])))
-    found = np.zeros(len(flags), dtype=bool)
+    result = np.zeros(len(flags), dtype=bool)
     for first, last in zip(edges[::2], edges[1::2], strict=True):
-        found[first:last] = last - first >= length
-    return found
+        result[first:last] = last - first >= length
+    return result

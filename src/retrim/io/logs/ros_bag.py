@@ -55,7 +55,7 @@ def _read(
 
     with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as bag:
         places = _places(path, wanted, sorted({connection.topic for connection in bag.connections}), optional)
-        taken: dict[Place, list[list[float]]] = {place: [] for found in places.values() for place in found}
+        taken: dict[Place, list[list[float]]] = {place: [] for result in places.values() for place in result}
         stamps: dict[str, list[tuple[float, float]]] = {place.topic: [] for place in taken}
         chosen = [connection for connection in bag.connections if connection.topic in stamps]
         for connection, received, raw in bag.messages(connections=chosen):
@@ -66,16 +66,16 @@ def _read(
             for place in taken:
                 if place.topic == topic:
                     taken[place].append(_numbers(path, place, message))
-    for what in [what for what, found in places.items() if not stamps[found[0].topic]]:
+    for what in [what for what, result in places.items() if not stamps[result[0].topic]]:
         if what not in optional:
             raise LogError(f"{path}: topic {places[what][0].topic!r} has no message")
         del places[what]
     times, notes = on_one_time({topic: np.array(both) for topic, both in stamps.items() if both})
-    found = dict[str, Series]()
+    result = dict[str, Series]()
     for what, fields in places.items():
         parts = [sign_of(name) * np.array(taken[place]) for name, place in zip(wanted[what], fields, strict=True)]
-        found[what] = Series(times[fields[0].topic], np.concatenate(parts, axis=1))
-    return found, notes
+        result[what] = Series(times[fields[0].topic], np.concatenate(parts, axis=1))
+    return result, notes
 
 
 def _places(
@@ -116,13 +116,13 @@ def _check_fields(
     optional: Collection[str],
 ) -> None:
     """Remove the optional quantities that the messages of a topic do not contain."""
-    for what in [what for what, found in places.items() if what in optional and found[0].topic == topic]:
+    for what in [what for what, result in places.items() if what in optional and result[0].topic == topic]:
         try:
             for place in places[what]:
                 _numbers(path, place, message)
         except LogError:
             del places[what]
-    needed = {place for found in places.values() for place in found}
+    needed = {place for result in places.values() for place in result}
     for place in [place for place in taken if place not in needed]:
         del taken[place]
 

@@ -35,7 +35,7 @@ def read_ulog(
     if log.dropouts:
         lost = sum(each.duration for each in log.dropouts) / 1000.0
         notes.append(f"the logger dropped out {len(log.dropouts)} times, for {lost:.2f} s in all")
-    found = dict[str, Series]()
+    result = dict[str, Series]()
     for what, fields in wanted.items():
         try:
             parts = [first_of(name, lambda each: _field(path, each, topics)) for name in fields]
@@ -51,8 +51,8 @@ def read_ulog(
             for name, (_, keys) in zip(fields, parts, strict=True)
             for key in keys
         ]
-        found[what] = Series(_times(path, topic, time), np.stack(columns, axis=1))
-    return found, notes
+        result[what] = Series(_times(path, topic, time), np.stack(columns, axis=1))
+    return result, notes
 
 
 def _times(path: Path, topic: Any, time: Clock | None) -> np.ndarray:

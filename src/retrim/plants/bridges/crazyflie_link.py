@@ -115,16 +115,16 @@ class CrazyflieLink:
     def _numbers(self, wanted: set[str], patience: float, keep_on: KeepOn) -> dict[str, int]:
         """Return the numbers of variables from its table of contents."""
         about = self.ask(Packet(crtp.LOG, crtp.TOC, bytes([crtp.INFO])), 1, patience, keep_on)
-        length, found = int.from_bytes(about[:2], "little"), dict[str, int]()
+        length, result = int.from_bytes(about[:2], "little"), dict[str, int]()
         for number in range(length):
             asked = bytes([crtp.ITEM]) + struct.pack("<H", number)
             item = self.ask(Packet(crtp.LOG, crtp.TOC, asked), 3, patience, keep_on)
             name = item[1:].rstrip(b"\0").replace(b"\0", b".").decode(errors="replace")
             if name in wanted:
-                found[name] = number
-            if len(found) == len(wanted):
-                return found
-        raise PlantError(f"the Crazyflie logs no {', '.join(sorted(wanted - set(found)))}; its firmware is too old")
+                result[name] = number
+            if len(result) == len(wanted):
+                return result
+        raise PlantError(f"the Crazyflie logs no {', '.join(sorted(wanted - set(result)))}; its firmware is too old")
 
     def _chores(self, now: float) -> None:
         if now >= self._echo_due:

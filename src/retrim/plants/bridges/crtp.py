@@ -166,10 +166,10 @@ def status_of(values: bytes) -> Status:
     """
     if len(values) != _STATUS.size:
         raise MessageError(f"{len(values)} bytes are no status, which has {_STATUS.size}")
-    found = Status(*_STATUS.unpack(values))
-    if not (math.isfinite(found.thrust) and math.isfinite(found.battery)):
+    result = Status(*_STATUS.unpack(values))
+    if not (math.isfinite(result.thrust) and math.isfinite(result.battery)):
         raise MessageError("a status that is not finite")
-    return found
+    return result
 
 
 def status_values(status: Status) -> bytes:

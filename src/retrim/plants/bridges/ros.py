@@ -111,7 +111,7 @@ def parts_of(address: str) -> tuple[str, str]:
     Raises:
         ConfigError: The text is not an address.
     """
-    found = ADDRESS.fullmatch(address or MASTER)
-    if found is None or not 0 < int(found["master"].rpartition(":")[2]) < 65_536:
+    result = ADDRESS.fullmatch(address or MASTER)
+    if result is None or not 0 < int(result["master"].rpartition(":")[2]) < 65_536:
         raise ConfigError(f"address {address!r}: expected HOST:PORT of a rosmaster, with /NAMESPACE or without")
-    return found["master"], found["namespace"] or NAMESPACE
+    return result["master"], result["namespace"] or NAMESPACE

@@ -120,11 +120,11 @@ class RosLink:
         """Process nav_msgs/Odometry: pose in its frame, twist in its child frame (the body, unless both are equal)."""
         twist, pose = message.twist.twist, message.pose.pose
         v, omega = (np.array([a.x, a.y, a.z]) for a in (twist.linear, twist.angular))
-        found = _pose(pose)
-        if found is None or not np.isfinite(np.concatenate([v, omega])).all():
+        result = _pose(pose)
+        if result is None or not np.isfinite(np.concatenate([v, omega])).all():
             self.ignored += 1
             return
-        p, R = found
+        p, R = result
         self._odometry_at = time.monotonic()
         in_world = message.child_frame_id in ("", message.header.frame_id)
         self._take(message.header.stamp.to_sec(), p, R, v if in_world else R @ v, R.T @ omega if in_world else omega)
@@ -133,13 +133,13 @@ class RosLink:
         """Process geometry_msgs/PoseStamped without recent odometry; velocities are smoothed differences of poses."""
         from scipy.spatial.transform import Rotation  # local, because it takes as long to import as all of retrim
 
-        found, last = _pose(message.pose), self.reading
-        if found is None:
+        result, last = _pose(message.pose), self.reading
+        if result is None:
             self.ignored += 1
             return
         if time.monotonic() - self._odometry_at < FRESH_S:
             return
-        p, R = found
+        p, R = result
         stamp = message.header.stamp.to_sec()
         if last is None or not 1e-4 < (dt := stamp - self._stamp) < FRESH_S:
             self._take(stamp, p, R, np.zeros(3), np.zeros(3))
