@@ -27,12 +27,13 @@ def test_batched_products_are_right_as_users_compile_them():
     assert done.stdout.strip() == "[0, 0, 0, 0]", done.stderr
 
 
+@pytest.mark.parametrize("imports", ["import jax; from retrim import State", "from retrim import State; import jax"])
 @pytest.mark.parametrize(("asked", "taken"), [(None, "float32"), ("tensorfloat32", "tensorfloat32")])
-def test_products_are_of_whole_single_precision_unless_asked(asked, taken):
-    """On a GPU, too, whose default is less; a user's choice stands."""
+def test_products_are_of_whole_single_precision_unless_asked(asked, taken, imports):
+    """On a GPU, too, whose default is less; a user's choice stands, and the order of imports does not matter."""
     environment = {name: value for name, value in os.environ.items() if name != "JAX_DEFAULT_MATMUL_PRECISION"}
     environment |= {} if asked is None else {"JAX_DEFAULT_MATMUL_PRECISION": asked}
-    code = "import retrim, jax; print(jax.config.jax_default_matmul_precision)"
+    code = f"{imports}; print(jax.config.jax_default_matmul_precision)"
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
     assert done.stdout.strip() == taken, done.stderr
 

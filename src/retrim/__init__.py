@@ -12,11 +12,9 @@ from importlib.metadata import version
 
 import lazy_loader
 
-# Each variable must be set before the first import of the package that reads it; values set by the user are kept.
-# XLA logs every program that its compile cache loads on a machine with different tuning flags.
+# These variables only matter if they are set before the first import of the package that reads them; values set by the
+# user are kept. XLA logs every program that its compile cache loads on a machine with different tuning flags.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
-# By default, GPUs round the factors of products to ten bits, so that flights would differ from those on a CPU.
-os.environ.setdefault("JAX_DEFAULT_MATMUL_PRECISION", "float32")
 # The plant crazyflow needs SciPy with the array API, and reports an error if SciPy was imported before.
 if "scipy" not in sys.modules:
     os.environ.setdefault("SCIPY_ARRAY_API", "1")

@@ -91,5 +91,7 @@ def test_accepted_commands_and_ages_reach_the_controller_inside(setup):
 def test_without_a_filter_there_is_no_state():
     with jax.numpy_dtype_promotion("standard"):
         setup = Setup.from_preset("vision/ideal")
-    with pytest.raises(ConfigError, match="'GeometricController' needs the state, and preset 'vision/ideal' shows keypoints"):
+    with pytest.raises(
+        ConfigError, match="'GeometricController' needs the state, and preset 'vision/ideal' shows keypoints"
+    ):
         MethodRequest(setup, None).by_state(BASELINES["geometric"].controller(setup))

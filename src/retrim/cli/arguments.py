@@ -3,19 +3,26 @@
 import dataclasses
 from collections.abc import Collection
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from ..adapt.learner_state import LearnerState
-from ..config.faults import NO_FAULT
+from ..config.disturbances import DISTURBANCES
+from ..config.faults import FAULTS, NO_FAULT
 from ..config.loading import changed, load_for, overlaid, with_vehicle
-from ..config.plants import DELAY, is_vehicle
+from ..config.methods import METHODS
+from ..config.plants import DELAY, PLANTS, is_vehicle
 from ..config.presets import Family, Preset
+from ..config.references import REFERENCES
+from ..config.residuals import RESIDUALS
 from ..config.scenario import THRUST_ERROR, Scenario
+from ..config.sensors import SENSORS
 from ..config.tasks import find_task
+from ..config.vehicles import VEHICLES
 from ..control.policy import AbstractPolicy
 from ..errors import ConfigError
 from ..io.checkpoint import load_delta
 from ..io.trained import load_learner_state, load_policy
+from .options import listed, option
 
 
 def loaded(
@@ -45,38 +52,51 @@ def loaded(
     return (load_delta(delta, weights).merged() if delta is not None else weights), preset, None
 
 
+DISTURBANCE = (
+    f"Disturbance of the flight: {listed(DISTURBANCES)}; by default large, and none on a vehicle. A size may follow, "
+    "as in wind=6 [m/s] or payload=0.2 [kg]. A sum combines several, as in wind+payload=0.1. Or module:name."
+)
+PLANT = (
+    f"Plant: {listed(PLANTS)}, or module:name; docs/plant.md describes them. A vehicle has an address: "
+    "mavlink:udp:HOST:PORT, mavlink:serial:DEVICE:BAUD, crazyflie:udp:HOST:PORT, ros:HOST:PORT."
+)
+REFERENCE = (
+    f"Reference of a tracking policy: {listed(REFERENCES)}, module:name, or a CSV file of t, x, y, z[, yaw]; by "
+    "default the reference of its training. A closed file repeats as laps, any other is flown once; my.csv:laps and "
+    "my.csv:once override this. Only a policy that observes its reference can follow another one than in training."
+)
+VEHICLE = (
+    f"Vehicle that the plant simulates: {listed(VEHICLES)}, a vehicle file or module:name; by default the vehicle of "
+    "training. rotorpy and crazyflow fly their own."
+)
+SENSOR = (
+    f"Sensors that measure the state for the policy: {listed(SENSORS)}, or module:name; docs/how-to/sensors.md lists "
+    "their noise."
+)
+THRUST = "Relative thrust error; 0.1 means 10 % more thrust than commanded (bem, simple, second-order)."
+LATE = "Command delay of the plant [s], unknown to the policy (bem, simple, second-order)."
+FAULT = (
+    f"Fault of the measurements, unknown to the policy (bem, simple, second-order): {listed(FAULTS)}. A size may "
+    "follow, as in late=3. Or module:name."
+)
+METHOD = (
+    f"Method of the flight: none, {listed(f'{name} ({METHODS[name].label})' for name in METHODS)}, or module:name."
+).replace("**", "")
+RESIDUAL = f"Residual model: {listed(RESIDUALS)}, or module:name; by default that of the policy."
+
+
 @dataclasses.dataclass(frozen=True)
 class FlightArguments:
     """Conditions of a flight, as the options of a command."""
 
-    disturbance: str | None = None
-    """Disturbance of the flight: none (the default on a vehicle), small, large (the default elsewhere), push, step,
-    kick, reversing, walk, wind, gusts, fan, payload, pickup, battery or weak-rotor. A size may follow, as in wind=6
-    [m/s] or payload=0.2 [kg]. A sum combines several, as in wind+payload=0.1. Or module:name."""
-    plant: str = "bem"
-    """Plant: bem (blade-element rotors), simple (rotors with linear drag), second-order (a rate loop of second order
-    without rotors); rotorpy, mujoco or crazyflow, which are independent simulators, each an extra to install;
-    betaflight (its firmware as the rate controller, in real time); mavlink:udp:HOST:PORT, mavlink:serial:DEVICE:BAUD,
-    crazyflie:udp:HOST:PORT or ros:HOST:PORT for a vehicle; or module:name."""
-    reference: str | None = None
-    """Reference of a tracking policy: circle, figure8, star, module:name or a CSV file of t, x, y, z[, yaw]; by default
-    the reference of its training. A closed file repeats as laps, any other is flown once; my.csv:laps and
-    my.csv:once override this. Only a policy that observes its reference can follow another one than in training."""
-    vehicle: str | None = None
-    """Vehicle that the plant simulates: small, large, kingfisher, a vehicle file or module:name; by default the vehicle
-    of training. rotorpy and crazyflow fly their own."""
-    sensors: str = "ideal"
-    """Sensors that measure the state for the policy: ideal, mocap (0.3 mm, 3 mm/s, 1 mrad), onboard (0.6 mm, 6 mm/s,
-    2 mrad, 10 ms late, 1 % of the samples lost), rough (1 mm, 10 mm/s, 3 mrad, 10 ms late, 5 % of the samples lost),
-    or module:name."""
-    thrust_error: float = THRUST_ERROR
-    """Relative thrust error; 0.1 means 10 % more thrust than commanded (bem, simple, second-order)."""
-    delay: float = DELAY
-    """Command delay of the plant [s], unknown to the policy (bem, simple, second-order)."""
-    fault: str = NO_FAULT
-    """Fault of the measurements, unknown to the policy (bem, simple, second-order): velocity-spikes, rare-spikes,
-    swapped-markers, late, frozen, repeated, scaled-velocity, velocity-bias, attitude-bias, drift, gaps, clock-jumps.
-    A size may follow, as in late=3. Or module:name."""
+    disturbance: Annotated[str | None, option(DISTURBANCE, optional=True)] = None
+    plant: Annotated[str, option(PLANT)] = "bem"
+    reference: Annotated[str | None, option(REFERENCE, optional=True)] = None
+    vehicle: Annotated[str | None, option(VEHICLE, optional=True)] = None
+    sensors: Annotated[str, option(SENSOR)] = "ideal"
+    thrust_error: Annotated[float, option(THRUST)] = THRUST_ERROR
+    delay: Annotated[float, option(LATE)] = DELAY
+    fault: Annotated[str, option(FAULT)] = NO_FAULT
 
     @property
     def is_vehicle(self) -> bool:

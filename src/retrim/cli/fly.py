@@ -3,6 +3,7 @@
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
@@ -19,18 +20,19 @@ from ..runkit.flights import Flight
 from ..runkit.interrupts import interrupts_only_set
 from ..runkit.outlet import Outlet
 from ..runkit.run import INTERRUPTED, Run
-from .arguments import FlightArguments, loaded, same_policy, with_residual
+from .arguments import METHOD, RESIDUAL, FlightArguments, loaded, same_policy, with_residual
 from .console import RichReporter, Trust, console, refuse, show_paths, show_table, started
 from .flight_vehicle import check_vehicle_file, save_flight_vehicle
+from .options import option
 
 
 def fly(
     policy: Path | None = None,
     resume: Path | None = None,
     delta: Path | None = None,
-    where: tyro.conf.OmitArgPrefixes[FlightArguments] = FlightArguments(),  # noqa: B008
-    adapt: str = "full",
-    residual: str | None = None,
+    flight: tyro.conf.OmitArgPrefixes[FlightArguments] = FlightArguments(),  # noqa: B008
+    adapt: Annotated[str, option(METHOD)] = "full",
+    residual: Annotated[str | None, option(RESIDUAL, optional=True)] = None,
     config: Path | None = None,
     latency: Latency = "fixed",
     seconds: float | None = None,
@@ -46,10 +48,9 @@ def fly(
         policy: A policy.safetensors, or the folder that holds one.
         resume: Instead of a policy: learner_state.safetensors of an earlier flight, from which to continue.
         delta: A low-rank delta.safetensors of an earlier flight, to add to the policy.
-        where: Plant, vehicle and disturbances of the flight.
-        adapt: full, lora: re-train in flight, all weights or a few; base-i: integral action; base-do: observer; none:
-            unchanged policy; geometric, geometric-i, indi, mppi, l1-mpc, raptor: another controller; or module:name.
-        residual: Residual model: ensemble, regression, layered, linear, or module:name.
+        flight: Plant, vehicle and disturbances of the flight.
+        adapt: Method of the flight; full and lora re-train the policy in flight.
+        residual: Residual model of the learners.
         config: TOML file with values that replace those of the policy's preset, for example a table [adapt].
         latency: fixed: learning takes the flight time of the preset, so that a run is reproducible bit for bit;
             measured: it takes the measured computing time.
@@ -64,20 +65,20 @@ def fly(
 
     def ordered(stop: threading.Event) -> int:
         check_vehicle_file(save_vehicle)
-        if where.is_vehicle:
+        if flight.is_vehicle:
             if delta or config or starts != 1 or latency != "fixed":
                 raise ConfigError("a vehicle is flown live: without --delta, --config, --starts and --latency")
             from .live import live  # here: other flights do not need this module
 
             return live(
-                policy, resume, where=where, adapt=adapt, residual=residual, seconds=seconds or 30.0, seed=seed,
+                policy, resume, flight=flight, adapt=adapt, residual=residual, seconds=seconds or 30.0, seed=seed,
                 save_vehicle=save_vehicle, trust=trust, out=out,
             )(stop)  # fmt: skip
         weights, preset, state = loaded(policy, resume, delta, trust=trust)
         if config is not None:
             preset = same_policy(preset, overlaid(preset, config, trust=trust), config)
         preset = with_residual(preset, residual, state)
-        scenario = where.scenario(preset)
+        scenario = flight.scenario(preset)
         methods: tuple[str, ...] = ("base",) if adapt in ("none", "base") else ("base", adapt)
         fleet = Fleet(
             preset, {seed: weights}, [scenario], methods=methods, starts=starts, seconds=seconds, latency=latency,

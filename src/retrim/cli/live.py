@@ -4,6 +4,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 from rich.live import Live
@@ -28,9 +29,10 @@ from ..runkit.run import INTERRUPTED, Run
 from ..runkit.training import train
 from ..runtime.events import Event
 from ..transport.remote import LOOPBACK
-from .arguments import FlightArguments, loaded, with_residual
+from .arguments import METHOD, RESIDUAL, FlightArguments, loaded, with_residual
 from .console import RichReporter, Trust, console, refuse, show_paths, show_table, started
 from .flight_vehicle import check_vehicle_file, save_flight_vehicle
+from .options import option
 
 LINE_EVERY = 5.0  # [s]: interval of status lines if the output is not a terminal
 
@@ -39,9 +41,9 @@ def live(
     policy: Path | None = None,
     resume: Path | None = None,
     preset: str = "hover/retrim",
-    where: tyro.conf.OmitArgPrefixes[FlightArguments] = FlightArguments(),  # noqa: B008
-    adapt: str = "full",
-    residual: str | None = None,
+    flight: tyro.conf.OmitArgPrefixes[FlightArguments] = FlightArguments(),  # noqa: B008
+    adapt: Annotated[str, option(METHOD)] = "full",
+    residual: Annotated[str | None, option(RESIDUAL, optional=True)] = None,
     seconds: float | None = None,
     fence: float = 3.0,
     policy_age: float | None = None,
@@ -65,9 +67,9 @@ def live(
         policy: A policy.safetensors, or the folder that holds one; without one, a policy is trained first.
         resume: A learner_state.safetensors of an earlier flight, from which to continue.
         preset: Preset to train with if there is neither --policy nor --resume.
-        where: Plant, vehicle and disturbances of the flight.
-        adapt: full, lora: learn in flight; base-i, base-do, none: fly without learning; or module:name.
-        residual: Residual model: ensemble, regression, layered, linear, or module:name.
+        flight: Plant, vehicle and disturbances of the flight.
+        adapt: Method of the flight; full and lora re-train the policy in flight.
+        residual: Residual model of the learners.
         seconds: Length of the flight; until Ctrl-C by default.
         fence: Largest distance from the reference along any axis before the fallback controller takes over [m].
         policy_age: Largest age of the flight data of a learned policy before the fallback takes over [s]; unlimited by
@@ -98,7 +100,7 @@ def live(
         if policy is not None or resume is not None:
             weights, chosen, state = loaded(policy, resume, trust=trust)
         chosen = with_residual(chosen, residual, state)
-        scenario = where.scenario(chosen)
+        scenario = flight.scenario(chosen)
         wanted = page or (seconds is None and not no_page)
         address = page_address(page_host, page_port, demanded=page, say=RichReporter().say) if wanted else None
         ground = learners_at(learners, RichReporter().say, key)

@@ -109,19 +109,20 @@ def _command(name: str, about: str, module: str, words: list[str], stop: threadi
     from ..errors import RetrimError
     from ..runkit.compile_flags import compile_for
     from .console import console, refuse
+    from .options import readable
 
     compile_for(name)
     command = importlib.import_module(module)
     try:
         if hasattr(command, "COMMANDS"):
             call = tyro.extras.subcommand_cli_from_dict(
-                {n: tyro.conf.configure(tyro.conf.AvoidSubcommands)(f) for n, f in command.COMMANDS.items()},
+                {n: tyro.conf.configure(tyro.conf.AvoidSubcommands)(readable(f)) for n, f in command.COMMANDS.items()},
                 prog=f"retrim {name}",
                 description=about,
                 args=words,
             )
         else:
-            call = tyro.cli(getattr(command, name), prog=f"retrim {name}", args=words)
+            call = tyro.cli(readable(getattr(command, name)), prog=f"retrim {name}", args=words)
         code: int = call(stop)
     except RetrimError as error:
         return refuse(str(error))

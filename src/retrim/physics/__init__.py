@@ -1,5 +1,6 @@
 """Physics: pure, differentiable, unbatched; without networks, input or output; keys only at construction."""
 
+from . import precision as precision
 from .actuator_response import ActuatorResponse as ActuatorResponse
 from .actuator_response import ActuatorState as ActuatorState
 from .actuators import Lagged as Lagged

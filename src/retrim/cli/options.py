@@ -1,0 +1,62 @@
+"""Help texts of options: placeholders instead of types, names from the registries, no default where there is none."""
+
+import functools
+import inspect
+import types
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
+
+import tyro
+
+PLACEHOLDERS = {Path: "PATH", str: "TEXT", int: "N", float: "NUMBER"}
+
+
+def listed(names: Iterable[str]) -> str:
+    """Return names for a help text, separated by commas."""
+    return ", ".join(names)
+
+
+def option(text: str, *, optional: bool = False) -> Any:
+    """Return the annotation of an option with a help text.
+
+    Args:
+        text: Help text.
+        optional: Whether the default is None; the help then shows no default.
+    """
+    more: dict[str, Any] = {"metavar": "TEXT", "help_behavior_hint": ""} if optional else {}
+    return tyro.conf.arg(help=text, **more)
+
+
+def readable(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a command whose optional options show a placeholder, and no default.
+
+    Args:
+        command: Function whose arguments are the options; None is the default of an optional one.
+    """
+    hints = get_type_hints(command, include_extras=True)
+    signature = inspect.signature(command)
+    parameters = []
+    for name, parameter in signature.parameters.items():
+        hint = hints.get(name, parameter.annotation)
+        if parameter.default is None and _of_hint(hint):
+            hint = Annotated[hint, tyro.conf.arg(**_of_hint(hint))]
+        parameters.append(parameter.replace(annotation=hint))
+
+    @functools.wraps(command)
+    def same(*words: Any, **options: Any) -> Any:
+        return command(*words, **options)
+
+    same.__annotations__ = {each.name: each.annotation for each in parameters} | {"return": hints.get("return", Any)}
+    vars(same)["__signature__"] = signature.replace(parameters=parameters)
+    del same.__wrapped__  # the signature of the wrapper is the one that counts
+    return same
+
+
+def _of_hint(hint: Any) -> dict[str, Any]:
+    """Return the settings of an option with a type that includes None; empty for any other type."""
+    if get_origin(hint) not in (Union, types.UnionType) or type(None) not in get_args(hint):
+        return {}
+    rest = [each for each in get_args(hint) if each is not type(None)]
+    placeholder = PLACEHOLDERS.get(rest[0]) if len(rest) == 1 else None
+    return {} if placeholder is None else {"metavar": placeholder, "help_behavior_hint": ""}
