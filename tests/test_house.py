@@ -77,7 +77,7 @@ def test_values_are_frozen():
 def test_no_room_outgrows_the_house(room):
     mine = lines((HOUSE / room).rglob("*.py"))
     assert mine <= 0.2 * lines(SOURCES)
-    assert room != "cli" or mine <= 1100
+    assert room != "cli" or mine <= 1200
 
 
 def test_what_is_stated_once_stays_as_it_is():
