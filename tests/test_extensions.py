@@ -107,3 +107,21 @@ def test_a_network_that_is_no_perceptron_is_refused_where_one_is_needed(folder):
     assert "low-rank adaptation needs a perceptron" in out
     out = retrim("export", "p", "--to", "npz", *TRUST, cwd=folder, code=1)
     assert "export needs a perceptron" in out
+
+
+BROKEN = """
+import jax.numpy as jnp
+
+
+def gust(key, size):
+    return lambda t, x: jnp.zeros(4).reshape(9)
+"""
+
+
+def test_a_mistake_in_a_file_of_the_user_is_a_line_with_its_place_or_a_traceback(folder):
+    (folder / "broken.py").write_text(BROKEN)
+    words = "fly", "--policy", "p", *TRUST, "--disturbance", "broken:gust", "--adapt", "none", "--seconds", "1"
+    out = retrim(*words, cwd=folder, code=1)
+    assert f"{folder}/broken.py, line 6: TypeError: cannot reshape array of shape (4,)" in out
+    with pytest.raises(TypeError, match="cannot reshape"):
+        retrim(*words, "--traceback", cwd=folder)

@@ -23,6 +23,7 @@ COMMANDS = {
     "bench": "How long each piece of work takes on this machine.",
     "doctor": "Versions, device and cache, and known faults of dependencies.",
 }
+TRACEBACK = "--traceback"
 GROUP = "retrim.commands"
 """Entry points of other packages that add commands: dictionaries from a name to help and module."""
 
@@ -51,6 +52,7 @@ def describe(known: Mapping[str, tuple[str, str]]) -> str:
             *(f"  {name:<{width}}{about}" for name, (about, _) in known.items()),
             "",
             "  --version, --help",
+            "  --traceback with any command: show the whole traceback of an error",
             "",
             "Ctrl-C, SIGTERM or a closed terminal (SIGHUP) stops a command and keeps what is done.",
         ]
@@ -105,14 +107,14 @@ def _command(name: str, about: str, module: str, words: list[str], stop: threadi
 
     import tyro
 
-    from ..config.registry import describe_user_error
-    from ..errors import RetrimError
     from ..runkit.compile_flags import compile_for
     from .console import console, refuse
     from .options import readable
 
     compile_for(name)
     command = importlib.import_module(module)
+    whole = TRACEBACK in words
+    words = [word for word in words if word != TRACEBACK]
     try:
         if hasattr(command, "COMMANDS"):
             call = tyro.extras.subcommand_cli_from_dict(
@@ -124,19 +126,29 @@ def _command(name: str, about: str, module: str, words: list[str], stop: threadi
         else:
             call = tyro.cli(readable(getattr(command, name)), prog=f"retrim {name}", args=words)
         code: int = call(stop)
-    except RetrimError as error:
-        return refuse(str(error))
-    except OSError as error:
-        where = f"{error.filename}: " if error.filename else ""
-        return refuse(f"{where}{error.strerror or error}")
-    except MemoryError:
-        return refuse("out of memory; use fewer --starts, smaller networks or a shorter horizon")
     except Exception as error:
-        own = describe_user_error(error, words)
-        if own is None:
+        if whole:
             raise
-        return refuse(own)
+        message = _message_of(error, words)
+        if message is None:
+            raise
+        return refuse(message)
     if stop.is_set():
         console.print("interrupted; what was done is kept, if anything was")
         return code or 130
     return code
+
+
+def _message_of(error: Exception, words: list[str]) -> str | None:
+    """Return the line that describes an error; None for a fault of this package, whose traceback is needed."""
+    from ..config.registry import describe_user_error
+    from ..errors import RetrimError
+
+    if isinstance(error, RetrimError):
+        return str(error)
+    if isinstance(error, OSError):
+        where = f"{error.filename}: " if error.filename else ""
+        return f"{where}{error.strerror or error}"
+    if isinstance(error, MemoryError):
+        return "out of memory; use fewer --starts, smaller networks or a shorter horizon"
+    return describe_user_error(error, words)

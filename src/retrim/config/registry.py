@@ -7,6 +7,7 @@ imported from the Python path or the current folder. :mod:`.trust` checks names 
 import importlib
 import re
 import sys
+import sysconfig
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from importlib.metadata import entry_points
@@ -17,6 +18,12 @@ from ..errors import ConfigError, excerpt
 from .validation import suggestion
 
 T = TypeVar("T")
+LIBRARIES = (
+    str(Path(__file__).resolve().parents[1]),
+    *(sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")),
+    "<",
+)
+"""Beginnings of the file names of code that is not the user's."""
 
 
 class Registry(Mapping[str, T], Generic[T]):
@@ -95,13 +102,14 @@ def describe_user_error(error: Exception, words: Sequence[str]) -> str | None:
         error: Exception that was raised.
         words: Words of the command line; a word with ``module:name`` names such a module.
     """
-    here = str(Path.cwd())
-    frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename.startswith(here)]
-    own = [f for f in frames if "site-packages" not in f.filename and "/src/retrim/" not in f.filename]
-    if not own and not any(_names_a_module(word) for word in words):
+    here, named = str(Path.cwd()), any(_names_a_module(word) for word in words)
+    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if not frame.filename.startswith(LIBRARIES)]
+    own = [frame for frame in frames if named or frame.filename.startswith(here)]
+    if not own and not named:
         return None
     place = f"{own[-1].filename}, line {own[-1].lineno}: " if own else ""
-    return f"{place}{type(error).__name__}: {error}; retrim.testing.check_... names a broken law"
+    hint = "--traceback shows where; retrim.testing.check_... names a broken law"
+    return f"{place}{type(error).__name__}: {error}; {hint}"
 
 
 def _names_a_module(word: str) -> bool:
