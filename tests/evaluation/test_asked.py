@@ -133,4 +133,4 @@ def test_a_mistake_in_a_module_of_ones_own_is_told_in_a_line(tmp_path, monkeypat
     with pytest.raises(KeyError) as ours:
         {}["x"]
     assert describe_user_error(ours.value, ["retrim", "fly", "--starts", "1"]) is None
-    assert describe_user_error(ours.value, ["retrim", "fly", "--disturbance", "mine:wind"]).startswith("KeyError: 'x'")
+    assert "KeyError: 'x'" in describe_user_error(ours.value, ["retrim", "fly", "--disturbance", "mine:wind"])
