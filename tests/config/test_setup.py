@@ -96,7 +96,7 @@ def test_the_task_has_the_presets_numbers(built):
         ("track", "l2"): L2Track,
         ("track", "sharp"): SharpTrack,
     }
-    for task in (made.env.task, made.flown):
+    for task in (made.env.task, made.flight_task):
         assert type(task) is kinds[preset.task, preset.reward]
         assert task.horizon == preset.pretrain.horizon
         assert float(task.box) == preset.termination_box

@@ -267,4 +267,4 @@ def test_a_set_up_on_another_reference_is_the_same_but_for_it(made, table):
     assert other.env is made[0].env
     assert dataclasses.replace(other, flight_task=made[0].flight_task, learner=made[0].learner).preset == made[0].preset
     back = other.on(made[0].followed)
-    jax.tree.map(np.testing.assert_array_equal, jax.tree.leaves(back.flown), jax.tree.leaves(made[0].flight_task))
+    jax.tree.map(np.testing.assert_array_equal, jax.tree.leaves(back.flight_task), jax.tree.leaves(made[0].flight_task))

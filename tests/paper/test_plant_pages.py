@@ -75,8 +75,8 @@ def test_drag_grows_with_speed_and_most_of_it_is_the_rotors():
 
 def test_steps_are_answered_and_a_battery_sags():
     rates = curves(model.rate_panel())
-    assert set(rates) == {f"{name}, {axis}" for name in model.VEHICLES for axis in ("roll", "yaw")}
-    for name in model.VEHICLES:
+    assert set(rates) == {f"{name}, {axis}" for name in model.SHOWN for axis in ("roll", "yaw")}
+    for name in model.SHOWN:
         roll, yaw = rates[f"{name}, roll"], rates[f"{name}, yaw"]
         assert (roll.x[0], roll.x[-1]) == (1.0, 300.0)  # [ms]
         assert abs(roll.y[0]) < 0.05
@@ -85,7 +85,7 @@ def test_steps_are_answered_and_a_battery_sags():
     thrust = curves(model.step_panel())
     np.testing.assert_array_equal(thrust["commanded"].x, [0.0, 300.0])
     np.testing.assert_array_equal(thrust["commanded"].y, [5.0, 5.0])
-    for name in model.VEHICLES:
+    for name in model.SHOWN:
         assert (thrust[name].x[0], thrust[name].x[-1]) == (2.0, 300.0)  # [ms]
         assert thrust[name].y[0] < 1.0
         assert thrust[name].y[-1] == pytest.approx(at(thrust["commanded"], 300.0), rel=0.1)

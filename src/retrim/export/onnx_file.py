@@ -49,7 +49,7 @@ def write_onnx(path: Path, policy: Portable) -> list[Path]:
 
     nodes = [
         *finite("observation", "observation_is_finite"),
-        helper.make_node("FlightArguments", ["observation_is_finite", "observation", "zero"], ["kept"]),
+        helper.make_node("Where", ["observation_is_finite", "observation", "zero"], ["kept"]),
     ]
     h = "kept"
     for i, (w, b) in enumerate(policy.layers):
@@ -67,7 +67,7 @@ def write_onnx(path: Path, policy: Portable) -> list[Path]:
         helper.make_node("Add", ["above", "low"], ["within"]),
         *finite("within", "command_is_finite"),
         helper.make_node("And", ["observation_is_finite", "command_is_finite"], ["finite"]),
-        helper.make_node("FlightArguments", ["finite", "within", "nan"], ["command"]),
+        helper.make_node("Where", ["finite", "within", "nan"], ["command"]),
     ]
     size = policy.sizes
     graph = helper.make_graph(

@@ -22,6 +22,7 @@ from retrim.viz.panels import Curve, Panel, panel_figure
 from ..published import GOLDEN_HOVER, Settled, published, settled_rotor
 
 DT = 0.02  # [s]
+SHOWN = ("small", "large", "kingfisher")  # vehicles; a user may have registered others
 PUBLISHED_MAP = 1.562522e-6  # [N s^2], thrust map of the 5.1 in rotors (Agilicious)
 
 
@@ -124,7 +125,7 @@ def inflow_panel() -> Panel:
 def rate_panel() -> Panel:
     """Plot the responses of roll and yaw rate to a step of the command."""
     curves = list[Curve]()
-    for name in VEHICLES:
+    for name in SHOWN:
         bem = BemQuadrotor.of(VEHICLES[name](), DT)
         for axis, word in ((0, "roll"), (2, "yaw")):
             u = Command(jnp.array(STANDARD_GRAVITY), 2.0 * jnp.eye(3)[axis])
@@ -138,7 +139,7 @@ def rate_panel() -> Panel:
 def step_panel() -> Panel:
     """Plot the response of the acceleration to a step of collective thrust."""
     curves = []
-    for name in VEHICLES:
+    for name in SHOWN:
         bem = BemQuadrotor.of(VEHICLES[name](), DT)
         u = Command(jnp.array(STANDARD_GRAVITY + 5.0), jnp.zeros(3))
         speeds = np.asarray(_flown(bem, u, 300).x.v)[:, 2]
