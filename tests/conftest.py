@@ -42,7 +42,7 @@ settings.register_profile("repeatable", derandomize=True)  # the same examples o
 settings.load_profile("repeatable")
 
 
-LONG = ("test_examples.py", "cli/", "docs/", "live/", "evaluation/")
+LONG = ("test_examples.py", "test_extensions.py", "cli/", "docs/", "live/", "evaluation/", "paper/", "estimation/")
 """Files whose tests fly whole flights: they begin first, so that both workers are done at about the same time."""
 
 

@@ -145,14 +145,14 @@ def test_it_is_the_exact_posterior_of_a_linear_vehicle(kinds, kind, sigma):
 
 @pytest.fixture(scope="module")
 def many():
-    """A hundred random vehicles, excited for a second, with the sensors ``onboard``."""
+    """Fifty random vehicles, excited for a second, with the sensors ``onboard``."""
     rng = np.random.default_rng(20)
-    vehicles = random_vehicles(rng, 100)
+    vehicles = random_vehicles(rng, 50)
     flights = fly(rng, vehicles, LEVELS["onboard"], 1.0, doublets)
-    return vehicles, [estimate(flights, i) for i in range(100)]
+    return vehicles, [estimate(flights, i) for i in range(50)]
 
 
-def test_a_hundred_vehicles_are_identified_within_a_second(many):
+def test_fifty_vehicles_are_identified_within_a_second(many):
     vehicles, found = many
     delay, lag, gain = (
         np.array([getattr(each, name).mean[-1] for each in found]) for name in ("delay", "rate_lag", "thrust_gain")
