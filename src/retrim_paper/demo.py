@@ -25,7 +25,7 @@ from .tables.levels import LEVELS, level_table
 SHOWN = ("base", "full")
 MOST = 4  # starts of the second quadrotor
 WHY = {
-    "hover/retrim": "felt gravity turns the frame in milliseconds, a closed-form residual and short bursts do the rest",
+    "hover/retrim": "an observer answers within milliseconds; a closed-form residual and short updates follow",
     "hover/fast": "the paper's loop with a command delay in the model, trained in seconds",
     "hover/released": "the delay, observation and training size of the authors' code",
     "hover/paper": "as printed: no delay in the model, no past commands in the observation",

@@ -180,7 +180,7 @@ WRONG = [
     (("sweep", "size.toml"), "'abc' is not a number"),
     (
         ("sweep", "method.toml"),
-        "preset 'vision/ideal' has no frame of felt gravity: a policy that sees keypoints feels it by its pose filter",
+        "preset 'vision/ideal': the frame of effective gravity needs a measured state or a pose filter",
     ),
     (("sweep", "ranks.toml"), "LoRA: 3 ranks (4, 10, 1) for 2 layers"),
     (("sweep", "overlay.toml"), "nonsense: unknown key"),

@@ -365,7 +365,7 @@ def test_a_frame_is_refused_for_what_cannot_be_turned():
     check_frame(fixed.preset, f)
     with pytest.raises(ConfigError, match="Moving overrides target"):
         check_frame(fixed.preset, Moving(f.goal, f.observation, f.box, f.heading, f.dt, f.horizon))
-    with pytest.raises(ConfigError, match=r"'vision/ideal' has no frame of felt gravity: .* occlusion = true"):
+    with pytest.raises(ConfigError, match=r"'vision/ideal': the frame of effective gravity needs .* occlusion = true"):
         Setup.from_preset(changed(load("vision/ideal"), adapt={"frame": "gravity"}))
     seeing = Setup.from_preset("vision/retrim")
     assert isinstance(seeing.learner.view, RestView)

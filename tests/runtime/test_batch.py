@@ -45,7 +45,7 @@ def test_same_as_flying_the_plant(parts, delay_s, sensors):
 
 
 def test_a_late_measurement_is_taken_for_what_it_says_of_now(parts):
-    """By the layer of felt gravity, in both ways of flying; a vehicle that drifts is seen where it is."""
+    """By the frame of effective gravity, in both ways of flying; a vehicle that drifts is seen where it is."""
     model, push, controller, x0 = parts
     observer = DisturbanceObserver(
         PointMass(0.02), jnp.array(0.05), jnp.array(6.0), jnp.array(4.0), CommandPath.of(0.02)

@@ -1,4 +1,4 @@
-"""The layers of hover/retrim together, end to end: felt gravity answers, learning leaves it alone, files keep it."""
+"""The layers of hover/retrim, end to end: effective gravity compensates, learning does not disturb it."""
 
 import jax
 import jax.numpy as jnp

@@ -106,13 +106,13 @@ def check_frame(preset: Preset, task: AbstractTask) -> None:
     seen = task.observation_in_flight
     if isinstance(seen, Keypoints):
         raise ConfigError(
-            f"preset {preset.name!r} has no frame of felt gravity: a policy that sees keypoints feels it by its pose "
-            "filter, which [vision] occlusion = true has"
+            f"preset {preset.name!r}: the frame of effective gravity needs a measured state or a pose filter; set "
+            "[vision] occlusion = true"
         )
     try:
         eqx.filter_eval_shape(lambda: task.in_frame(EffectiveGravityFrame.of(jnp.zeros(3))))
     except FrameError as error:
-        raise ConfigError(f"task {preset.task!r} has no frame of felt gravity: {error}") from error
+        raise ConfigError(f"task {preset.task!r} has no frame of effective gravity: {error}") from error
 
 
 def effective_gravity_frame(

@@ -20,7 +20,7 @@ PAPER: PaperRows = {  # Table III [m]
     "lora": ("0.084 ± 0.014", "0.111 ± 0.024", "0.205 ± 0.048"),
 }
 TITLES = {
-    "vision/retrim": "Our preset: only points in the image, 1 px of noise, 5 % missed; felt gravity",
+    "vision/retrim": "Our preset: only points in the image, 1 px of noise, 5 % missed; effective gravity",
     "vision/ideal": "The paper's loop, a small budget: all points are observed",
     "vision/occluded": "The paper's loop, a small budget: only points in the image, 1 px of noise, 5 % of them missed",
     "vision/paper": "The paper's formulation: its reward and sizes, raw pixels, all points are observed",
@@ -52,7 +52,7 @@ def vision(
         reporter: Receives progress and the sections.
         presets: Presets to train and fly; vision/paper trains for several minutes.
         methods: Methods of the flights; by default all that the preset supports: baselines with the estimate of a pose
-            filter, and base-do in the frame of felt gravity.
+            filter, and base-do in the frame of effective gravity.
         seeds: Training seeds.
         seconds: Length of a flight [s].
         starts: Flights per disturbance, method and seed.
